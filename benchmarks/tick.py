@@ -6,7 +6,7 @@ import numpy as np
 
 from trilat_net.core.kernel import site_tick
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.core.ticks import Arrival, TickInput, TickRecord
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, exact_offset
 from trilat_net.net.timing import PeerClock, SiteTiming
@@ -19,62 +19,76 @@ AT_NS = 10_000_000_000
 DELAY_NS = 300_000
 
 
-def run() -> list[str]:
-    scenario = load_scenario("paper")
-    site = Site(scenario.setup("m1"))
-    record = site.step(TickInput(0))
-    echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
-    payloads = [encode_sample(p, 7, record, AT_NS - DELAY_NS, echo) for p in site.peers]
-    peers = [PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers]
-    timing = SiteTiming(0, site.rate_hz, peers, "m2")
-    timing.sent(0, AT_NS - 2 * DELAY_NS)
-    counter = iter(range(1, 10_000_000))
+class TickParts:
+    """A site and what came in from its peers, to be stepped again and again."""
 
-    def decoded() -> list[PeerSample]:
-        return [decode(payload, PeerSample, layout=site.layout) for payload in payloads]
+    def __init__(self) -> None:
+        self.site = site = Site(load_scenario("paper").setup("m1"))
+        record = site.step(TickInput(0))
+        self.echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
+        self.payloads = [encode_sample(p, 7, record, AT_NS - DELAY_NS, self.echo) for p in site.peers]
+        peers = [PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers]
+        self.timing = SiteTiming(0, site.rate_hz, peers, "m2")
+        self.timing.sent(0, AT_NS - 2 * DELAY_NS)
+        self.counter = iter(range(1, 10_000_000))
+        self.samples = self.decode()
+        self.came = self.take(self.samples)
+        self.output = self.step()
 
-    def arrivals(samples: list[PeerSample]) -> list[Arrival]:
-        pairs = zip(timing.meters, samples, strict=True)
+    def decode(self) -> list[PeerSample]:
+        """Returns what the peers sent."""
+        return [decode(payload, PeerSample, layout=self.site.layout) for payload in self.payloads]
+
+    def take(self, samples: list[PeerSample]) -> list[Arrival]:
+        """Returns samples as the site takes them in."""
+        pairs = zip(self.timing.meters, samples, strict=True)
         delays = [meter.take(sample, AT_NS) for meter, sample in pairs]
         return [Arrival(j, s.tick, s.q, s.qd, delays[j] // 1000) for j, s in enumerate(samples)]
 
-    def stamps() -> None:
-        k = next(counter)
-        timing.schedule.deadline(k)
-        arrivals(samples)
-        timing.sent(k, AT_NS)
-        timing.echo()
+    def stamp(self) -> None:
+        """Does what a tick does with times."""
+        k = next(self.counter)
+        self.timing.schedule.deadline(k)
+        self.take(self.samples)
+        self.timing.sent(k, AT_NS)
+        self.timing.echo()
         if k % 100 == 0:
-            timing.measured(AT_NS)
+            self.timing.measured(AT_NS)
 
-    samples = decoded()
-    came = arrivals(samples)
-    output = site.step(TickInput(next(counter), came))
+    def step(self) -> TickRecord:
+        """Steps the site once more."""
+        return self.site.step(TickInput(next(self.counter), self.came))
 
-    def whole() -> bytes:
-        k = next(counter)
-        timing.schedule.deadline(k)
-        taken = arrivals(decoded())
-        done = site.step(TickInput(k, taken))
-        sent_ns, echoed = timing.sent(k, AT_NS), timing.echo()
+    def whole(self) -> bytes:
+        """Does all that a tick does up to its sample."""
+        k = next(self.counter)
+        self.timing.schedule.deadline(k)
+        taken = self.take(self.decode())
+        done = self.site.step(TickInput(k, taken))
+        sent_ns, echoed = self.timing.sent(k, AT_NS), self.timing.echo()
         if k % 100 == 0:
-            timing.measured(AT_NS)
+            self.timing.measured(AT_NS)
         return encode_sample("m1", 7, done, sent_ns, echoed)
 
-    def leaf() -> None:
-        k = next(counter)
-        site_tick(k, 1_000_000 * k, 2, *site._tick_arrays)
+    def leaf(self) -> None:
+        """Does what is compiled of a tick."""
+        k = next(self.counter)
+        site_tick(k, 1_000_000 * k, 2, *self.site._tick_arrays)
 
+
+def run() -> list[str]:
+    one = TickParts()
+    output, came, echo, peers = one.output, one.came, one.echo, one.site.peers
     gc.disable()
-    total = each_us(whole)
+    total = each_us(one.whole)
     parts = {
-        "decode two payloads": each_us(decoded),
-        "stamps: deadline, two delays, sending, echo": each_us(stamps),
-        "Site.step": each_us(lambda: site.step(TickInput(next(counter), came))),
-        "  of it the compiled leaf": each_us(leaf),
+        "decode two payloads": each_us(one.decode),
+        "stamps: deadline, two delays, sending, echo": each_us(one.stamp),
+        "Site.step": each_us(one.step),
+        "  of it the compiled leaf": each_us(one.leaf),
         "encode the sample": each_us(lambda: encode_sample("m1", 7, output, AT_NS, echo)),
         "outside of it, a block at a time: encode the record": each_us(
-            lambda: encode_state("m1", 7, site.peers, output, came, 0, 0, AT_NS, echo)
+            lambda: encode_state("m1", 7, peers, output, came, 0, 0, AT_NS, echo)
         ),
     }
     gc.enable()

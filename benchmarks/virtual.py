@@ -9,16 +9,33 @@ from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.ros2.viz_channels import VIZ_HZ
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import Scenario, load_scenario
 
 from .stopwatch import best_s
 
 
 def run() -> list[str]:
     scenario = load_scenario("paper")
+    real = scenario.duration_s
     with_log = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO()))
     with_views = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO(), views_hz=VIZ_HZ))
     alone = best_s(lambda: [None for _ in virtual.execute_virtual(scenario)])
+    encoding, writing = time_writing(scenario)
+    reading, checking = time_checking(scenario)
+    return [
+        f"sim paper with its full log: {real / with_log:.1f} x real time, best of 5 (bar: >= 15)",
+        f"  stepping and the simulated network: {100 * alone / with_log:.0f} %",
+        f"  encoding records: {100 * encoding / with_log:.0f} %",
+        f"  writing MCAP: {100 * writing / with_log:.0f} %",
+        f"with the standard channels of `trilat sim` beside it: {real / with_views:.1f} x real time",
+        f"the same without a log: {real / alone:.0f} x real time",
+        f"verify, from the file: {real / checking:.1f} x real time, best of 5 (bar: >= 15)",
+        f"  of it reading and decoding: {100 * reading / checking:.0f} %",
+    ]
+
+
+def time_writing(scenario: Scenario) -> tuple[float, float]:
+    """Returns what encoding all records of a run takes, and writing them, s."""
     steps = list(virtual.execute_virtual(scenario))
 
     def encode() -> list[tuple[str, bytes, int, int]]:
@@ -32,7 +49,6 @@ def run() -> list[str]:
             for s in steps
         ]
 
-    encoding = best_s(encode)
     payloads = encode()
 
     def write() -> None:
@@ -42,7 +58,11 @@ def run() -> list[str]:
             writer.add(keys[name], payload, t_ns, t_ns, tick)
         writer.finish({})
 
-    writing = best_s(write)
+    return best_s(encode), best_s(write)
+
+
+def time_checking(scenario: Scenario) -> tuple[float, float]:
+    """Returns what reading a log takes, and verifying it, s."""
     stream = io.BytesIO()
     virtual.write_virtual_log(scenario, stream)
 
@@ -56,15 +76,4 @@ def run() -> list[str]:
         stream.seek(0)
         verify(open_log(stream))
 
-    reading, checking = best_s(read), best_s(check)
-    real = scenario.duration_s
-    return [
-        f"sim paper with its full log: {real / with_log:.1f} x real time, best of 5 (bar: >= 15)",
-        f"  stepping and the simulated network: {100 * alone / with_log:.0f} %",
-        f"  encoding records: {100 * encoding / with_log:.0f} %",
-        f"  writing MCAP: {100 * writing / with_log:.0f} %",
-        f"with the standard channels of `trilat sim` beside it: {real / with_views:.1f} x real time",
-        f"the same without a log: {real / alone:.0f} x real time",
-        f"verify, from the file: {real / checking:.1f} x real time, best of 5 (bar: >= 15)",
-        f"  of it reading and decoding: {100 * reading / checking:.0f} %",
-    ]
+    return best_s(read), best_s(check)

@@ -51,7 +51,11 @@ class Robot:
         )
 
     def apply(self, tau: tuple[float, ...] | None) -> None:
-        """Moves on by a period under a torque; None: the brakes hold it."""
+        """Moves on by a period under a torque; None: the brakes hold it.
+
+        A torque is meant for one period: an arm of light drives that moves on by thirty under one, as a
+        stalled program would that made up for them, swings and diverges.
+        """
         if tau is None:
             self.qd[:] = 0.0
             return
@@ -81,7 +85,7 @@ def main() -> None:
         while not port.over:
             port.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())
             robot.apply(port.torque())
-            next_s += PERIOD_S
+            next_s = max(next_s + PERIOD_S, time.monotonic())  # late periods are not made up for, see `apply`
             time.sleep(max(0.0, next_s - time.monotonic()))
     print(f"over: the arm is at {', '.join(f'{q:.3f}' for q in robot.q)} rad")
 

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.run_end import FLOOR_RAD, EnvelopeTrend, fit_envelope
+from trilat_net.analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend, fit_envelope
 
 Array = NDArray[np.float64]
 

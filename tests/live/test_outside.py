@@ -1,6 +1,5 @@
 """What comes from outside, in real processes: a law that cannot keep up, an arm that is no arm of ours."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +10,6 @@ from trilat_net.execution.virtual import execute_virtual
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.scenario_reader import read_shipped
 
 from .processes import PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
 
@@ -85,10 +83,8 @@ def drive_arm(session: Session, scenario: str, *options: str) -> str:
 def test_an_arm_of_seven_joints_that_feels_a_push_after_one_of_six_was_told_its_mistake(stage: Stage) -> None:
     """The wrong arm goes on sending until it is ended; the right one may begin where it did not."""
     next(execute_virtual(load_scenario("seven_joints")))  # compiles, once for all processes
-    calm = stage.folder / "calm.toml"  # heavy drives bear a torque that a busy machine holds for too long
-    calm.write_text(re.sub("armature_kg_m2 = .*", "armature_kg_m2 = 2.0", read_shipped("seven_joints")))
     options = ("--set", "sites.s.plant=external", "--set", "sites.s.arm.known=false", "--duration", "3")
-    session = Session(stage, str(calm), ("m1", "m2", "s"), *options)
+    session = Session(stage, "seven_joints", ("m1", "m2", "s"), *options)
     session.all()
     site = session.processes["s"]
     site.prints("waiting for its arm on trilat/t/s/measured")
@@ -99,7 +95,7 @@ def test_an_arm_of_seven_joints_that_feels_a_push_after_one_of_six_was_told_its_
     finally:
         wrong.kill()
         wrong.wait()
-    assert drive_arm(session, str(calm), "--sensor").count(",") == 6
+    assert drive_arm(session, "seven_joints", "--sensor").count(",") == 6
     session.ends_well()
     log = whole(session.log)
     executed_again(log)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.theory.figures_of_runs import measured, peak, printed
-from trilat_net.analysis.run_end import EnvelopeTrend
+from trilat_net.analysis.envelope_trend import EnvelopeTrend
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 

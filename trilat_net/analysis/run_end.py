@@ -5,26 +5,9 @@ judged by itself, and the worst decides; a word states what the record shows and
 is known of a whole log (V, the roots at its end pose) may make a stable run open, never the reverse.
 
 The judged part is the second half of the run, or what follows the last act of an operator and the last change
-of the loop if that is less and long enough. It is called the half below. It is divided into n equal windows,
-n = 16 and, if those do not decide, n = 8. A window counts with its largest value, at least `FLOOR_RAD`. A
-straight line is fitted to the logarithms of these maxima, with the one-sided 99.5 % bounds of its slope
-(Student's t, n - 2 degrees of freedom).
-
-GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or more each;
-and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first,
-or at least 0.45 of it if the maxima rise to more than 8/5 in all (no response that starts at zero and
-saturates does that). The maxima of the four quarters of the first half must not fall by 1 % or more each:
-a fall followed by a rise is a V, and needs a longer record.
-
-DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half, and the last
-quarter still takes half of its share in that; or nothing in the last quarter exceeds `FLOOR_RAD`. HARDLY: the
-line falls, by 4 % or more, and that is all. STEADY: the bounds exclude that the envelope doubles or halves
-within the half. All require that the last quarter of the half is at most twice the one before. A sustained
-oscillation of any size is steady; a joint that is steady while a faster one of the coupled sites falls may
-live on that (modes that decay beat), and is undecided.
-
-UNDECIDED: everything else: too short, too irregular, growing ever more slowly, a V. No finite record
-excludes growth that begins later, or a beat longer than the run, whose rising flank looks like growth.
+of the loop if that is less and long enough. Trends of |e| and |qd| over it are those of `envelope_trend`. A
+sustained oscillation of any size is steady; a joint that is steady while a faster one of the coupled sites
+falls may live on that (modes that decay beat), and is undecided.
 """
 
 import math
@@ -42,6 +25,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from .arm_rows import build_arm_rows
+from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelope, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
 from .timeline import first_divergence_s
 from .torque_sources import compute_operator_script
@@ -55,9 +39,6 @@ STATIC_SPEED_RAD_S = 2e-3
 EQUILIBRIUM_SPEED_RAD_S = 1e-5
 """The largest speed of the last second of a run whose end is an equilibrium, rad/s: the loop can be
 linearised there."""
-
-FLOOR_RAD = 1e-6
-"""An envelope below this has converged, rad; of speeds, rad/s."""
 
 AGREEMENT_RAD = 2e-2
 """Sites whose angles of a joint differ by more do not agree, rad."""
@@ -83,16 +64,6 @@ LEAST_JUDGED_SHARE = 0.1
 MIN_SIGN_CHANGES = 6
 """Fewer changes of sign in the second half of a run show no period."""
 
-_T_QUANTILES = {16: 2.977, 8: 3.707}
-"""Number of windows, and the 99.5 % quantile of Student's t with two degrees of freedom less: to these
-digits, with which the classes of published runs were made."""
-
-_RISE = math.log(1.01)
-_DOUBLE = math.log(2.0)
-_CALM = math.log(1.25)
-_CALM_STEP = math.log(1.5)
-_FROM_ZERO = math.log(8.0 / 5.0)
-
 
 class Stability(StrEnum):
     """The one judgement of a run; the text is the word for people."""
@@ -100,16 +71,6 @@ class Stability(StrEnum):
     STABLE = "stable"
     NOT_STABLE = "not stable"
     OPEN = "open"
-
-
-class EnvelopeTrend(StrEnum):
-    """Trend of an envelope at the end of a run; the text is the word for people."""
-
-    DECAYS = "decays"
-    HARDLY = "hardly decays"
-    STEADY = "steady"
-    GROWS = "grows"
-    UNDECIDED = "undecided (record longer)"
 
 
 class EndBehaviour(StrEnum):
@@ -134,32 +95,6 @@ class EndBehaviour(StrEnum):
 
 
 _MOVES_ON = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
-
-
-class EnvelopeFit(NamedTuple):
-    """Trend of an envelope over the second half of a run.
-
-    Attributes:
-        rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t). NaN if there
-            are too few points.
-        calm: True if it falls, or the upper bound excludes a rise by a quarter within the half; and the last
-            quarter is no more than half as high again as the one before.
-    """
-
-    trend: EnvelopeTrend
-    rate_per_s: float
-    calm: bool = False
-
-    @property
-    def text(self) -> str:
-        """The trend as a verb."""
-        return "shows no trend" if self.trend is EnvelopeTrend.UNDECIDED else self.trend.value
-
-    @property
-    def rate_text(self) -> str:
-        """The rate of what grows or decays; else the trend as a verb."""
-        still = self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED)
-        return self.text if still else f"{self.rate_per_s:+.3g}/s"
 
 
 class RunEnd(NamedTuple):
@@ -536,82 +471,3 @@ def _frequency_hz(parts: list[SiteLog]) -> float | None:
     crossings = _count_sign_changes(column)
     span_s = float(part.tick[-1] - part.tick[len(part) // 2]) / part.rate_hz
     return None if crossings < MIN_SIGN_CHANGES else 0.5 * crossings / span_s
-
-
-def fit_envelope(t_s: Array, error_rad: Array) -> EnvelopeFit:
-    """Returns the trend of an envelope; the module's docstring defines it.
-
-    Times ascend, shape (K,), s; the largest |e| is that at each time, or since the time before.
-    """
-    return fit_envelopes(t_s, error_rad[:, np.newaxis])[0]
-
-
-def fit_envelopes(t_s: Array, values: Array) -> list[EnvelopeFit]:
-    """Returns the trends of several envelopes, shape (K, C), see `fit_envelope`."""
-    fits = [EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)] * values.shape[1]
-    pending = list(range(values.shape[1]))
-    for windows in _T_QUANTILES:
-        maxima = _window_maxima(t_s, values[:, pending], windows)
-        if maxima is None:
-            continue
-        for n, fit in zip(pending, _fit_maxima(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows), strict=True):
-            fits[n] = fit
-        pending = [n for n in pending if fits[n].trend is EnvelopeTrend.UNDECIDED]
-    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
-    first_half = _window_maxima(-t_s[::-1], values[::-1, growing], 4) if growing else None
-    if first_half is not None:  # a fall, then a rise: a V
-        for n, fell in zip(growing, np.diff(np.log(first_half), axis=0).min(axis=0) >= _RISE, strict=True):
-            fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED) if fell else fits[n]
-    return fits
-
-
-def _window_maxima(t_s: Array, values: Array, windows: int) -> Array | None:
-    """Returns the maxima of equal windows of the second half; None if one has fewer than two points."""
-    if not len(t_s):
-        return None
-    edges = np.linspace(0.5 * (t_s[0] + t_s[-1]), t_s[-1], windows + 1)
-    starts = np.searchsorted(t_s, edges[:-1])
-    if np.any(np.diff(np.append(starts, len(t_s))) < 2):
-        return None
-    return np.maximum(np.maximum.reduceat(values, starts, axis=0), FLOOR_RAD)
-
-
-def _fit_maxima(maxima: Array, window_s: float) -> list[EnvelopeFit]:
-    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their logarithms."""
-    n, values = len(maxima), np.log(maxima)
-    x = np.arange(n) - 0.5 * (n - 1)
-    spread = float(x @ x)
-    slopes = (x[:, np.newaxis] * values).sum(axis=0) / spread  # a matrix product's last bits may vary
-    residual = values - values.mean(axis=0) - x[:, np.newaxis] * slopes
-    bounds = _T_QUANTILES[n] * np.sqrt((residual**2).sum(axis=0) / (n - 2) / spread)
-    quarters = np.log(maxima.reshape(4, n // 4, -1).max(axis=1))
-    fits = []
-    for slope, bound, quarter in zip(slopes.tolist(), bounds.tolist(), quarters.T, strict=True):
-        steps, last = np.diff(quarter), float(quarter[-1])
-        trend = _name_trend(slope * n, bound * n, steps, dead=last <= math.log(FLOOR_RAD))
-        falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-        calm = (falls or (slope + bound) * n <= _CALM) and float(steps[-1]) <= _CALM_STEP
-        fits.append(EnvelopeFit(trend, float(slope / window_s), bool(calm)))
-    return fits
-
-
-def _name_trend(change: float, bound: float, steps: Array, *, dead: bool) -> EnvelopeTrend:
-    """Returns the class of an envelope.
-
-    Args:
-        change: of its logarithm over the half, by the line.
-        bound: of the error of that.
-        steps: of the logarithm of the maxima from quarter to quarter of the half.
-        dead: True if the last quarter is at the floor.
-    """
-    lasts = steps[-1] >= 0.75 * steps[0] or (steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0])
-    if dead:
-        return EnvelopeTrend.DECAYS
-    if change > bound and steps.min() >= _RISE and lasts:
-        return EnvelopeTrend.GROWS
-    if steps[-1] > _DOUBLE:
-        return EnvelopeTrend.UNDECIDED
-    if change + bound < 0.0 and change <= -4.0 * _RISE:
-        clear = change <= -_DOUBLE and steps[-1] <= -_DOUBLE / 8.0
-        return EnvelopeTrend.DECAYS if clear else EnvelopeTrend.HARDLY
-    return EnvelopeTrend.STEADY if abs(change) + bound <= _DOUBLE else EnvelopeTrend.UNDECIDED

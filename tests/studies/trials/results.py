@@ -4,7 +4,8 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.analysis.run_end import EndBehaviour, EnvelopeFit, EnvelopeTrend, RunEnd
+from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.studies.trials.expectations import ExpectationResult
 from trilat_net.studies.trials.measure_run import LinkAge, RunMetrics

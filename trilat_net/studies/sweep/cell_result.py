@@ -12,8 +12,9 @@ from enum import StrEnum
 import msgspec
 import numpy as np
 
+from ...analysis.envelope_trend import FLOOR_RAD
 from ...analysis.json_values import finite_or_none
-from ...analysis.run_end import FLOOR_RAD, EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario

@@ -14,12 +14,7 @@ import msgspec
 import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
-from ...analysis.run_end import (
-    NO_BUCKETS,
-    RunEnd,
-    RunTrace,
-    classify_run_end,
-)
+from ...analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
 from ...analysis.timeline import first_divergence_s
 from ...analysis.torque_sources import list_walls, wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
