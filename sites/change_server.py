@@ -30,7 +30,11 @@ MIN_RAMP_S = 0.5
 
 
 class ChangeServer:
-    """The change requests to one site."""
+    """The change requests to one site.
+
+    Attributes:
+        stopped: True once the site has made the last tick that it was asked for.
+    """
 
     def __init__(self, scenario: Scenario, site: str, queries: QueryInbox) -> None:
         self._scenario, self._site, self._queries = scenario, site, queries
@@ -40,9 +44,13 @@ class ChangeServer:
         self._planned = scheduled_link_tables(scenario)
         self._accepted: Counter[str] = Counter()
         self._waiting: deque[int] = deque()
+        self._stop_tick: int | None = None
+        self.stopped = False
 
     def take(self, k: int) -> Sequence[CoreChange]:
         """Replies to every request; returns the accepted changes, for the next tick, k."""
+        if self._stop_tick is not None:
+            self.stopped = k + 1 >= self._stop_tick
         query = self._queries.poll()
         if query is None:
             return ()
@@ -50,14 +58,25 @@ class ChangeServer:
         first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
         while query is not None:
             try:
-                changes.append(self._resolve(decode(query.payload, ChangeRequest), first))
-                text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
-                reply = ChangeReply(member=self._site, accepted=True, text=text, tick=first)
+                request = decode(query.payload, ChangeRequest)
+                if request.stop_s is not None:
+                    reply = self._stop(k, request.stop_s)
+                else:
+                    changes.append(self._resolve(request, first))
+                    text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+                    reply = ChangeReply(member=self._site, accepted=True, text=text, tick=first)
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
             query.answer(encode(reply))
             query = self._queries.poll()
         return changes
+
+    def _stop(self, k: int, stop_s: float) -> ChangeReply:
+        asked = first_tick_at(round(stop_s * 1e9), self._rate_hz)
+        self._stop_tick = min(max(asked, k + 1), self._stop_tick or self._ticks)
+        self.stopped = k + 1 >= self._stop_tick
+        text = f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s"
+        return ChangeReply(member=self._site, accepted=True, text=text, tick=self._stop_tick)
 
     def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)

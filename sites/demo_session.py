@@ -101,6 +101,7 @@ def run_demo(
                     warm_up(scenario, name)  # once for all children
         endpoints = choose_session_endpoints(session, scenario.names)
         sites, recorder = _start(scenario, folder, session, endpoints)
+        display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.external:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
             display.say(f"{name} waits for its arm on {place}; see docs/external-arm.md")

@@ -53,7 +53,8 @@ class LeavingSite:
         if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
             self._publish("law", hiccups)
             parts.say(hiccups)
-        self._publish("end", f"{parts.name} made {self._ticks} ticks")
+        asked = ", as many as it was asked for" if parts.changes.stopped else ""
+        self._publish("end", f"{parts.name} made {self._ticks} ticks{asked}")
         code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in self._boots or parts.monitor.recorders:

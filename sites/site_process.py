@@ -8,7 +8,7 @@ seconds (`shutdown`).
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
-from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord, describe_mode
+from trilat_net.core.ticks import NS_PER_S, Arrival, Mode, TickInput, TickRecord, describe_mode
 from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
@@ -17,7 +17,7 @@ from trilat_net.net.membership import Epoch, EventPublisher, describe_member
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
-from trilat_net.process import Interrupt
+from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_law import ImportedLaw
 
@@ -27,6 +27,8 @@ from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
+STATUS_TICKS_S = 5
+"""Between two lines that say how a site does, s."""
 
 
 def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]) -> int:
@@ -50,8 +52,11 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         bus = open_bus(options.connection, clock, interrupt.requested, timeout_s, named)
         if bus is None:
             return interrupt.exit_code
-        with closing(bus):
-            return take_part(SiteParts(scenario, name, options, bus, clock, interrupt, say))
+        with closing(bus), LinePrinter(say) as printer:
+            parts = SiteParts(scenario, name, options, bus, clock, interrupt, printer.put)
+            if options.connection.listen:
+                parts.say(f"others connect to {', '.join(map(str, options.connection.listen))}")
+            return take_part(parts)
 
 
 def take_part(parts: SiteParts) -> int:
@@ -115,6 +120,8 @@ class RunningSite:
         self._parts, self._publisher, self._epoch = parts, publisher, epoch
         self._failure: RunFailed | None = None
         self._mode = Mode.RUN
+        self._output: TickRecord | None = None
+        self._status_s = 0
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
@@ -183,7 +190,8 @@ class RunningSite:
         if parts.arm is not None:
             parts.arm.poll()
             self._failure = self._failure or parts.arm.failure
-        return bool(self._failure or parts.monitor.ended_by) or parts.interrupt.requested()
+        ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
+        return bool(ended) or parts.interrupt.requested()
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """See `LoopIO`."""
@@ -191,10 +199,11 @@ class RunningSite:
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.take(k)
         try:
-            return self._step(TickInput(k, arrivals, parts.changes.take(k), measured, hand))
+            self._output = self._step(TickInput(k, arrivals, parts.changes.take(k), measured, hand))
         except LawFailed as failed:
             self._failure = failed
             return None
+        return self._output
 
     def attend(self, k: int, t_ns: int) -> None:
         """See `LoopIO`: answers queries, follows the leader's grid, publishes who is gone, who holds."""
@@ -205,12 +214,28 @@ class RunningSite:
         for news in () if self._parts.hand is None else self._parts.hand.take_news():
             self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
             self._parts.say(news.text.partition(": ")[2])
+        if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
+            self._status_s = t_ns // NS_PER_S
+            self._parts.say(self._describe_status(self._output))
+
+    def _describe_status(self, output: TickRecord) -> str:
+        """Returns how the site does, in a line."""
+        shared = output.shared()[0]
+        apart = max(abs(a - b) for a, b in zip(shared, output.q_des, strict=True))
+        unit = "m or rad" if output.x else "rad"
+        torque_nm, stats = max(map(abs, output.tau)), self._parts.stats
+        dropped = sum(stats.dropped.values())
+        return (
+            f"t = {output.t_ns / NS_PER_S:.0f} s, {output.mode.name.lower()}, |e| {apart:.3g} {unit}, torque "
+            f"{torque_nm:.3g} N m, {stats.overruns} ticks late, {dropped} messages dropped"
+        )
 
     def report(self, output: TickRecord) -> None:
         """See `LoopIO`."""
         name, at = self._parts.name, {"t_ns": output.t_ns, "ticks": output.tick}
         for change in output.cmd:
             self._publisher.publish("change", f"{name} takes in {change}", command=change, **at)
+            self._parts.say(f"takes in {change}")
         if output.mode is not self._mode:
             self._mode = output.mode
             self._publisher.publish("mode", describe_mode(name, output), **at)

@@ -7,12 +7,13 @@ to the process that started them, and end with it or when it fails.
 
 import gc
 import os
+import queue
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -45,6 +46,37 @@ def disable_gc() -> None:
     """Freezes and stops the collector, for a loop that must not pause."""
     freeze_gc()
     gc.disable()
+
+
+class LinePrinter:
+    """A context that prints lines in a thread of its own, so that a loop never waits for a terminal.
+
+    Of lines that are not printed yet it keeps 256; more are lost.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._lines: queue.Queue[str | None] = queue.Queue(256)
+        self._thread = threading.Thread(target=self._print, daemon=True)
+
+    def __enter__(self) -> "LinePrinter":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=1.0)
+        self._thread.join(1.0)
+
+    def put(self, text: str) -> None:
+        """Prints a line soon."""
+        with suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def _print(self) -> None:
+        while (text := self._lines.get()) is not None:
+            with suppress(OSError):
+                self._say(text)
 
 
 class Interrupt:
@@ -110,6 +142,7 @@ def worker_pool(count: int) -> Iterator[Executor]:
     from loky import ProcessPoolExecutor
 
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
+    warnings.filterwarnings("ignore", "A worker was restarted")  # each keeps the laws that it compiled
     pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=(os.getpid(),))
     try:
         with hold_sigint():

@@ -45,7 +45,7 @@ class Apart(Session):
         if name in self._apart.centre:
             return [*clock, "--router", f"tcp/{self._apart.centre[name]}:7447"]
         others = SITES if name == "recorder" else SITES[: SITES.index(name)]
-        listen = () if name == "recorder" else ("--listen", PORT)
+        listen = () if name == "recorder" else ("--insecure", "--listen", PORT)
         return [*clock, *listen, *connections([f"tcp/{self._apart.address[other]}:7447" for other in others])]
 
 

@@ -1,4 +1,4 @@
-"""Sessions through a router, and over TLS by a configuration of one's own."""
+"""Sessions through a router, with keys, and over TLS by a configuration of one's own."""
 
 import signal
 
@@ -7,8 +7,10 @@ import pytest
 from tests.net.certificates import Certificates
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.log.log_reader import open_log
+from trilat_net.net.access_rules import RECORDER, ROUTER
+from trilat_net.net.member_keys import create_keys
 
-from .processes import Process, Session, Stage
+from .processes import PAPER, Process, Session, Stage
 
 SITES = ("m", "s")
 
@@ -21,11 +23,38 @@ class Routed(Session):
         self.endpoint = self.recorder_endpoint.replace("tcp", protocol)
         self._network = network
 
-    def ways(self, name: str) -> list[str]:  # noqa: ARG002 - all of them alike
-        return ["--router", self.endpoint, *self._network]
+    def network(self, name: str) -> list[str]:  # noqa: ARG002 - all of them alike
+        """How a member is secured."""
+        return [*self._network]
+
+    def ways(self, name: str) -> list[str]:
+        return ["--router", self.endpoint, *self.network(name)]
 
     def router(self, called: str = "router") -> Process:
-        return self._stage.start(called, "router", "--listen", self.endpoint, *self._network)
+        return self._stage.start(called, "router", "--listen", self.endpoint, *self.network("router"))
+
+
+class Keyed(Routed):
+    """The same with a key for each."""
+
+    def __init__(self, stage: Stage, duration: str) -> None:
+        super().__init__(stage, duration, "tls")
+        create_keys(stage.folder / "keys", [*SITES, RECORDER, ROUTER], [], 1)
+
+    def network(self, name: str) -> list[str]:
+        return ["--keys", str(self._stage.folder / "keys" / name)]
+
+
+@pytest.mark.long
+def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
+    session = Session(stage, "paper", PAPER, "--duration", "3")
+    create_keys(stage.folder / "keys", [*PAPER, RECORDER], [], 1)
+    session.endpoints = [place.replace("tcp", "tls") for place in session.endpoints]
+    session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
+    for name in (RECORDER, *PAPER):
+        keys = ("--keys", str(stage.folder / "keys" / name))
+        _ = session.recorder(*keys) if name == RECORDER else session.site(name, "--needs-recorder", *keys)
+    session.is_reproduced()
 
 
 @pytest.mark.long
@@ -41,7 +70,7 @@ def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) ->
 
 def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stage) -> None:
     """The loops never stop; what was made meanwhile comes into the log from the sites' memory."""
-    session = Routed(stage, "8")
+    session = Keyed(stage, "8")
     router = session.router()
     session.all()
     session.begun()

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import UsageError
 from trilat_net.net.zenoh_bus import MAX_DEPTH, read_zenoh_file
-from trilat_net.net.zenoh_config import REQUIREMENTS, ZenohFile, _merge, check_zenoh_file, make_zenoh_config
+from trilat_net.net.zenoh_config import (
+    REQUIREMENTS,
+    ZenohFile,
+    check_zenoh_file,
+    make_zenoh_config,
+    merge_settings,
+)
 
 SOURCE = "mine.json5"
 
@@ -71,7 +77,7 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
         value = data.draw(
             st.sampled_from([WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"])
         )
-        stated = _merge(stated, nested(path, value))
+        stated = merge_settings(stated, nested(path, value))
     try:
         file = checked(stated)
     except UsageError:
@@ -167,6 +173,7 @@ def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_pa
         ("{connect: {endpoints: {pear: []}}}", r"connect/endpoints/pear: no key .*did you mean peer\?"),
         ("{connect: {endpoints: ['nope']}}", "connect/endpoints: Endpoints must be of the form <protocol>"),
         ("{access_control: {rules: [{id: 'x'}]}}", "access_control/rules: missing field `key_exprs`"),
+        ("{access_control: {default_permission: 'deny'}}", "access_control: has no `enabled: true`"),
         ("{transport: {link: {tx: {lease: 500}}}}", "transport/link/tx/lease: 500 must be 5000 or more"),
     ],
 )

@@ -16,10 +16,12 @@ from ..errors import TrilatError
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error
 from . import (
+    bench,
     certify,
     compare,
     demo,
     figure,
+    keys,
     linear,
     live,
     log,
@@ -33,9 +35,11 @@ from . import (
     scenario,
     sim,
     site,
+    stop,
     sweep,
     test,
     verify,
+    watch,
 )
 from . import set as set_command
 
@@ -83,7 +87,9 @@ _SINGLE = {
     "site": (site.site_command, "m1 --scenario paper"),
     "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
     "ping": (ping.ping_command, "--session paper"),
-    "router": (router.router_command, f"--listen {router.ANY_ADDRESS}"),
+    "watch": (watch.watch_command, "--session paper-demo"),
+    "stop": (stop.stop_command, "--session paper-demo"),
+    "router": (router.router_command, "--keys keys/router"),
     "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
     "verify": (verify.verify_command, "run.mcap"),
     "certify": (certify.certify_command, "run.mcap"),
@@ -112,6 +118,7 @@ _STUDIES = {
         "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
         "runs/sweep-p_d_margin-001 --cell 17",
     ),
+    "bench": (bench.bench_command, "--small", "--study round-trips --law wave,smith"),
     "linear": (linear.linear_command, "p_d_margin --set control.d=0.9 --over control.d=0.1:3"),
 }
 _SCENARIO = {
@@ -123,6 +130,10 @@ _SCENARIO = {
 _SET = {
     "link": (set_command.set_link_command, "'m1->s' --delay 350ms --loss 5%"),
     "dominance": (set_command.set_dominance_command, "s m1=0.9 m2=0.1"),
+}
+_KEYS = {
+    "new": (keys.keys_new_command, "keys m1 m2 s recorder operator --host 192.0.2.1"),
+    "info": (keys.keys_info_command, "keys/m1"),
 }
 _CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
 _CHANGES.callback()(set_command.set_command)
@@ -137,6 +148,10 @@ app.add_typer(
     name="scenario",
 )
 app.add_typer(_CHANGES, name="set")
+app.add_typer(
+    _group(_KEYS, "keys ", no_args_is_help=True, help="The keys by which members know one another."),
+    name="keys",
+)
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ def live_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
     host: Annotated[
         str, typer.Option("--host", help="Address to serve the page at; others than loopback demand a token.")
     ] = "127.0.0.1",
@@ -52,12 +53,12 @@ def live_command(
         alone = {"--duration", "--out", "--seed", "--set", "--force", "scenario"}
         if extra := alone & set(options.given_options(context)):
             raise UsageError(f"--session shows a session that runs: leave out {', '.join(sorted(extra))}")
-        connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
+        connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
         name = options.check_session_name(session)
         code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)
         raise typer.Exit(code)
-    if connect or router or zenoh_config:
-        raise UsageError("--connect, --router and --zenoh-config go with --session")
+    if connect or router or zenoh_config or keys:
+        raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     _run_session(page, scenario, folder, duration, seed, overrides, force=force)
 
 

@@ -11,6 +11,7 @@ from ..errors import UsageError
 
 if TYPE_CHECKING:
     from ..net.connection import Connection
+    from ..net.member_keys import MemberKeys
     from ..scenario import Scenario
 
 
@@ -44,6 +45,14 @@ RouterOption = Annotated[
 ZenohConfigOption = Annotated[
     Path | None,
     typer.Option("--zenoh-config", metavar="FILE", help="Your own Zenoh configuration: TLS, QUIC, access."),
+]
+KeysOption = Annotated[
+    Path | None,
+    typer.Option("--keys", metavar="DIR", help="Folder of this member's keys, see trilat keys new."),
+]
+InsecureOption = Annotated[
+    bool,
+    typer.Option("--insecure", help="Allow --listen at a network where everybody is trusted, unencrypted."),
 ]
 
 
@@ -172,13 +181,26 @@ def resolve_connection(
     zenoh_config: Path | None,
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
+    keys: Path | None = None,
+    *,
+    insecure: bool = False,
 ) -> "Connection":
     """Returns how a member takes part by a command's options, and by default."""
-    from ..net.connection import resolve_member_connection
+    from ..net.connection import resolve_member_connection, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    return resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
+    connection = resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
+    return secure_connection(connection, read_keys(keys), insecure=insecure)
+
+
+def read_keys(folder: Path | None) -> "MemberKeys | None":
+    """Returns a member's keys, None without a folder."""
+    if folder is None:
+        return None
+    from ..net.member_keys import read_member_keys
+
+    return read_member_keys(folder)
 
 
 OnOption = Annotated[

@@ -24,6 +24,7 @@ def ping_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
     count: Annotated[
         int, typer.Option("--count", metavar="N", help="Round trips to each member.", callback=_check_count)
     ] = 50,
@@ -50,7 +51,7 @@ def ping_command(
     from ..net.clock import make_system_clock
     from ..process import Interrupt
 
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None)
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         probe = ping_session(

@@ -17,6 +17,8 @@ def record_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    insecure: options.InsecureOption = False,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
     ] = None,
@@ -73,7 +75,9 @@ def record_command(
     from ..log.ros2.viz_channels import parse_viz_rate
     from ..net.clock import make_system_clock
 
-    connection = options.resolve_connection(listen, connect, router, zenoh_config, [], None)
+    connection = options.resolve_connection(
+        listen, connect, router, zenoh_config, [], None, keys, insecure=insecure
+    )
     path = output if output is not None else Path(f"{options.check_session_name(session)}.mcap")
     place = LogStorage(
         path,

@@ -86,6 +86,7 @@ def replay_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a session of its own.
@@ -109,11 +110,10 @@ def replay_command(
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
     name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    first = [default_endpoint(name, 0)]
-    connection = options.resolve_connection(listen, connect, router, zenoh_config, first, [])
+    ways = listen, connect, router, zenoh_config, [default_endpoint(name, 0)]
+    connection = options.resolve_connection(*ways, [], insecure=insecure)
     play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
-    console = terminal.err if as_json else terminal.out
-    tell = partial(console.print, markup=False, soft_wrap=True)
+    tell = partial((terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True)
     _announce(facts, name, speed, tell)
     reported = set(facts.torn)  # playing may add to them
     _warn_torn(facts.torn)

@@ -7,18 +7,22 @@ import typer
 from ..reporting import terminal_output as terminal
 from . import options
 
-ANY_ADDRESS = "tcp/0.0.0.0:7447"
+LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 
 
 def router_command(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            "--listen", metavar="EP", help=f"Endpoint to listen at; repeatable; default: {ANY_ADDRESS}."
+            "--listen",
+            metavar="EP",
+            help=f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
         ),
     ] = None,
     connect: options.ConnectOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    insecure: options.InsecureOption = False,
     until_idle: Annotated[
         float | None,
         typer.Option(
@@ -35,12 +39,16 @@ def router_command(
     continues when it is restarted. Routers that --connect to each other act as one.
     """
     from ..net.clock import SystemClock
-    from ..net.connection import open_bus, resolve_router_connection, run_router
+    from ..net.connection import open_bus, resolve_router_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
     from ..process import Interrupt
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    connection = resolve_router_connection(listen, connect, file, [ANY_ADDRESS])
+    owned = options.read_keys(keys)
+    places = [LOOPBACK if owned is None else ANY_ADDRESS]
+    connection = secure_connection(
+        resolve_router_connection(listen, connect, file, places), owned, insecure=insecure
+    )
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)

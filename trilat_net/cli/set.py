@@ -55,12 +55,13 @@ def set_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
 ) -> None:
     """Changes a link, or a site's shares in its peers, while a session runs.
 
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
-    context.obj = session, options.resolve_connection(None, connect, router, zenoh_config, [], None)
+    context.obj = session, options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
 
 
 def set_link_command(

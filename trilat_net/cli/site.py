@@ -20,6 +20,8 @@ def site_command(
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    insecure: options.InsecureOption = False,
     join_timeout: Annotated[
         float,
         typer.Option(
@@ -63,7 +65,14 @@ def site_command(
     places = default_endpoints(identity, chosen.names)
     before = chosen.names[: chosen.names.index(name)]
     connection = options.resolve_connection(
-        listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
+        listen,
+        connect,
+        router,
+        zenoh_config,
+        [places[name]],
+        [places[peer] for peer in before],
+        keys,
+        insecure=insecure,
     )
     how = SiteOptions(
         session=identity,

@@ -180,7 +180,7 @@ def _run_in_folder(
             f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}"
         )
     try:
-        with _sweep_progress() as progress:
+        with show_progress("sweeping", terminal.print_text) as progress:
             swept = run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
         with folder.journal() as journal:
@@ -205,10 +205,10 @@ def _print_results(results: "SweepResults", more: list[str], path: Path) -> None
 
 
 @contextmanager
-def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
+def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Callable[[int, int], None]]:
     """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
     if terminal.err.is_interactive:
-        with terminal.progress_bar("sweeping") as show:
+        with terminal.progress_bar(label) as show:
             yield show
         return
     from ..net.clock import SystemClock
@@ -225,7 +225,7 @@ def _sweep_progress() -> Iterator[Callable[[int, int], None]]:
             return
         printed = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
-        terminal.print_text(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
+        print_line(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
 
     yield line
 

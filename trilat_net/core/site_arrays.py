@@ -27,7 +27,7 @@ _SETTINGS = (
     *("theta_known", "needs_model", "remembered", "asked"),
 )
 _COUNTS = ("joints", "shared", "parameters", "task", "sent")
-_GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0"))
+_GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),

@@ -213,6 +213,7 @@ class Gains(NamedTuple):
         rho: largest robust torque of ADAPTIVE, shape (n,), N m.
         width: speed r at which it is 0.71 of that, shape (n,), rad/s.
         friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
+        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp takes it to that of the peers; only linearised.
     """
 
     law: Law
@@ -230,6 +231,7 @@ class Gains(NamedTuple):
     rho: Vector = (0.0,)
     width: Vector = (1.0,)
     friction: Vector = (1.0,)
+    absolute: bool = False
 
 
 class SiteSetup(NamedTuple):

@@ -6,21 +6,25 @@ given both on the command line and in a file are united or refused, never chosen
 Zenoh traffic and prints who joins and leaves; it adds no routing of its own.
 """
 
+import ipaddress
 import math
 import re
 import socket
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 from ..errors import SessionError, UsageError
 from . import topics
 from .bus import Bus
 from .clock import Clock
 from .zenoh_bus import RouterSilent, ZenohBus
-from .zenoh_config import Endpoint, ZenohFile, ZenohMode
+from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
+
+if TYPE_CHECKING:
+    from .member_keys import MemberKeys
 
 _FIRST_PORT, _BLOCKS, _BLOCK = 10_240, 340, 64
 
@@ -71,18 +75,81 @@ class Connection:
     Attributes:
         connect: endpoints to connect to; a client takes the first that answers. None: still to be found.
         mode: peer of the other members, client of a router, or a router.
-        own: Zenoh settings of a user's file.
+        own: Zenoh settings of a user's file, or of a member's keys.
+        keyed: true: links are encrypted, and both ends prove by certificates who they are.
     """
 
     listen: Sequence[Endpoint] = ()
     connect: Sequence[Endpoint] | None = ()
     mode: ZenohMode = "peer"
     own: Mapping[str, Any] = field(default_factory=dict)
+    keyed: bool = False
 
     @property
     def places(self) -> Sequence[Endpoint]:
         """Endpoints at which others reach this member: its own, or the routers of a client."""
-        return self.listen or self.connect or ()
+        return self.reach(self.listen or self.connect or ())
+
+    def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
+        """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
+        if not self.keyed:
+            return list(endpoints)
+        return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
+
+
+def secure_connection(connection: Connection, keys: "MemberKeys | None", *, insecure: bool) -> Connection:
+    """Returns a connection with a member's keys; without any it must not be open to a network.
+
+    Raises:
+        UsageError: an endpoint is not encrypted, or reached from other machines without keys, or the user's
+            own settings contradict the keys.
+    """
+    own, named = connection.own, (*connection.listen, *(connection.connect or ()))
+    if udp := [place for place in _find_addresses(named) if place.startswith("udp/")]:
+        raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
+    if keys is not None:
+        plain = [place for place in _find_addresses(named) if not place.startswith(ENCRYPTED)]
+        if plain := [place for place in plain if not _is_loopback(place)]:
+            raise UsageError(
+                f"{plain[0]}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
+            )
+        if twice := sorted(set(own) & {"access_control", "low_pass_filter", "adminspace"}):
+            raise UsageError(f"--zenoh-config: {twice[0]}: comes from --keys; give it in one place")
+        if "tls" in own.get("transport", {}).get("link", {}):
+            raise UsageError("--zenoh-config: transport/link/tls: comes from --keys; give it in one place")
+        return replace(connection, own=merge_settings(keys.settings, own), keyed=True)
+    mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
+    for place in _find_addresses(connection.listen):
+        if not (insecure or _is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):
+            raise UsageError(
+                f"--listen {place}: anybody on that network could take part: give --keys DIR (make them with "
+                "trilat keys new), or --insecure where you trust everybody on it"
+            )
+    return connection
+
+
+ENCRYPTED = ("tls/", "quic/")
+
+
+def _find_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
+    """Returns the addresses of endpoints, those of Zenoh's groups of locators too."""
+    addresses: list[str] = []
+    for one in endpoints:
+        stated = one.get("locators", ()) if isinstance(one, Mapping) else [one]
+        addresses += [stated] if isinstance(stated, str) else map(str, stated)
+    return addresses
+
+
+def _is_loopback(address: str) -> bool:
+    """True if nobody on another machine reaches an address."""
+    protocol, _, rest = address.partition("/")
+    host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
+    if protocol.startswith("unix") or host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def resolve_member_connection(
@@ -185,7 +252,10 @@ def open_bus(
     begun_ns, printed = clock.monotonic_ns(), False
     while not stopped():
         try:
-            return ZenohBus(connection.listen, connection.connect or (), connection.mode, connection.own)
+            listen, connect = (
+                connection.reach(side or ()) for side in (connection.listen, connection.connect)
+            )
+            return ZenohBus(listen, connect, connection.mode, connection.own)
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None

@@ -129,15 +129,24 @@ def request_change(
         info = find_site_info(bus, clock, session, site, names)
         if not info.running:
             raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
-        replies = bus.ask(topics.key(session, site, topics.SET), encode(request))
-        give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-        while clock.monotonic_ns() < give_up_ns:
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-            if (reply := replies.poll()) is not None:
-                try:
-                    return decode(reply[1], ChangeReply)
-                except WireError as error:
-                    raise SessionError(f"the answer of {site} cannot be read: {error}") from None
+        return send_change(bus, clock, session, site, request)
+
+
+def send_change(bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest) -> ChangeReply:
+    """Sends a request to a site of a session that runs, and returns its reply.
+
+    Raises:
+        SessionError: the site does not reply.
+    """
+    replies = bus.ask(topics.key(session, site, topics.SET), encode(request))
+    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+    while clock.monotonic_ns() < give_up_ns:
+        clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+        if (reply := replies.poll()) is not None:
+            try:
+                return decode(reply[1], ChangeReply)
+            except WireError as error:
+                raise SessionError(f"the answer of {site} cannot be read: {error}") from None
     raise SessionError(f"{site} gave no answer; its records show whether it made the change")
 
 

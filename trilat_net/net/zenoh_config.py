@@ -79,14 +79,17 @@ def make_zenoh_config(
             "shared_memory": {"enabled": False},
         },
     }
-    return _merge(needed, own or {})
+    return merge_settings(needed, own or {})
 
 
-def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns settings with those of `own` in place of what they name."""
     both = dict(base)
     for key, value in own.items():
         under = both.get(key)
-        both[key] = _merge(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+        both[key] = (
+            merge_settings(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+        )
     return both
 
 
@@ -179,6 +182,10 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
         need = REQUIREMENTS.get(key)
         if need is not None and not need.holds(value):
             raise UsageError(f"{source}: {key}: {_short_json(value)} must be {need.must}")
+        if key.startswith("access_control/") and "enabled" not in settings["access_control"]:
+            raise UsageError(
+                f"{source}: access_control: has no `enabled: true`, without which Zenoh lets everybody in"
+            )
         if re.fullmatch(_FILES, key):
             try:
                 Path(str(value)).read_bytes()

@@ -8,14 +8,18 @@ from collections.abc import Mapping
 from itertools import permutations
 from typing import Literal
 
+import numpy as np
 from msgspec import field
 
 from ..core.laws.tanks import Tanks
 from ..core.laws.tdpa import Tdpa
 from ..core.laws.wave import Wave, find_line
+from ..core.site_setup import Gains, Law
+from ..core.vectors import Array
 from .fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition
+from .linear_form import LinearForm, LinearSituation
 
 _PASSIVE = "operators and environments are passive (*sufficient*)"
 
@@ -75,6 +79,38 @@ class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
             return KeyProblem("rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick")
         return None
 
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns its gravity."""
+        return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns lines as the delays that they are, in continuous time, if no wave is late or lost."""
+        if any(self.K) and not all(self.K):
+            return None
+        here = at.names[at.site]
+        form = LinearForm(len(at.inertia), [f"q_sd_{at.names[j]}" for j in at.peers] if any(self.K) else [])
+        K, B = np.array(self.K), np.array(self.B)
+        for j in at.peers:
+            line = find_line(self.lines, here, at.names[j])
+            b = np.array(self.b if line is None else [line])
+            if not b.all():
+                continue
+            c, to, came, led = np.sqrt(2.0 * b), ("to", j), ("from", j), f"q_sd_{at.names[j]}"
+            if not any(self.K):
+                form.add("tau", "qd", -b / self.beta)
+                form.add("tau", came, c / self.beta)
+                form.add(to, "qd", c)
+                form.add(to, came, -1.0)
+                continue
+            rate = {came: c / (b + B), led: -K / (b + B), "q": K / (b + B), "qd": B / (b + B)}
+            for column, own in ((came, 0.0), (led, K), ("q", -K), ("qd", -B)):
+                force = own + B * rate[column]
+                form.add(led, column, rate[column])
+                form.add("tau", column, force / self.beta)
+                form.add(to, column, -c / b * force)
+            form.add(to, came, 1.0)
+        return form
+
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns that the lines are passive, and how sites share."""
         here = situation.names[situation.site]
@@ -109,6 +145,10 @@ class EnergyTanks(EnergyLaw, frozen=True, tag_field="law", tag="tanks"):
     """
 
     core_class = Tanks
+
+    def explain_no_linear_form(self) -> str:
+        """Returns why it cannot be linearised."""
+        return "it is the layer where a tank is full enough, and none where it is empty: energy switches it"
 
     K: PositiveJoints = (100.0,)
     Kd: NotNegativeJoints = (2.0,)
@@ -150,6 +190,10 @@ class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
     """
 
     core_class = Tdpa
+
+    def explain_no_linear_form(self) -> str:
+        """Returns why it cannot be linearised."""
+        return "its controllers act by the energy observed, which is of second order in the motion"
 
     K: NotNegativeJoints = (0.0,)
     B: NotNegativeJoints = (0.0,)

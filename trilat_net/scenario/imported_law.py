@@ -24,6 +24,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 from .fields import Frozen
 from .law_conditions import LawSituation, StabilityCondition
+from .linear_form import LinearForm, LinearSituation
 from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
@@ -45,8 +46,19 @@ class PluggedLaw(Frozen, frozen=True):
         return Gains(Law.OWN)
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns the law of known gravity whose small motions are this law's; None: there is none."""
+        """Returns the law of known gravity, or the adaptive one, whose small motions are this law's.
+
+        With those of `linear_form`, if it has any; None: there is none.
+        """
         return None
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:  # noqa: ARG002
+        """Returns its small motions beyond those of `linear_gains`."""
+        return None
+
+    def explain_no_linear_form(self) -> str:
+        """Returns why it cannot be linearised, if `linear_gains` has nothing."""
+        return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Returns what the stability of the law at a site rests on; None if that is not known here."""

@@ -29,6 +29,7 @@ from .fields import (
 )
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .linear_form import LinearForm, LinearSituation
 
 _LLEWELLYN = (
     "transparent without delay only; with delay no bound is known that holds for every operator and "
@@ -68,10 +69,19 @@ class FourChannels(PluggedLaw, frozen=True, tag_field="law", tag="four_channel")
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the same law as one of known gravity, which has neither qdd nor the arm's own torque."""
-        if self.acceleration or any(self.force_own):
-            return None
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.B, d=(0.0,), k_f=self.force_peer, known=known)
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns what acceleration and the arm's own torque add."""
+        if not self.acceleration and not any(self.force_own):
+            return None
+        form = LinearForm(len(at.inertia), sends_acceleration=self.acceleration > 0.0)
+        form.add("tau", "tau_h", self.force_own)
+        for j in at.peers:
+            form.add("tau", ("from", j), self.acceleration * at.alpha[at.site, j] * at.inertia)
+            form.add(("to", j), "q", 0.0)
+        return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Returns that acceleration = 1 is unstable with any delay; else Llewellyn's condition decides."""
@@ -151,6 +161,20 @@ class Authority(PluggedLaw, frozen=True, tag_field="law", tag="authority"):
     leads: bool = True
     gravity: NotNegative = 1.0
 
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns its damping and its gravity."""
+        return Gains(Law.KNOWN, d=self.d, known=(theta * self.gravity).tolist())
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns the springs to the users."""
+        form = LinearForm(len(at.inertia))
+        for j in at.peers:
+            share = at.alpha[at.site, j] * float(getattr(at.laws[j], "leads", False)) * np.array(self.K)
+            form.add("tau", "q", -share)
+            form.add("tau", ("from", j), share)
+            form.add(("to", j), "q", 1.0)
+        return form
+
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the condition of P+d among the users; the slave follows them and closes no loop."""
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
@@ -180,6 +204,11 @@ class Synchronised(PluggedLaw, frozen=True, tag_field="law", tag="sync"):
     K: PositiveJoints = (3.0,)
     Gamma: NotNegativeParameters = (1.0,)
     theta_hat0: Parameters = (0.0,)
+
+    def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
+        """Returns the adaptive law whose r is that of the absolute pose."""
+        gains = Gains(Law.ADAPTIVE, self.Lambda, self.K, Gamma=self.Gamma, theta_hat0=self.theta_hat0)
+        return gains._replace(absolute=True)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns that every constant delay is allowed, and what it then does."""
@@ -253,6 +282,24 @@ class Impedances(PluggedLaw, frozen=True, tag_field="law", tag="impedance"):
     K: PositiveJoints = (50.0,)
     follows: bool = False
 
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns its gravity."""
+        return Gains(Law.KNOWN, known=theta.tolist())
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns the impedance, by the inertia of the arm, and the force that the slave sends."""
+        form = LinearForm(len(at.inertia))
+        share = at.inertia @ np.diag(np.broadcast_to(1.0 / np.array(self.M), len(at.inertia)))
+        form.add("tau", "tau_h", share - np.eye(len(at.inertia)))
+        for column, gain in (("q", self.K), ("qd", self.B)):
+            form.add("tau", column, -share * np.array(gain))
+            if self.follows:
+                form.add("tau", f"{column}_des", share * np.array(gain))
+        for j in at.peers:
+            form.add("tau", ("from", j), share)
+            form.add(("to", j), "tau_h", self.follows * at.alpha[at.site, j])
+        return form
+
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the stiffest spring at the slave's arm for which the small-gain theorem holds."""
         followers = [n for n, law in enumerate(situation.laws) if getattr(law, "follows", False)]
@@ -314,6 +361,28 @@ class SmithPredicted(PluggedLaw, frozen=True, tag_field="law", tag="smith"):
     inertia: PositiveJoints = (1.0,)
     predicts: bool = False
     gravity: NotNegative = 1.0
+
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns its damping and its gravity; of the slave, which is P+d, its stiffness too."""
+        K = (0.0,) if self.predicts else self.K
+        return Gains(Law.KNOWN, K=K, d=self.d, known=(theta * self.gravity).tolist())
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns the model, which the master has under its own pose and the slave under what came."""
+        (peer,), K, m = at.peers, np.array(self.K), np.array(self.inertia)
+        form = LinearForm(len(at.inertia), ("x", "xd"))
+        form.add("x", "xd", 1.0)
+        form.add("xd", "x", -K / m)
+        form.add("xd", "xd", -np.array(self.d) / m)
+        form.add("xd", "q" if self.predicts else "q_des", K / m)
+        if self.predicts:
+            form.add("tau", "q", -K)
+            form.add("tau", "x", K)
+            form.add("tau", ("from", peer), K)
+        else:
+            form.add(("to", peer), "q", 1.0)
+            form.add(("to", peer), "x", -1.0)
+        return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns that the model decides: with the true one the loop is that without delay."""

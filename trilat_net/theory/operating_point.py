@@ -11,7 +11,7 @@ as a run makes.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from ..errors import ScenarioError
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.imported_law import ImportedLaw, PluggedLaw
+from ..scenario.linear_form import LinearForm, LinearSituation
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .site_dynamics import SiteRates, evaluate_site_rates
@@ -67,6 +68,7 @@ class OperatingConditions(NamedTuple):
         age_s: age of the sample of j that i uses, shape (N, N), s; 0 where it uses none.
         notes: remarks on what was left out or fixed.
         varying: True if ages vary, and `age_s` holds their means.
+        laws: the control of each site.
     """
 
     sites: tuple[SiteSetup, ...]
@@ -74,6 +76,21 @@ class OperatingConditions(NamedTuple):
     age_s: Array
     notes: tuple[str, ...]
     varying: bool = False
+    laws: tuple[Any, ...] = ()
+
+    def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
+        """Returns what laws add to their gains in small motions, with the inertia of their arms."""
+        forms: list[LinearForm | None] = []
+        for n, law in enumerate(self.laws):
+            M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
+            situation = LinearSituation(n, self.names, self.laws, self.alpha, M)
+            forms.append(law.linear_form(situation) if isinstance(law, PluggedLaw) else None)
+        return forms
+
+    @property
+    def has_forms(self) -> bool:
+        """True if a law has states of its own, or sends more than samples have: then time is continuous."""
+        return any(form is not None for form in self.find_forms())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,7 +125,12 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
     )
     alpha = _final_dominance(scenario, sites, notes)
     age_s, varying = np.zeros_like(alpha), []
-    for i, j in zip(*np.nonzero(alpha), strict=True):
+    laws = tuple(spec.control for spec in scenario.sites.values())
+    conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
+    links = ~np.eye(len(alpha), dtype=bool) if conditions.has_forms else alpha != 0.0
+    if conditions.has_forms:
+        notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
+    for i, j in zip(*np.nonzero(links), strict=True):
         age = _final_age(scenario, scenario.names[j], scenario.names[i], notes)
         age_s[i, j] = age.mean_s
         if age.most_s > age.least_s:
@@ -122,7 +144,7 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
         )
     if any(site.on_stale.action is not StaleAction.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
-    return OperatingConditions(sites, alpha, age_s, tuple(dict.fromkeys(notes)), bool(varying))
+    return conditions._replace(notes=tuple(dict.fromkeys(notes)), varying=bool(varying))
 
 
 def is_constant_link(link: LinkBase) -> bool:
@@ -138,9 +160,12 @@ def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
         gains = law.linear_gains(theta) if isinstance(law, PluggedLaw) else law.gains(theta)
         if gains is None:
             code = f"{law.code} is an imported law" if isinstance(law, ImportedLaw) else "is a law"
+            why = law.explain_no_linear_form() if isinstance(law, PluggedLaw) else ""
             raise ScenarioError(
-                f"{code}, whose equations are unknown here; adaptive, adaptive_box, p_d, pd_d and p_f can be "
-                "linearised, and some others, see docs/laws.md",
+                f"has no linear loop: {why}"
+                if why
+                else f"{code}, whose equations are unknown here; adaptive, adaptive_box, p_d, pd_d and p_f "
+                "can be linearised, and some others, see docs/laws.md",
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )

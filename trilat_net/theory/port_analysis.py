@@ -86,7 +86,7 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> Loo
     In task space it is J r, with places in q's stead. None if a site has another law than the paper's, which
     has no r, and where orientations are followed, or axes that a peer leaves free: there is no proof.
     """
-    if any(site.gains.law is not Law.ADAPTIVE for site in conditions.sites):
+    if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites):
         return None
     if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE_COORDINATES:
         return None

@@ -81,7 +81,8 @@ def evaluate_transfer(loop: LinearLoop, s: Complex, output: LoopOutput | None = 
     response = np.zeros((len(s), len(output.C), loop.B.shape[1]), np.complex128)
     for first in range(0, len(s), _BATCH):
         some = s[first : first + _BATCH]
-        left = some[:, np.newaxis, np.newaxis] * np.eye(len(loop.A)) - loop.A
+        rates = np.eye(len(loop.A)) if loop.E is None else np.diag(loop.E)
+        left = some[:, np.newaxis, np.newaxis] * rates - loop.A
         right = np.broadcast_to(loop.B.astype(np.complex128), (len(some), *loop.B.shape)).copy()
         for term in loop.delayed:
             shift = np.exp(-some * term.delay_s)[:, np.newaxis, np.newaxis]
@@ -246,4 +247,5 @@ def _clamp(loop: LinearLoop, site: str) -> LinearLoop:
         now.B,
         loop.C[np.ix_(others, kept)],
         tuple(term for term in late if term.A.any() or term.B.any()),
+        E=None if loop.E is None else loop.E[kept],
     )

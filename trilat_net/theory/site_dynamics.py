@@ -196,6 +196,11 @@ def _evaluate_law(
         pull = pull + K * e - k_f * x[at.peer_torque]
         return G - d * qd - following.to_joints(pull), 0.0 * estimate
     r = qd - v
+    if gains.absolute:
+        Lambda = _as_columns(gains.Lambda, q)
+        v, a, r = -Lambda * q, -Lambda * qd, qd + Lambda * q
+        led = _as_columns(gains.Kp, q) * (x[at.qd_des] + Lambda * x[at.q_des])
+        pull = pull - led
     tau = arm.required_torque(estimate, qd, v, a) - _as_columns(gains.Kp, q) * r - following.to_joints(pull)
     rho, width, known = (_as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction))
     tau = tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)

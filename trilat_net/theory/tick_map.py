@@ -112,9 +112,11 @@ def compute_sampled_spectrum(
 ) -> Spectrum | None:
     """Returns the rightmost roots s = ln(z) / h of the sampled loop; None if the sites have several rates.
 
+    Also where a law has states or waves of its own, which is linearised in continuous time alone.
+
     If delays are long Newton's method starts `near` the roots of the continuous loop.
     """
-    if find_common_rate_hz(conditions) is None:
+    if find_common_rate_hz(conditions) is None or conditions.has_forms:
         return None
     pencil, names, constant = build_tick_pencil(conditions, rest)
     h_s = 1.0 / conditions.sites[0].rate_hz

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_layout import collect_provenance
+from trilat_net.studies.run_journal import RunJournal
 from trilat_net.studies.sweep import sweep_folder as folders
 from trilat_net.studies.sweep.sweep_cell import CellRun
 from trilat_net.studies.sweep.sweep_folder import (
     PLAN_FILE,
-    SweepJournal,
     open_sweep_folder,
     prepare_sweep_folder,
 )
@@ -110,15 +110,19 @@ def entry(cell: int, seed: int = 1) -> CellRun:
     )
 
 
+def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
+    return RunJournal(path, sweep, CellRun, folders.build_resume_hint(path.parent))
+
+
 def written(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
-    with SweepJournal(path, sweep) as journal:
+    with opened(path, sweep) as journal:
         for one in entries:
             journal.add(one)
     return path.read_bytes()
 
 
 def read(path: Path, sweep: str = NAME) -> list[CellRun]:
-    with SweepJournal(path, sweep) as journal:
+    with opened(path, sweep) as journal:
         return list(journal.done.values())
 
 
@@ -183,7 +187,7 @@ def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
 
 def test_a_run_that_a_full_disk_refuses_is_not_done_and_says_how_to_go_on(path: Path) -> None:
     """`/dev/full` answers as a disk does that is full."""
-    with SweepJournal(path, "sweep") as journal:
+    with opened(path, "sweep") as journal:
         journal.add(FIVE[0])
         whole = journal._file
         with Path("/dev/full").open("ab", buffering=0) as full:

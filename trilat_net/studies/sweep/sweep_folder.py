@@ -1,100 +1,31 @@
 """The folder of a sweep: its plan, the journal of finished runs, and at the end the results.
 
-Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed in. Each
-journal line carries a CRC-32 over sweep and text, so a torn line is ignored; a process that dies at any
-moment loses no earlier line and spoils no later one.
+Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed in.
 """
 
-import errno
 import hashlib
 import json
-import os
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from ...core.fingerprint import compute_fingerprint
 from ...errors import UsageError
-from ...files import describe_write_error, make_results_folder, write_whole
+from ...files import make_results_folder, write_whole
 from ...log.log_layout import collect_provenance
 from ..commands import format_command
+from ..run_journal import RunJournal
 from .sweep_cell import CellRun
 from .sweep_plan import SweepPlan, plan_from_json
 from .sweep_results import RESULTS_FILE
 
 JOURNAL_FILE = "cells.journal"
 
-RunKey = tuple[int, int]
-"""A run: cell and seed."""
-
-
-class SweepJournal:
-    """The runs that are done, in a file that is only ever appended to; a context, which closes it.
-
-    Attributes:
-        done: the runs, by cell and seed; lines of another sweep count for nothing.
-    """
-
-    def __init__(self, path: Path, sweep: str) -> None:
-        self._path, self._sweep = path, sweep
-        self.done: dict[RunKey, CellRun] = {}
-        before = path.read_bytes() if path.exists() else b""
-        for entry in _entries(before, sweep):
-            self.done.setdefault((entry.cell, entry.seed), entry)
-        self._file = path.open("ab", buffering=0)
-        if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
-            self._put(b"\n")
-
-    def __enter__(self) -> "SweepJournal":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.fsync(self._file.fileno())
-        self._file.close()
-
-    def add(self, entry: CellRun) -> None:
-        """Writes one run down, at once; one that is there already changes nothing.
-
-        Raises:
-            LogRefused: the disk refused it.
-        """
-        if (entry.cell, entry.seed) in self.done:
-            return
-        self._put(encode_journal_line(entry, self._sweep))
-        self.done[entry.cell, entry.seed] = entry
-
-    def _put(self, data: bytes) -> None:
-        try:
-            if self._file.write(data) != len(data):  # a disk that became full takes a part, and says nothing
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise describe_write_error(self._path, error, build_resume_hint(self._path.parent)) from None
-
 
 def build_resume_hint(folder: Path) -> str:
     """Returns how to go on with a sweep that the disk interrupted."""
     command = format_command("sweep", "--resume", str(folder))
     return f"what is done is kept: make room, and go on with: {command}"
-
-
-def encode_journal_line(entry: CellRun, sweep: str) -> bytes:
-    """Returns the line of a run: JSON, a tab, and the CRC-32 of sweep and JSON in hexadecimal digits."""
-    text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
-    return b"%s\t%08x\n" % (text, _checksum(text, sweep))
-
-
-def _checksum(text: bytes, sweep: str) -> int:
-    return zlib.crc32(text, zlib.crc32(sweep.encode()))
-
-
-def _entries(data: bytes, sweep: str) -> Iterator[CellRun]:
-    for one in data.split(b"\n"):
-        text, tab, digits = one.rpartition(b"\t")
-        if tab and digits == b"%08x" % _checksum(text, sweep):
-            yield msgspec.convert(json.loads(text), CellRun)  # unlike msgspec, json knows infinity
 
 
 PLAN_FILE = "plan.json"
@@ -125,9 +56,10 @@ class SweepFolder(NamedTuple):
         """Where the results are, once all runs are done."""
         return self.path / RESULTS_FILE
 
-    def journal(self) -> SweepJournal:
+    def journal(self) -> RunJournal[CellRun]:
         """Opens the journal."""
-        return SweepJournal(self.path / JOURNAL_FILE, hashlib.sha256(_text(self.facts).encode()).hexdigest())
+        study = hashlib.sha256(_text(self.facts).encode()).hexdigest()
+        return RunJournal(self.path / JOURNAL_FILE, study, CellRun, build_resume_hint(self.path))
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:

@@ -27,10 +27,11 @@ from ..executor import (
     list_imported_laws,
     open_worker_pool,
 )
+from ..run_journal import RunJournal
 from . import cell_result
 from .cell_result import CellClass
 from .sweep_cell import CellRun, SweepSource, run_cell
-from .sweep_folder import SweepFolder, SweepJournal, build_resume_hint
+from .sweep_folder import SweepFolder, build_resume_hint
 from .sweep_plan import SweepPlan
 from .sweep_results import (
     GRID_POINTS_FILE,
@@ -178,7 +179,7 @@ def run_sweep(
     return FinishedSweep(results, folder, speed)
 
 
-def _run_cells(plan: SweepPlan, journal: SweepJournal, pool: WorkerPool, progress: Progress) -> None:
+def _run_cells(plan: SweepPlan, journal: RunJournal[CellRun], pool: WorkerPool, progress: Progress) -> None:
     """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = plan.seeds
 

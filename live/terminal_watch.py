@@ -1,0 +1,128 @@
+"""`trilat watch`: a session in a terminal, a line for each site.
+
+A terminal shows a table that is refreshed; other outputs get the same lines every two seconds.
+"""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from trilat_net.core.live_hand import HandInForce
+from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import SessionError
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.process import Interrupt
+
+from .session_view import SessionView, SiteView
+
+POLL_NS = 20_000_000
+TABLE_NS, LINES_NS = NS_PER_S // 4, 2 * NS_PER_S
+"""Between two updates of a table, and of lines."""
+HEADS = ("site", "time", "mode", "angles", "|e|", "torque", "age of each peer's sample", "held", "late")
+
+
+class SessionWatch:
+    """What is shown of a session; `update` takes in what has come."""
+
+    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+        self.view = SessionView(bus, clock, session)
+        self._V = ""
+
+    def update(self) -> None:
+        """Takes in what has come, and computes V as far as all records are there."""
+        view = self.view
+        view.poll()
+        if view.energy is None:
+            return
+        course = view.energy.advance({name: site.complete for name, site in view.sites.items()})
+        if course is not None:
+            self._V = f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, people and walls gave "
+            self._V += f"{course.supplied[-1]:.4g} J"
+        elif view.energy.reason:
+            self._V = f"no V: {view.energy.reason}"
+
+    @property
+    def title(self) -> str:
+        """The session, and its V."""
+        state = self._V if self.view.running else "waits for its members"
+        return f"session {self.view.session}" + (f"; {state}" if state else "")
+
+    def rows(self) -> list[list[str]]:
+        """Returns a line of `HEADS` for each site."""
+        return [self._row(name, site) for name, site in self.view.sites.items()]
+
+    def _row(self, name: str, site: SiteView) -> list[str]:
+        record, stats = site.record, site.stats
+        if record is None or not site.window.knows(record.tick):
+            return [name, *[""] * (len(HEADS) - 1)]
+        own = site.window.rows(record.tick, record.tick)
+        apart, unit = float(np.linalg.norm(own.e[0])), "m" if record.x else "rad"
+        ages = {} if stats is None else stats.age_us
+        hand = HandInForce.read(record.hand) if record.hand else None
+        held = "" if hand is None else "yes" if hand.source else "fades" if hand.grip else "free"
+        return [
+            name,
+            f"{record.t_ns / NS_PER_S:.1f} s",
+            "silent" if self.view.silent(site) else record.mode,
+            " ".join(f"{q:+.3f}" for q in record.q) + " rad",
+            f"{apart:.4f} {unit}",
+            f"{max(map(abs, record.tau)):.2f} N m",
+            ", ".join(
+                f"{peer} {age / 1000:.0f} ms" if age >= 0 else f"{peer} none" for peer, age in ages.items()
+            ),
+            held,
+            "" if stats is None else f"{stats.late_max_us} us",
+        ]
+
+
+def watch_session(
+    bus: Bus, clock: Clock, session: str, console: Console, interrupt: Interrupt, timeout_s: float
+) -> None:
+    """Shows a session until it ends or a signal comes.
+
+    Raises:
+        SessionError: no site answers in time.
+    """
+    watch = SessionWatch(bus, clock, session)
+    live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+    begun_ns = shown_ns = clock.monotonic_ns()
+    with live or nullcontext():
+        while not (interrupt.requested() or watch.view.ended):
+            watch.update()
+            now_ns = clock.monotonic_ns()
+            if not watch.view.met and now_ns - begun_ns > timeout_s * NS_PER_S:
+                raise SessionError(f"no site of session {session!r} answered within {timeout_s:g} s")
+            if now_ns - shown_ns >= (LINES_NS if live is None else TABLE_NS):
+                shown_ns = now_ns
+                _show(watch, console, live)
+            clock.sleep_until(now_ns + POLL_NS)
+
+
+def _show(watch: SessionWatch, console: Console, live: Live | None) -> None:
+    rows = watch.rows()
+    if live is not None:
+        live.update(_tabulate(watch.title, rows), refresh=True)
+        return
+    for line in [watch.title, *(describe_row(row) for row in rows)]:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def describe_row(row: Sequence[str]) -> str:
+    """Returns a site in a line of text."""
+    name, time, mode, angles, apart, torque, ages, held, late = row
+    parts = [f"{name} {time} {mode}", angles, f"|e| {apart}", f"torque {torque}", f"age {ages}"]
+    return "; ".join([*parts, *([f"hand {held}"] if held else []), f"late {late}"])
+
+
+def _tabulate(title: str, rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for head in HEADS:
+        table.add_column(head, justify="right" if head in ("time", "|e|", "torque", "late") else "left")
+    for row in rows:
+        table.add_row(*row)
+    return table

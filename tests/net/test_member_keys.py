@@ -1,0 +1,269 @@
+"""Keys of members, and what a member with a valid certificate cannot do all the same.
+
+The attacker is a member, `s`, that holds itself to no rules; what it may say comes after what it may not on
+the same link, so that the first has been refused once the second is there.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trilat_net.errors import UsageError
+from trilat_net.net import topics
+from trilat_net.net.access_rules import MOST_PUT_BYTES, OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
+from trilat_net.net.bus import Bus
+from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
+from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, MemberKeys, create_keys, read_member_keys
+from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+
+from .waiting import answered, drained, received, until
+
+SITES = ("m1", "m2", "s")
+ALL = (*SITES, RECORDER, OPERATOR, ROUTER)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("deployment") / "keys"
+    create_keys(made, ALL, ["192.0.2.1", "robot.example"], 30)
+    return made
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("others") / "keys"
+    create_keys(made, ALL, [], 30)
+    return made
+
+
+def lawless(keys: MemberKeys) -> dict[str, Any]:
+    """The settings of a member that holds nobody to any rules, itself neither."""
+    return {"transport": keys.settings["transport"]}
+
+
+class Meeting:
+    """m1 and m2 with their keys, and whoever joins them, as peers of one another or through a router."""
+
+    def __init__(self, folder: Path, *, routed: bool) -> None:
+        self.folder, self.members = folder, list[Bus]()
+        places = [place.replace("tcp", "tls") for place in find_free_endpoints(3)]
+        self._places, self._mode = (places[2:], "client") if routed else (places[:2], "peer")
+        if routed:
+            self.members.append(ZenohBus(places[2:], mode="router", own=self._own(ROUTER)))
+        listens = [[], []] if routed else [[place] for place in places[:2]]
+        self.m1 = self._enter(listens[0], places[2:] if routed else [], self._own("m1"))
+        self.m2 = self._enter(listens[1], places[2:] if routed else places[:1], self._own("m2"))
+
+    def _own(self, member: str) -> dict[str, Any]:
+        return read_member_keys(self.folder / member).settings
+
+    def _enter(self, listen: list[str], connect: list[str], own: dict[str, Any]) -> ZenohBus:
+        bus = ZenohBus(listen, connect, self._mode, own)  # type: ignore[arg-type]
+        self.members.append(bus)
+        return bus
+
+    def join(self, own: dict[str, Any]) -> ZenohBus:
+        return self._enter([], self._places, own)
+
+    def close(self) -> None:
+        for member in reversed(self.members):
+            member.close()
+
+
+@pytest.fixture(params=[False, True], ids=["peers", "router"])
+def meeting(request: pytest.FixtureRequest, folder: Path) -> Iterator[Meeting]:
+    made = Meeting(folder, routed=request.param)
+    yield made
+    made.close()
+
+
+def key(member: str, channel: str) -> str:
+    return topics.key("x", member, channel)
+
+
+def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
+    """All that came until one's own word is heard, which is repeated until it is."""
+    came: list[tuple[str, bytes]] = []
+
+    def there() -> bool:
+        say(b"true")
+        came.extend(drained(inbox))
+        return any(payload == b"true" for _, payload in came)
+
+    until(there)
+    return came
+
+
+def test_a_member_speaks_under_its_own_name_alone(meeting: Meeting, folder: Path) -> None:
+    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
+    inbox, alive = (
+        meeting.m1.inbox(key("*", topics.EVENT)),
+        meeting.m1.presence(topics.presence_key("x", "*")),
+    )
+    forged, true = attacker.publisher(key("m2", topics.EVENT)), attacker.publisher(key("s", topics.EVENT))
+    attacker.announce(topics.presence_key("x", "m2").replace("*", "666"))
+    attacker.announce(topics.presence_key("x", "s").replace("*", "7"))
+
+    def say(payload: bytes) -> None:
+        forged(b"forged")
+        true(payload)
+
+    assert {where for where, _ in heard(say, inbox)} == {key("s", topics.EVENT)}
+    assert until(alive.poll) == (topics.presence_key("x", "s").replace("*", "7"), True)
+    assert drained(alive) == []
+
+
+def test_nobody_answers_for_another(meeting: Meeting, folder: Path) -> None:
+    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
+    attacker.respond(key("m2", topics.INFO), lambda _: b"forged")
+    attacker.respond(key("s", topics.INFO), lambda _: b"true")
+    first = until(lambda: answered(meeting.m1, key("*", topics.INFO)))
+    assert first == (key("s", topics.INFO), b"true")
+    answers = [reply[1] for reply in received(meeting.m1.ask(key("*", topics.INFO)), 1)]
+    assert answers == [b"true"]
+
+
+def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> None:
+    attacker = meeting.join(lawless(read_member_keys(folder / "s")))
+    operator = meeting.join(read_member_keys(folder / OPERATOR).settings)
+    meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
+    inbox = meeting.m1.inbox(key("m1", topics.HAND))
+    forged, true = (bus.publisher(key("m1", topics.HAND)) for bus in (attacker, operator))
+    assert until(lambda: answered(operator, key("m1", topics.SET), b"order"))
+    assert answered(attacker, key("m1", topics.SET), b"order") is None
+
+    def say(payload: bytes) -> None:
+        forged(b"forged")
+        true(payload)
+
+    assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+
+
+def test_what_is_too_long_is_dropped_and_what_is_not_goes_on(meeting: Meeting) -> None:
+    inbox, publish = meeting.m1.inbox(key("m2", topics.STATE)), meeting.m2.publisher(key("m2", topics.STATE))
+    recorder = meeting.join(read_member_keys(meeting.folder / RECORDER).settings)
+    records = recorder.inbox(key("m2", topics.STATE))
+
+    def say(payload: bytes) -> None:
+        publish(bytes(MOST_PUT_BYTES + 1))
+        publish(payload)
+
+    assert {payload for _, payload in heard(say, records)} == {b"true"}
+    assert drained(inbox) == []  # a site hears no records but its own
+
+
+def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
+    inbox = meeting.m1.inbox(key("*", topics.EVENT))
+    stranger = meeting.join(lawless(read_member_keys(foreign / "m2"))) if meeting._mode == "peer" else None
+    if stranger is None:
+        with pytest.raises(RouterSilent):
+            meeting.join(lawless(read_member_keys(foreign / "m2")))
+    else:
+        stranger.publisher(key("m2", topics.EVENT))(b"forged")
+    came = heard(meeting.m2.publisher(key("m2", topics.EVENT)), inbox)
+    assert {payload for _, payload in came} == {b"true"}
+
+
+def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
+    keys = read_member_keys(folder / "m1")
+    assert (keys.member, keys.members) == ("m1", ALL)
+    with pytest.raises(UsageError, match="folder of one member"):
+        read_member_keys(folder)
+    with pytest.raises(UsageError, match="No such file"):
+        read_member_keys(tmp_path)
+    with pytest.raises(UsageError, match="name a new folder"):
+        create_keys(folder, SITES, [], 30)
+    with pytest.raises(UsageError, match=r"letters, digits, _ and -, not 'm\*'"):
+        create_keys(tmp_path / "k", ["m*"], [], 30)
+    create_keys(tmp_path / "old", SITES, [], 0)
+    with pytest.raises(UsageError, match="ended on"):
+        read_member_keys(tmp_path / "old" / "m1")
+
+
+@pytest.mark.parametrize(
+    ("take", "from_", "words"),
+    [
+        (CERTIFICATE, "s", "is that of s"),
+        (PRIVATE_KEY, "m2", "private key is not that of the certificate"),
+        ("authority.pem", "", "has not signed"),
+    ],
+)
+def test_keys_of_several_do_not_mix(
+    take: str, from_: str, words: str, folder: Path, foreign: Path, tmp_path: Path
+) -> None:
+    for file in (folder / "m1").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / PRIVATE_KEY).chmod(0o600)
+    source = folder / from_ if from_ else foreign / "m1"
+    (tmp_path / take).write_bytes((source / take).read_bytes())
+    with pytest.raises(UsageError, match=words):
+        read_member_keys(tmp_path)
+
+
+def test_a_key_that_others_can_read_is_refused(folder: Path, tmp_path: Path) -> None:
+    for file in (folder / "m1").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / PRIVATE_KEY).chmod(0o644)
+    with pytest.raises(UsageError, match="chmod 600"):
+        read_member_keys(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("listen", "open_"),
+    [
+        ("tcp/0.0.0.0:7447", True),
+        ("tcp/[::]:7447", True),
+        ("tcp/192.0.2.1:7447", True),
+        ("tls/192.0.2.1:7447", True),
+        ("tcp/127.0.0.1:7447", False),
+        ("tcp/[::1]:7447", False),
+        ("tcp/localhost:7447", False),
+        ("unixsock-stream//tmp/x", False),
+    ],
+)
+def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> None:
+    connection = Connection([listen])
+    assert secure_connection(connection, None, insecure=True) == connection
+    if open_:
+        with pytest.raises(UsageError, match="--insecure"):
+            secure_connection(connection, None, insecure=False)
+    else:
+        assert secure_connection(connection, None, insecure=False) == connection
+
+
+def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
+    own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
+    safe = Connection(["tls/192.0.2.1:7447"], own=own)
+    assert secure_connection(safe, None, insecure=False) == safe
+    with pytest.raises(UsageError, match="--insecure"):
+        secure_connection(Connection(["tcp/192.0.2.1:7447"], own=own), None, insecure=False)
+
+
+def test_with_keys_links_are_encrypted(folder: Path) -> None:
+    keys = read_member_keys(folder / "m1")
+    safe = secure_connection(Connection(["tcp/127.0.0.1:1"], ["tls/192.0.2.1:7"]), keys, insecure=False)
+    assert (safe.reach(safe.listen), safe.reach(safe.connect or ())) == (
+        ["tls/127.0.0.1:1"],
+        ["tls/192.0.2.1:7"],
+    )
+    for plain in ("tcp/192.0.2.1:7", "udp/192.0.2.1:7", "ws/192.0.2.1:7"):
+        with pytest.raises(UsageError, match="tls"):
+            secure_connection(Connection([], [plain]), keys, insecure=True)
+    with pytest.raises(UsageError, match="one place"):
+        secure_connection(Connection(own={"access_control": {"enabled": True}}), keys, insecure=False)
+
+
+def test_every_rule_names_its_member_or_everybody_and_denies_the_rest() -> None:
+    rules = make_access_rules(ALL)["access_control"]
+    assert rules["enabled"] is True
+    assert rules["default_permission"] == "deny"
+    says = {
+        rule["id"].split()[0]: set(rule["key_exprs"])
+        for rule in rules["rules"]
+        if rule["flows"] == ["ingress"] and rule["messages"] == ["put"]
+    }
+    for site in SITES:
+        assert {topics.parse_key(one).member for one in says[site]} == {site}  # type: ignore[union-attr]
+    assert says[OPERATOR] == {topics.key("*", "*", channel) for channel in ROLES[OPERATOR].addresses}

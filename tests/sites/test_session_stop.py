@@ -1,0 +1,59 @@
+"""A session that is ended in order, and watched in a terminal meanwhile."""
+
+from pathlib import Path
+
+import pytest
+
+from live.terminal_watch import HEADS, SessionWatch, describe_row
+from sites.session_stop import stop_session
+from trilat_net.errors import SessionError
+from trilat_net.execution.verify import verify
+from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.clock import ManualClock
+from trilat_net.scenario import load_scenario
+
+from .relay import RelayClock
+from .sessions import SESSION, Session
+
+LIVE = {"sites.m1.hands": [{"kind": "live"}]}
+
+
+def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_path: Path) -> None:
+    session = Session.whole(load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={})
+    said: list[str] = []
+    shown: list[list[list[str]]] = []
+    titles: list[str] = []
+
+    def stop(bus: Bus, clock: RelayClock) -> None:
+        clock.sleep_until(clock.monotonic_ns() + 2_500_000_000)
+        said.extend(stop_session(bus, clock, SESSION))
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        watch = SessionWatch(bus, clock, SESSION)
+        while not watch.view.ended:
+            watch.update()
+            shown.append(watch.rows())
+            titles.append(watch.title)
+            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+
+    session.stranger(stop)
+    session.stranger(look)
+    log = session.run()
+    assert session.ends == {"m1": 0, "m2": 0, "s": 0}
+    (ticks,) = {log.expected_ticks(name) for name in log.sites}
+    assert 1500 < ticks < 4000
+    assert said == [f"{name} ends at t = {ticks / 1000:.3f} s" for name in log.sites]
+    assert log.complete
+    assert verify(log).identical == 3 * ticks
+    last = [dict(zip(HEADS, row, strict=True)) for row in shown[-1]]
+    assert [row["site"] for row in last] == ["m1", "m2", "s"]
+    assert last[0]["angles"] == " ".join(f"{q:+.3f}" for q in log["m1"].q[-1]) + " rad"
+    assert [row["held"] for row in last] == ["free", "", ""]
+    assert describe_row(shown[-1][0]).startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
+    assert titles[0].endswith("waits for its members")
+    assert " V = " in titles[-1]
+
+
+def test_a_session_that_is_not_there_is_not_stopped() -> None:
+    with pytest.raises(SessionError, match="no site of session"):
+        stop_session(LocalNetwork().join(), ManualClock(), "t")

@@ -1,0 +1,162 @@
+"""`trilat bench`: the suite of control laws, on the same tasks, links and seeds.
+
+Invariant: everything printed is in the result files too. A suite that is interrupted goes on by the same
+command. Numbers are printed and nothing is ranked.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..errors import UsageError
+from ..reporting import terminal_output as terminal
+from . import options
+from .sweep import show_progress
+
+if TYPE_CHECKING:
+    from ..studies.bench import BenchPlan, BenchResults
+    from ..studies.bench.bench_run import BenchFolder
+
+_option = partial(typer.Option, rich_help_panel="Gains")
+
+
+def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
+    """Tunes laws of a study at all delays, and writes their gains into the file of the suite."""
+    from ..studies.bench.bench_gains import GAINS_FILE, tune_laws, write_gains
+    from ..studies.bench.bench_tasks import STUDIES
+
+    asked = STUDIES[study].laws
+    unknown = [law for law in laws if law not in {law for known in asked.values() for law in known}]
+    if unknown:
+        raise UsageError(f"--law: {unknown[0]} is none of the study {study}")
+    wanted = {form: [law for law in known if law in laws or not laws] for form, known in asked.items()}
+    with show_progress("tuning", terminal.print_note) as progress:
+        found = tune_laws({form: kept for form, kept in wanted.items() if kept}, jobs, on, progress)
+    write_gains(found)
+    terminal.print_paths([GAINS_FILE])
+
+
+def _print_cell(plan: "BenchPlan", name: str) -> None:
+    """Prints the commands that make logs of a cell, one per seed."""
+    for seed in plan.cell(name).seeds:
+        terminal.print_line(f"{plan.cell(name).build(seed).command} -o {name.replace('/', '-')}-{seed}.mcap")
+
+
+def _run(folder: "BenchFolder", jobs: int | None, on: str | None) -> "BenchResults":
+    from ..studies.bench import run_bench
+
+    try:
+        with show_progress("running", terminal.print_note) as progress:
+            return run_bench(folder, jobs, on, progress)
+    except KeyboardInterrupt:
+        terminal.print_note(f"what is done is kept in {folder.path}; the same command goes on")
+        raise
+
+
+def _write(results: "BenchResults", folder: Path, command: str) -> list[Path]:
+    from ..files import write_whole
+    from ..studies.bench.bench_figures import write_bench_figures
+    from ..studies.bench.bench_tables import build_bench_page, encode_places, encode_runs
+
+    texts = {
+        "bench.md": build_bench_page(results, command),
+        "places.csv": encode_places(results),
+        "runs.csv": encode_runs(results),
+    }
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+    return [*(folder / name for name in texts), *write_bench_figures(results, folder)]
+
+
+def _print_results(results: "BenchResults", paths: list[Path]) -> None:
+    from ..studies.bench.bench_tables import (
+        describe_bench,
+        list_quantities,
+        tabulate_energies,
+        tabulate_quantity,
+        tabulate_round_trips,
+        tabulate_verdicts,
+    )
+
+    for line in describe_bench(results):
+        terminal.print_text(line)
+    terminal.out.print()
+    terminal.print_table(tabulate_verdicts(results))
+    for asked in list_quantities(results):
+        if asked.key != "effort_nm":
+            terminal.out.print()
+            terminal.print_text(f"{asked.task}: {asked.words}")
+            terminal.print_table(tabulate_quantity(results, asked))
+    if any(run.observed for run in results.runs):
+        terminal.print_table(tabulate_energies(results))
+    if results.plan.study == "round-trips":
+        terminal.print_table(tabulate_round_trips(results))
+    terminal.print_paths(paths)
+
+
+def bench_command(
+    study: Annotated[
+        str, typer.Option("--study", metavar="full|small|round-trips", help="Which part of the suite.")
+    ] = "full",
+    small: Annotated[bool, typer.Option("--small", help="As --study small: some minutes.")] = False,
+    task: Annotated[
+        str | None, typer.Option("--task", metavar="TASK,TASK...", help="Some tasks alone.")
+    ] = None,
+    law: Annotated[str | None, typer.Option("--law", metavar="LAW,LAW...", help="Some laws alone.")] = None,
+    link: Annotated[
+        str | None, typer.Option("--link", metavar="LINK,LINK...", help="Other links, as in rtt68-loss10,4g.")
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", metavar="N", help="How many; default: the study's.")
+    ] = None,
+    cell: Annotated[
+        str | None,
+        typer.Option("--cell", metavar="TASK/LAW/LINK", help="Print the commands that make logs of a cell."),
+    ] = None,
+    tune: Annotated[
+        bool, _option("--tune", help="Tune the laws again, and keep their gains with the suite.")
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder; a suite in it goes on. Default: runs/bench-STUDY."
+        ),
+    ] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs control laws on the same tasks over the same links: errors, effort, transparency, passivity.
+
+    Each law has the gains that one procedure found for it. What is done is kept: the same command goes on.
+    """
+    from ..studies.bench import plan_bench, prepare_bench_folder
+    from ..studies.bench.bench_gains import find_stale
+    from ..studies.bench.bench_tables import bench_to_json
+    from ..studies.commands import format_command
+    from ..studies.executor import check_workers
+
+    check_workers(jobs, on)
+    chosen = "small" if small else study
+    lists = [options.split_names(one) for one in (task, law, link)]
+    if tune:
+        return _tune(lists[1], chosen, jobs, on)
+    plan = plan_bench(chosen, tasks=lists[0], laws=lists[1], links=lists[2], seeds=seeds)
+    if cell is not None:
+        return _print_cell(plan, cell)
+    stale = find_stale({str(one.tuned): one.tuned for one in plan.cells}.values())
+    if stale:
+        terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
+    folder = prepare_bench_folder(plan, output)
+    terminal.print_note(f"{len(plan.cells)} cells, {plan.runs} runs, into {folder.path}")
+    results = _run(folder, jobs, on)
+    given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
+    words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
+    paths = _write(results, folder.path, format_command("bench", "--study", chosen, *words))
+    if as_json:
+        terminal.print_json(bench_to_json(results))
+    else:
+        _print_results(results, paths)
+    return None

@@ -1,0 +1,51 @@
+"""`trilat keys`: the keys by which members of a session know one another."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..reporting import terminal_output as terminal
+
+
+def keys_new_command(
+    folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
+    members: Annotated[
+        list[str],
+        typer.Argument(
+            help="Sites, and recorder, operator, router as far as there are.", metavar="MEMBER..."
+        ),
+    ],
+    hosts: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--host", metavar="NAME", help="Name or address at which some member listens; repeatable."
+        ),
+    ] = None,
+    days: Annotated[
+        int, typer.Option("--days", min=1, max=3650, help="How long the certificates hold.")
+    ] = 30,
+) -> None:
+    """Makes keys: a private authority, and for each member a folder that it alone needs.
+
+    Bring each folder to its machine by a way that you trust, and give it as --keys. Members without keys, or
+    with those of another authority, cannot connect; each can speak under its own name alone. Keep the folder
+    `authority` where no member runs, or delete it: new keys are made for all at once.
+    """
+    from ..net.member_keys import create_keys
+
+    made = create_keys(folder, members, hosts or (), days)
+    for one in made:
+        terminal.print_line(f"{one}: for {one.name}")
+    terminal.print_line(f"they hold for {days} days; as in: trilat site {made[0].name} --keys {made[0]} ...")
+
+
+def keys_info_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
+) -> None:
+    """Shows whose keys these are, until when they hold, and the settings of Zenoh that they make."""
+    from ..net.member_keys import read_member_keys
+
+    keys = read_member_keys(folder)
+    terminal.print_line(f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC")
+    terminal.print_json(keys.settings)

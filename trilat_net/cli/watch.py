@@ -1,0 +1,54 @@
+"""`trilat watch`: shows a running session in a terminal."""
+
+from typing import Annotated
+
+import typer
+
+from ..reporting import terminal_output as terminal
+from . import options
+
+
+def watch_command(
+    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to watch.")],
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            "--timeout",
+            metavar="S",
+            help="Longest wait for the first answer, s.",
+            callback=options.check_seconds,
+        ),
+    ] = 10.0,
+) -> None:
+    """Shows a running session in a terminal, a line for each site, until it ends or Ctrl-C.
+
+    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the arm; above them
+    stands V. Without endpoints it asks the first site, at its loopback port, for the others.
+    """
+    from live.terminal_watch import watch_session
+
+    from ..net.clock import SystemClock
+    from ..net.discovery import connect_to_session
+    from ..process import Interrupt
+    from ..scenario import parse_embedded
+
+    name, clock = options.check_session_name(session), SystemClock()
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    with Interrupt() as interrupt:
+        with connect_to_session(
+            connection,
+            clock,
+            name,
+            lambda text: parse_embedded(text, name).names,
+            stopped=interrupt.requested,
+            timeout_s=timeout,
+        ) as bus:
+            if bus is not None:
+                watch_session(bus, clock, name, terminal.out, interrupt, timeout)
+        if interrupt.requested():
+            raise typer.Exit(interrupt.exit_code)
+    terminal.print_text(f"session {name} has ended")

@@ -1,0 +1,106 @@
+"""Figures of the suite: a panel per task, a row per law, a column per link.
+
+Invariant: a cell is coloured by its mean alone; a white cross says that a run there is not stable, a dot that
+one is open. Equal results give equal bytes.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from ...analysis.run_end import Stability
+from ...core.vectors import Array
+from ...reporting import style
+from ...reporting.figure_size import make_print_size
+from ..intervals import MeanInterval
+from .bench_run import BenchPlace, BenchResults
+from .bench_tables import list_laws, name_law
+
+FIGURES_OF_BENCH = {
+    "stable": ("share of stable runs", ""),
+    "error": ("error, rad", "error_rad"),
+    "effort": ("effort, N m", "effort_nm"),
+    "transparency": ("torque of the hands, N m", "hand_nm"),
+}
+"""Per figure its label, and the number that it shows; "" for the share of stable runs."""
+_WIDTH_IN = 7.0
+_ROW_IN, _HEAD_IN = 0.14, 0.65
+_TEXT_PT = 5.5
+_PALETTE = "cividis"
+_NONE = "#a23b53"
+"""Where there is no number: the run diverged."""
+
+
+def draw_bench(results: BenchResults, name: str) -> Figure:
+    """Returns a figure by its name in `FIGURES_OF_BENCH`."""
+    label, quantity = FIGURES_OF_BENCH[name]
+    tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
+    links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
+    fields = {task: _collect(results, task, links, quantity) for task in tasks}
+    known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
+    scale: Any = Normalize(0.0, 1.0)
+    if quantity:
+        least, most = (float(known.min()), float(known.max())) if known.size else (0.1, 1.0)
+        scale = LogNorm(max(least, 1e-6), max(most, 2e-6))
+    height = sum(_HEAD_IN / 2 + _ROW_IN * len(field) for field in fields.values()) + _HEAD_IN
+    form = make_print_size(_WIDTH_IN)
+    with style.figure_style(form):
+        figure = style.new_figure(height, form.width_in)
+        ratios = [len(field) for field in fields.values()]
+        grid = style.add_panels(figure, len(tasks), 1, sharex=True, height_ratios=ratios)[:, 0]
+        for axes, (task, field) in zip(grid, fields.items(), strict=True):
+            image = axes.imshow(field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest")
+            _mark(axes, results, task, links)
+            axes.set_title(task)
+        grid[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
+        figure.colorbar(image, ax=list(grid), label=label, fraction=0.03)
+    return figure
+
+
+def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
+    """Returns the laws that ran in a task."""
+    return [one for one in list_laws(results) if next(results.of(task, one[0]), None) is not None]
+
+
+def _collect(results: BenchResults, task: str, links: list[str], quantity: str) -> Array:
+    """Returns the numbers of a panel, shape (laws, links); NaN where there is none."""
+    rows = _rows(results, task)
+    field = np.full((len(rows), len(links)), np.nan)
+    for place in results.of(task):
+        field[rows.index((place.cell.law, place.cell.form)), links.index(place.cell.link)] = _number(
+            place, quantity
+        )
+    return field
+
+
+def _number(place: BenchPlace, quantity: str) -> float:
+    if not quantity:
+        return place.stable / len(place.runs)
+    value = place.mean(quantity)
+    return np.nan if value is None else value.mean if isinstance(value, MeanInterval) else value
+
+
+def _mark(axes: Axes, results: BenchResults, task: str, links: list[str]) -> None:
+    """Names the rows of a panel, and marks where a run is open or not stable."""
+    rows = _rows(results, task)
+    axes.set_yticks(range(len(rows)), [name_law(*one) for one in rows], fontsize=_TEXT_PT)
+    axes.grid(visible=False)
+    axes.set_facecolor(_NONE)
+    for place in results.of(task):
+        at = [links.index(place.cell.link)], [rows.index((place.cell.law, place.cell.form))]
+        if place.count(Stability.NOT_STABLE):
+            axes.plot(*at, marker="x", color="#ffffff", markersize=3.0, markeredgewidth=0.8)
+        elif place.stable < len(place.runs):
+            axes.plot(*at, marker=".", color="#ffffff", markersize=2.0)
+
+
+def write_bench_figures(results: BenchResults, folder: Path) -> list[Path]:
+    """Writes all figures into a folder, and returns their paths."""
+    paths = [folder / f"bench-{name}.png" for name in FIGURES_OF_BENCH]
+    for path, name in zip(paths, FIGURES_OF_BENCH, strict=True):
+        draw_bench(results, name).savefig(path, dpi=style.REPORT_DPI)
+    return paths

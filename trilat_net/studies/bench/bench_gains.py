@@ -1,0 +1,171 @@
+"""The gains of the suite: each law tuned by the one procedure at three delays, and kept in a file.
+
+Invariant: gains come from `trilat bench --tune` alone. Each entry has the fingerprint of what it was tuned
+for, the resolved scenario and the sources of the law: a stale one is named wherever it is used.
+"""
+
+import hashlib
+import inspect
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ...core import control
+from ...files import write_whole
+from ...scenario.laws import LAWS
+from ..commands import format_toml_value
+from ..executor import Progress, Workers, ignore_progress
+from ..tuning.candidate import CandidateScore, TuningScenario, load_tuning_scenario
+from ..tuning.final_posture import CandidateClass
+from ..tuning.pareto_search import CandidateSearch
+from ..tuning.search_space import SEARCH_SPACES, ModelInformation
+from ..tuning.tuning_plan import plan_tuning
+from .bench_tasks import BASES, TUNED_ROUND_TRIPS_MS, TUNING_TASK, Settings, build_settings
+
+GAINS_FILE = Path(str(resources.files("trilat_net.studies.bench") / "bench_gains.json"))
+KNOWLEDGE = ModelInformation()
+"""All laws know gravity exactly."""
+TUNING_BUDGET = 32
+"""Candidates per law and delay."""
+
+
+class TunedGains(msgspec.Struct, frozen=True):
+    """The gains of a law in a form of the tasks at a round trip.
+
+    Attributes:
+        gains: by name: of the stable candidates at the pose that with the least error; without one, of those
+            that did not diverge.
+        outcome: its class.
+        settled: how many of the candidates were stable and at the pose.
+        tried: how many there were.
+        error_rad, effort_nm: of that candidate.
+        fingerprint: of scenario and law.
+    """
+
+    form: str
+    law: str
+    round_trip_ms: int
+    gains: dict[str, float]
+    outcome: CandidateClass
+    settled: int
+    tried: int
+    error_rad: float | None
+    effort_nm: float | None
+    fingerprint: str
+
+    def __str__(self) -> str:
+        return f"{self.law} ({self.form}, {self.round_trip_ms} ms)"
+
+
+def name_settings(settings: Settings) -> list[str]:
+    """Returns overrides as texts KEY=VALUE."""
+    return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
+
+
+def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
+    """Returns the experiment in which the laws of a form are tuned."""
+    return load_tuning_scenario(
+        BASES[form], name_settings(build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}"))
+    )
+
+
+@cache
+def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
+    """Returns the fingerprint of what a law is tuned for: the scenario, the law's sources and its ranges."""
+    space = SEARCH_SPACES[law]
+    kind = getattr(LAWS.get(law), "core_class", None)
+    source = inspect.getsource(control if kind is None else inspect.getmodule(kind) or kind)
+    ranges = json.dumps([knob._asdict() for knob in space.knobs])
+    text = load_tuning_task(form, round_trip_ms).scenario.text
+    return hashlib.sha256("\0".join((text, source, ranges, str(TUNING_BUDGET))).encode()).hexdigest()[:16]
+
+
+def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
+    """Returns all tuned gains, by form, law and round trip."""
+    entries = msgspec.json.decode(path.read_bytes(), type=list[TunedGains]) if path.exists() else []
+    return {(one.form, one.law, one.round_trip_ms): one for one in entries}
+
+
+def find_stale(entries: Iterable[TunedGains]) -> list[str]:
+    """Returns the gains that were tuned for another scenario, or for another text of the law."""
+    return [
+        str(one)
+        for one in entries
+        if fingerprint_tuning(one.form, one.law, one.round_trip_ms) != one.fingerprint
+    ]
+
+
+def choose_round_trip(mean_ms: float) -> int:
+    """Returns at which round trip the gains for a link were tuned: the next one that is no shorter."""
+    longer = [tuned_ms for tuned_ms in TUNED_ROUND_TRIPS_MS if tuned_ms >= mean_ms]
+    return longer[0] if longer else TUNED_ROUND_TRIPS_MS[-1]
+
+
+def choose_candidate(search: CandidateSearch) -> int:
+    """Returns the place of the candidate whose gains are kept: the end of the front with the least error."""
+    if search.front:
+        return search.front[-1]
+
+    def rank(place: int) -> tuple[bool, float]:
+        score: CandidateScore = search.scores[place]
+        return score.error_rad is None, score.error_rad or 0.0
+
+    return min(range(len(search.scores)), key=rank)
+
+
+def tune_laws(
+    wanted: Mapping[str, Sequence[str]],
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Progress = ignore_progress,
+    budget: int = TUNING_BUDGET,
+) -> list[TunedGains]:
+    """Tunes laws at every delay, and returns their gains.
+
+    Args:
+        wanted: per form the laws.
+        jobs: processes of this machine.
+        on: what runs the candidates instead.
+        progress: called with the tunings that are done, and their number.
+        budget: candidates per law and delay.
+    """
+    found: list[TunedGains] = []
+    total = len(TUNED_ROUND_TRIPS_MS) * len(wanted)
+    for form, laws in wanted.items():
+        for round_trip_ms in TUNED_ROUND_TRIPS_MS:
+            settings = name_settings(build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}"))
+            tuned = plan_tuning(BASES[form], settings, laws=laws, budget=budget).run(jobs, on=on)
+            found += [_keep(form, round_trip_ms, search) for search in tuned.found]
+            progress(len(found) // max(1, len(laws)), total)
+    return found
+
+
+def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
+    place, law = choose_candidate(search), search.space.law
+    score = search.scores[place]
+    return TunedGains(
+        form=form,
+        law=law,
+        round_trip_ms=round_trip_ms,
+        gains=search.tried[place],
+        outcome=score.outcome,
+        settled=search.outcomes[CandidateClass.SETTLED],
+        tried=len(search.tried),
+        error_rad=score.error_rad,
+        effort_nm=score.effort_nm,
+        fingerprint=fingerprint_tuning(form, law, round_trip_ms),
+    )
+
+
+def write_gains(found: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
+    """Writes gains into the file of the suite, in place of those of the same law, form and delay."""
+    kept: dict[Any, TunedGains] = read_gains(path) | {
+        (one.form, one.law, one.round_trip_ms): one for one in found
+    }
+    rows = [json.dumps(msgspec.to_builtins(kept[key])) for key in sorted(kept)]
+    write_whole(path, "[\n" + ",\n".join(rows) + "\n]\n")
