@@ -49,9 +49,7 @@ def _toml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-def unit_scenario(
-    sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
-) -> Scenario:
+def unit_text(sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any) -> str:
     """Sites with unit arms, the last one a slave; two follow each other, more share as `dominance` says.
 
     `more` are keys of the scenario; links have 200 ms unless `link` says otherwise.
@@ -71,7 +69,14 @@ def unit_scenario(
         "dominance": pair,
         **more,
     }
-    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in table.items()), "unit")
+    return "\n".join(f"{key} = {_toml(value)}" for key, value in table.items())
+
+
+def unit_scenario(
+    sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
+) -> Scenario:
+    """The scenario of `unit_text`."""
+    return parse_scenario(unit_text(sites, control, **more), "unit")
 
 
 def pair_run(control: Mapping[str, Any], *, clamped: bool, **more: Any) -> Run:

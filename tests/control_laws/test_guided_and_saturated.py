@@ -12,6 +12,7 @@ from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
 from trilat_net.scenario.plugged_laws import complementary_shares
+from trilat_net.theory.textbook_arm import PlacedArm
 
 SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}
 P_D = {"law": "p_d", "K": 100.0, "d": 20.0}
@@ -150,3 +151,19 @@ def test_a_prediction_that_lacks_the_contact_is_unstable_there() -> None:
 def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
     with pytest.raises(ScenarioError, match="saturated_pd compares joint by joint"):
         load_scenario("unlike_arms", {"control": SATURATED})
+
+
+def test_a_saturated_pull_and_gravity_must_fit_below_the_torque_limit() -> None:
+    """The largest gravity over all poses of the textbook's arm."""
+    changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
+    scenario = load_scenario("paper", changes)
+    spec, theta = scenario.sites["s"], scenario.arms["s"].theta
+    poses = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, 201)] * 2)).reshape(2, -1)
+    arm = PlacedArm(spec.arm.g_m_s2, scenario.arms["s"].lengths_m, poses)
+    gravity = np.abs(arm.gravity_torque(np.repeat(theta[:, None], poses.shape[1], axis=1))).max(axis=1)
+    room = np.array(spec.limits.tau_limit_nm) - gravity - 5.0
+    (line, *_) = describe_law_conditions(scenario)
+    assert f"is within tau_limit_nm up to {room.min() / 4.0:.3g} rad/s" in line
+    limit = {"limits.tau_limit_nm": float(gravity.max() + 4.0)}
+    (line, *_) = describe_law_conditions(load_scenario("paper", {**changes, **limit}))
+    assert "does not hold: tau_limit_nm of joint 1 is 1 N m below gravity + P" in line

@@ -252,6 +252,13 @@ class ArmModel(NamedTuple):
         found: Array = J[: self.counts.shared]
         return found
 
+    def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
+        """Returns what gravity turns a joint of the planar arm by at most, N m; () of a chain."""
+        if self.chain is not None:
+            return ()
+        upper, lower = (abs(float(share)) * g_m_s2 for share in self.theta[3:5])
+        return upper + lower, lower
+
     def inertia(self, q: Array) -> Array:
         """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""
         assert self.chain is not None

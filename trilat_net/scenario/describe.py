@@ -58,9 +58,8 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     for n, (name, site) in enumerate(scenario.sites.items()):
         if isinstance(law := site.control, PluggedLaw | LeeSpong | AdaptiveRobust):
             limits = np.atleast_1d(site.limits.tau_limit_nm).tolist()
-            situation = LawSituation(
-                n, scenario.names, laws, scenario.alpha, delay_s, tuple(limits), site.rate_hz
-            )
+            own = (tuple(limits), site.rate_hz, scenario.arms[name].largest_gravity(site.arm.g_m_s2))
+            situation = LawSituation(n, scenario.names, laws, scenario.alpha, delay_s, *own)
             if found := law.condition(situation):
                 owners.setdefault((str(law.__struct_config__.tag), found), []).append(name)
     words = {True: "holds", False: "does not hold", None: "is not decided here"}

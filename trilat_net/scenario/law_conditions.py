@@ -29,6 +29,7 @@ class LawSituation(NamedTuple):
         delay_s: delay of the link from j to i, row i, column j, at least one tick, s; NaN if it varies.
         tau_limit_nm: largest torques of the site's joints, N m.
         rate_hz: tick rate of the site, Hz.
+        gravity_nm: largest torque by which the site's planar arm is held, N m per joint; () of a chain.
     """
 
     site: int
@@ -38,6 +39,7 @@ class LawSituation(NamedTuple):
     delay_s: Array
     tau_limit_nm: tuple[float, ...]
     rate_hz: int
+    gravity_nm: tuple[float, ...] = ()
 
     @property
     def longest_s(self) -> float:
@@ -82,6 +84,11 @@ def find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int])
     return delay_s
 
 
+def find_least_reversible(alpha: Array) -> float | None:
+    """Returns the least eigenvalue of reversible shares, which bounds d by K T; None: they are not."""
+    return None if find_balancing_weights(alpha) is None else float(np.linalg.eigvals(alpha).real.min())
+
+
 def judge_position_exchange(situation: LawSituation, stiffness: str, damping: str) -> StabilityCondition:
     """Returns the condition of P+d, whatever the arms weigh; the keys of a law's K and d are named.
 
@@ -100,10 +107,11 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
         return StabilityCondition(excess >= -1e-9 * float(d.max()) ** 2, text)
     if np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any() or np.ptp(situation.delay_s[situation.alpha > 0.0]):
         return StabilityCondition(None, "known of more than two sites for one K, one d and one delay")
-    if find_balancing_weights(situation.alpha) is None:
+    least = find_least_reversible(situation.alpha)
+    if least is None:
         return StabilityCondition(
             False, "shares that are not reversible: some heavy arms are unstable at any d"
         )
-    share = max(-float(np.linalg.eigvals(situation.alpha).real.min()), COMMON_MOTION_SHARE)
+    share = max(-least, COMMON_MOTION_SHARE)
     text = f"d > {share:.4g} K T = {share * float(K.max()) * T:.4g} (sufficient whatever the masses)"
     return StabilityCondition(bool((d[0] > share * K[0] * T).all()), text)

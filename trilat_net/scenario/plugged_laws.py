@@ -137,8 +137,20 @@ class SaturatedPositions(PluggedLaw, frozen=True, tag_field="law", tag="saturate
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d: the slope of the pull is nowhere above K."""
-        return judge_position_exchange(situation, "K", "d")
+        """Returns the condition of P+d (the slope is nowhere above K), and what the torque limit leaves."""
+        found = judge_position_exchange(situation, "K", "d")
+        if not situation.gravity_nm:
+            return found._replace(text=f"{found.text}; and tau_limit_nm above gravity + P + d |qd|")
+        gravity = self.gravity * np.array(situation.gravity_nm)
+        room = np.array(situation.tau_limit_nm) - gravity - np.array(self.P)
+        if room.min() <= 0.0:
+            n = int(room.argmin())
+            lacks = f"tau_limit_nm of joint {n + 1} is {-room[n]:.3g} N m below gravity + P"
+            return StabilityCondition(False, f"{lacks}: it would cut the pull off")
+        with np.errstate(divide="ignore"):
+            most = float(np.min(room / np.array(self.d)))
+        within = f"; gravity + P + d |qd| is within tau_limit_nm up to {most:.3g} rad/s"
+        return found._replace(text=found.text + within)
 
 
 class Authority(PluggedLaw, frozen=True, tag_field="law", tag="authority"):

@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.dominance import find_balancing_weights
 from ...core.vectors import Array
 from ...errors import ScenarioError
 from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.fields import is_number
-from ...scenario.law_conditions import COMMON_MOTION_SHARE
+from ...scenario.law_conditions import COMMON_MOTION_SHARE, find_least_reversible
 from ...scenario.laws import Adaptive, ProportionalDamped
 from ...theory import compute_growth_rates
 from ..commands import format_command, set_options
@@ -83,9 +82,9 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
         symbol = r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$"
         excess = _excess_of_two(K, d, 0.5 * sum(ticks), rate_hz)
         return StabilityCriterion(symbol, "4 d1 d2 = (T1 + T2)² K1 K2", source, excess)
-    if len({*K}) > 1 or len({*d}) > 1 or len({*ticks}) > 1 or find_balancing_weights(scenario.alpha) is None:
+    least = find_least_reversible(scenario.alpha)
+    if len({*K}) > 1 or len({*d}) > 1 or len({*ticks}) > 1 or least is None:
         return None
-    least = float(np.linalg.eigvals(scenario.alpha).real.min())
     excess = d[0] - K[0] * _find_asked_share(least, ticks[0]) * ticks[0] / rate_hz
     if -least < COMMON_MOTION_SHARE:
         return StabilityCriterion(r"$d = 0.2172\,K\,T$", "d = 0.2172 K T", source, excess)
