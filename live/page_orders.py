@@ -23,6 +23,7 @@ from trilat_net.net.wire import decode, encode
 
 MAX_MESSAGE_BYTES = 4_096
 REPLY_TIMEOUT_NS = 3_000_000_000
+MOST_WAITING = 256
 LEAST_RAMP_S = 0.25
 """The time in which shares change that somebody drags, s."""
 
@@ -60,6 +61,12 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
     to: Annotated[dict[Name, float], Meta(max_length=16)]
 
 
+class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
+    """A text that the log keeps as an event of this moment."""
+
+    text: Annotated[str, Meta(min_length=1, max_length=80)]
+
+
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     """The page takes hold of an arm, moves what it holds, or lets go.
 
@@ -77,7 +84,7 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
 
 
 Order = SetLink | SetShares
-_DECODER = msgspec.json.Decoder(Seen | TakePart | SetLink | SetShares | MoveHand | EndSession)
+_DECODER = msgspec.json.Decoder(Seen | TakePart | SetLink | SetShares | MoveHand | MarkMoment | EndSession)
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
@@ -171,8 +178,13 @@ class OrderDesk:
         if not site or "/" in site or "*" in site:
             self.refused["no such site"] += 1
             return
-        if len(self._waiting) < 256:
+        if len(self._waiting) < MOST_WAITING:
             self._waiting[site, request.link] = request
+
+    def mark(self, site: str, text: str) -> None:
+        """Asks a site to mark this moment in the log."""
+        if len(self._waiting) < MOST_WAITING:
+            self._waiting[site, f"mark {text}"] = ChangeRequest(mark=text)
 
     def poll(self) -> None:
         """Asks the sites, one question each at a time, and reads their answers."""

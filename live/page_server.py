@@ -31,6 +31,7 @@ from trilat_net.net.clock import Clock
 from .page_orders import (
     MAX_MESSAGE_BYTES,
     EndSession,
+    MarkMoment,
     MoveHand,
     OrderDesk,
     PageHands,
@@ -316,6 +317,9 @@ class PageServer:
             self.refused["does not take part"] += 1
         elif isinstance(message, SetLink | SetShares):
             self._desk.order(message)
+        elif isinstance(message, MarkMoment):
+            if self.view.scenario is not None:
+                self._desk.mark(self.view.scenario.names[0], message.text)
         elif isinstance(message, MoveHand):
             self._move_hand(page, message)
         elif isinstance(message, EndSession) and self._ends:

@@ -27,6 +27,8 @@ from trilat_net.scenario import (
 AHEAD_MS = 100
 MIN_RAMP_S = 0.5
 """Shortest change of dominance."""
+MARKS_WAITING = 16
+"""Marks between two events of a site, which are a tenth of a second apart."""
 
 
 class ChangeServer:
@@ -34,6 +36,7 @@ class ChangeServer:
 
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
+        marks: moments that somebody marked and that no event names yet: ticks, and texts.
     """
 
     def __init__(self, scenario: Scenario, site: str, queries: QueryInbox) -> None:
@@ -46,6 +49,7 @@ class ChangeServer:
         self._waiting: deque[int] = deque()
         self._stop_tick: int | None = None
         self.stopped = False
+        self.marks: list[tuple[int, str]] = []
 
     def take(self, k: int) -> Sequence[CoreChange]:
         """Replies to every request; returns the accepted changes, for the next tick, k."""
@@ -61,6 +65,8 @@ class ChangeServer:
                 request = decode(query.payload, ChangeRequest)
                 if request.stop_s is not None:
                     reply = self._stop(k, request.stop_s)
+                elif request.mark:
+                    reply = self._mark(k, request.mark)
                 else:
                     changes.append(self._resolve(request, first))
                     text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
@@ -70,6 +76,13 @@ class ChangeServer:
             query.answer(encode(reply))
             query = self._queries.poll()
         return changes
+
+    def _mark(self, k: int, text: str) -> ChangeReply:
+        if len(self.marks) >= MARKS_WAITING:
+            raise ScenarioError(f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms")
+        self.marks.append((k, text))
+        text = f"{self._site} marks tick {k}"
+        return ChangeReply(member=self._site, accepted=True, text=text, tick=k)
 
     def _stop(self, k: int, stop_s: float) -> ChangeReply:
         asked = first_tick_at(round(stop_s * 1e9), self._rate_hz)

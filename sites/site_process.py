@@ -8,7 +8,7 @@ seconds (`shutdown`).
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
-from trilat_net.core.ticks import NS_PER_S, Arrival, Mode, TickInput, TickRecord, describe_mode
+from trilat_net.core.ticks import NS_PER_S, Arrival, Mode, TickInput, TickRecord, describe_mode, tick_ns
 from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
@@ -206,7 +206,7 @@ class RunningSite:
         return self._output
 
     def attend(self, k: int, t_ns: int) -> None:
-        """See `LoopIO`: answers queries, follows the leader's grid, publishes who is gone, who holds."""
+        """See `LoopIO`: answers queries, follows the leader's grid, publishes news."""
         self._publisher.update(ticks=k + 1)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
@@ -214,6 +214,10 @@ class RunningSite:
         for news in () if self._parts.hand is None else self._parts.hand.take_news():
             self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
             self._parts.say(news.text.partition(": ")[2])
+        for tick, text in self._parts.changes.marks:
+            at_ns = tick_ns(tick, self._parts.site.rate_hz)
+            self._publisher.publish("mark", text, t_ns=at_ns, ticks=tick)
+        self._parts.changes.marks.clear()
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))

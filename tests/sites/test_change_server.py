@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.change_server import AHEAD_MS, MIN_RAMP_S, ChangeServer
+from sites.change_server import AHEAD_MS, MARKS_WAITING, MIN_RAMP_S, ChangeServer
 from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS, Site
 from trilat_net.core.ticks import CoreChange, TickInput
 from trilat_net.net import topics
@@ -140,3 +140,12 @@ def test_a_run_takes_a_bounded_number_of_changes() -> None:
         (taken,), _ = asked.ask(k, link="m1->s", to={"delay_ms": float(k)})
         assert site.step(TickInput(k, (), [taken])).cmd == [taken.text]
     assert asked.ask(MAX_CHANGES, link="m1->s", to={"delay_ms": 1.0})[0] == []
+
+
+def test_a_mark_changes_nothing_and_waits_for_the_next_event() -> None:
+    asked = Asked()
+    taken, reply = asked.ask(7, mark="the wall")
+    assert (taken, reply.accepted, reply.tick) == ([], True, 7)
+    assert asked.changes.marks == [(7, "the wall")]
+    replies = [asked.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
+    assert [reply.accepted for reply in replies] == [True] * (MARKS_WAITING - 1) + [False]

@@ -190,7 +190,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         member: who says it: a site, or "recorder".
         boot: the sender's process start.
         kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
-            "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand".
+            "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand",
+            "mark".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
