@@ -94,7 +94,7 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
     at, accelerations, records = lay_out_arguments(site), [], []
     for rate_hz in (10_000, 20_000):
         one = site._replace(rate_hz=rate_hz)
-        arrays, buffers = build_site_arrays(one, 0, pages=8), build_tick_buffers(one)
+        arrays, buffers = build_site_arrays(one, pages=8), build_tick_buffers(one)
         s = arrays.site[0]
         s.q, s.qd, s.theta_hat = state[at.q], state[at.qd], state[at.estimate]
         for link, peer in zip(arrays.links, peers, strict=True):
