@@ -205,6 +205,7 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
     if site.ramps > 1:
         apply_ramps(t_ns, site.ramps, ramps, links)
     put(site.q_followed, site.q_des)
+    put(site.qd_followed, site.qd_des)
     for i in range(site.q_des.shape[0]):
         q_des = qd_des = felt = 0.0
         for j in range(links.shape[0]):

@@ -12,13 +12,15 @@ from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
+from .session_life import update_session_life
 from .site_arrays import SiteArrays, TickBuffers
-from .site_setup import Law, Scheme
+from .site_setup import Law, Scheme, StaleAction
 from .task_space import POSE, update_orientation_reference
 from .ticks import Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
 _DIVERGED = int(Mode.DIVERGED)
+_GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
 
@@ -202,7 +204,10 @@ def reference_stages(
     s: Row = site[0]
     update_reference(t_ns, s, links, ramps)  # 3 reference
     _place_arm(s, chain, links, True)
-    update_stale_mode(t_ns, s, links)
+    if s.on_stale == _GLIDE:
+        update_session_life(t_ns, tick_ns(k - 1, s.rate_hz), s, links)
+    else:
+        update_stale_mode(t_ns, s, links)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
     _update_external_torque(t_ns * 1e-9, s, chain, actors, table)

@@ -33,14 +33,14 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the layout of a link on which samples of so many coordinates come: one row per peer.
 
     They stand in scenario order. `used` is -1 until the first sample is released; until then q and qd are the
-    peer's start pose, at rest (L7). It is `new` in the tick that released it; `tick` and `age_s` are filled
-    in for laws that look at their peers.
+    peer's start pose, at rest (L7). It is `new` in the tick that released it, at `used_ns`; `tick` and
+    `age_s` are filled in for laws that look at their peers.
     """
     fields = [
         ("alpha", "f8"),
         ("alpha_rate", "f8"),
         ("rate_hz", "i8"),
-        *((name, "i8") for name in ("used", "tick", "new")),
+        *((name, "i8") for name in ("used", "used_ns", "tick", "new")),
         ("age_s", "f8"),
         *_sample_vectors(shared),
         ("key", "u8"),
@@ -210,7 +210,7 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     calendar[page] = -1
     slot: Row = link.samples[newest & (link.samples.shape[0] - 1)]
     if newest > row.used and slot.tick == newest:
-        row.used, row.new = newest, 1
+        row.used, row.used_ns, row.new = newest, tick_ns(k, rate_hz), 1
         put(row.q, slot.q)
         put(row.qd, slot.qd)
         put(row.tau_x, slot.tau_x)

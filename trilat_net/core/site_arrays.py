@@ -34,7 +34,21 @@ _PER_JOINT = (
     *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
 )
 _PER_COORDINATE = (
-    *("Lambda", "Kd", "K", "k_f", "q_held", "q_des", "qd_des", "q_followed", "felt", "e", "ed"),
+    *(
+        "Lambda",
+        "Kd",
+        "K",
+        "k_f",
+        "q_held",
+        "qd_held",
+        "q_des",
+        "qd_des",
+        "q_followed",
+        "qd_followed",
+        "felt",
+        "e",
+        "ed",
+    ),
 )
 _PER_PARAMETER = ("theta", "known", "Gamma", "low", "high", "theta_hat", "Yr", "Yr_before")
 _OF_TASK = ("x", "xd", "wrench", "axes", "b", "y")
@@ -55,8 +69,11 @@ _OF_CHAIN = (
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
     """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
-    fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns")]
-    fields += [("g", "f8"), ("wall_n", "f8"), ("lengths", "f8", (2,))]
+    fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")]
+    fields += [
+        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit")),
+        ("lengths", "f8", (2,)),
+    ]
     fields += [("k", "i8"), ("t_s", "f8"), ("h_s", "f8"), ("M", "f8", (layout.joints, layout.joints))]
     for names, count in (
         (_PER_JOINT, layout.joints),
@@ -288,6 +305,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     s.external, s.ramps = int(setup.external), 1
     s.theta_known = setup.theta_known
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
+    s.align_speed, s.align_limit = rule.align_speed, rule.align_limit
     if setup.chain is None:
         s.g, s.lengths = setup.g_m_s2, setup.lengths_m
     else:

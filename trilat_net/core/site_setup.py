@@ -48,12 +48,13 @@ class StaleAction(IntEnum):
     """The action of a site while a peer that it follows is stale.
 
     USE goes on with the last sample; HOLD stays at the reference that was in force; BRAKE stays where the
-    arm was.
+    arm was. GLIDE lets the reference come to rest, and begins by waiting for all peers, see `session_life`.
     """
 
     USE = 0
     HOLD = 1
     BRAKE = 2
+    GLIDE = 3
 
 
 class StaleRule(NamedTuple):
@@ -61,13 +62,18 @@ class StaleRule(NamedTuple):
 
     Attributes:
         action: the site's action then.
-        age_ns: a peer whose sample in use is older is stale, ns.
+        age_ns: a peer whose sample in use is older is stale, ns; of GLIDE one of which none came into use for
+            so long.
         return_ns: duration of the return to the peers, ns.
+        align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place m/s).
+        align_limit: of GLIDE, the longest way that it goes by itself, rad (m).
     """
 
     action: StaleAction = StaleAction.USE
     age_ns: int = 0
     return_ns: int = 1
+    align_speed: float = 1.0
+    align_limit: float = math.inf
 
 
 class LinkSetup(NamedTuple):

@@ -22,7 +22,7 @@ from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
 from .live_hand import HandInForce, free_hand
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
-from .site_setup import SiteSetup
+from .site_setup import SiteSetup, StaleAction
 from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
 from .vectors import Row
 
@@ -82,6 +82,8 @@ class Site:
         self._hand = self._arrays.actors[live[0]] if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
+        self._glides = setup.on_stale.action is StaleAction.GLIDE
+        self._remembers = self._glides or self._user_law is not None
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
     def order(self, command: CoreChange, t_ns: int) -> None:
@@ -151,7 +153,7 @@ class Site:
             self._used.tolist(),
             self._crc(packed, count),
             [command.text for command in tick.commands],
-            [] if mode in (_RUN, _DIVERGED) and self._user_law is None else self._held_memory() + memory,
+            self._held_memory() + memory if self._remembers or mode not in (_RUN, _DIVERGED) else [],
             *(row[column] for column in task),
         )
         return record._replace(ch=self._sent.tolist(), hand=hand) if self._sends or hand else record
@@ -187,7 +189,10 @@ class Site:
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
         s: Row = self._site[0]
-        return [*s.q_held.tolist(), float(s.return_from_ns)]
+        held = [*s.q_held.tolist(), float(s.return_from_ns)]
+        if not self._glides:
+            return held
+        return [*held, *s.qd_held.tolist(), float(s.reason), *self._links["used_ns"].astype(float).tolist()]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""
@@ -226,10 +231,15 @@ class Site:
         s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
         if last.mem:
             s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
+        rest = last.mem[held + 1 :]
+        if self._glides and rest:
+            s.qd_held, s.reason = rest[:held], int(rest[held])
+            rest = rest[held + 1 :]
+            self._links["used_ns"], rest = rest[: len(self.peers)], rest[len(self.peers) :]
         self._sent[:] = last.ch or 0.0
         self._take_hand(last.hand)
         if self._law is not None:
-            self._law.recall(last.mem[held + 1 :])
+            self._law.recall(rest)
         resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:

@@ -40,8 +40,9 @@ class Mode(IntEnum):
     """The mode of a site in a tick.
 
     RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
-    the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN.
-    DIVERGED, past a limit, is final.
+    the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN. Under
+    the rule `glide` a site is WAITING for its peers before it goes to them, see `session_life`. DIVERGED,
+    past a limit, is final.
     """
 
     RUN = 1
@@ -49,6 +50,7 @@ class Mode(IntEnum):
     HOLD = 3
     BRAKE = 4
     RETURN = 5
+    WAITING = 6
 
 
 class Arrival(NamedTuple):
@@ -156,7 +158,8 @@ class TickRecord(NamedTuple):
         cmd: texts of the changes that it took in.
         mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it holds, rad, and
             the time at which it began to return, ns since the epoch (0 before). A site with a user's law
-            always has these, and the law's memory after them.
+            always has these, and the law's memory after them. Under the rule `glide` a site always has what
+            `session_life` remembers in their place.
         x: in task space what the site shares of its end effector: its place, m, and orientation; else empty.
         xd: its derivative, m/s and rad/s.
         wrench: what tau_x amounts to there, N and N m.
@@ -218,6 +221,7 @@ def describe_mode(site: str, output: TickRecord) -> str:
         Mode.HOLD: "holds its reference: a peer is stale",
         Mode.BRAKE: "holds its pose: a peer is stale",
         Mode.RETURN: "returns to its peers",
+        Mode.WAITING: "waits for its peers",
     }
     return f"{site} {doing[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
 

@@ -260,7 +260,8 @@ class SiteLog:
         return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0
 
     mode = _RecordField(
-        record_columns.decode_strings, 'Mode, shape (K,): "run", "hold", "brake", "return" or "diverged".'
+        record_columns.decode_strings,
+        'Mode, shape (K,): "run", "hold", "brake", "return", "waiting" or "diverged".',
     )
     q = _RecordVector("Joint angles, shape (K, n), rad.")
     qd = _RecordVector("Joint velocities, shape (K, n), rad/s.")

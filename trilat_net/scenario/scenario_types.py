@@ -40,18 +40,30 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     """The rule for a peer whose sample in use is too old.
 
     Attributes:
-        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is.
-        age_ms: the age beyond which it is too old, ms.
-        return_s: duration of the return once a fresh sample is in use, s.
+        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is;
+            "glide": begins by waiting for all peers, lets its reference come to rest when none of a peer's
+            samples came into use for a time, and aligns with its peers without a jump.
+        age_ms: the age beyond which it is too old, ms; not of "glide".
+        return_s: duration of the return once a fresh sample is in use, s; not of "glide".
+        silence_ms: of "glide", the time without a new sample in use after which a peer is silent, ms.
+        align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; in task space m/s.
+        align_limit_rad: of "glide", the longest way that it goes by itself, rad; in task space m.
     """
 
-    action: Literal["use", "hold", "brake"] = "use"
+    action: Literal["use", "hold", "brake", "glide"] = "use"
     age_ms: Annotated[float, Meta(gt=0.0, le=1e6)] = 350.0
     return_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
+    silence_ms: Annotated[float, Meta(gt=0.0, le=1e4)] = 20.0
+    align_speed_rad_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 0.5
+    align_limit_rad: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
 
     @property
     def rule(self) -> StaleRule:
         """The rule as the core has it."""
+        if self.action == "glide":
+            silence_ns = round(self.silence_ms * 1e6)
+            limits = self.align_speed_rad_s, self.align_limit_rad
+            return StaleRule(StaleAction.GLIDE, silence_ns, 1, *limits)
         return StaleRule(
             StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
         )

@@ -346,6 +346,9 @@ def _normalise_change(change: Change) -> Change:
 def _check_stale_rules(scenario: Scenario) -> None:
     """Refuses a rule by which a site would always hold: the delay of its links alone exceeds its age."""
     for name, site in scenario.sites.items():
+        if site.on_stale.action == "glide":
+            _check_glide(scenario, name)
+            continue
         for peer in scenario.peers(name):
             link = scenario.links[f"{peer}->{name}"]
             delay_ms = max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
@@ -356,6 +359,23 @@ def _check_stale_rules(scenario: Scenario) -> None:
                     f"the site would never follow {peer}",
                     path=f"sites.{name}.on_stale.age_ms",
                 )
+
+
+def _check_glide(scenario: Scenario, name: str) -> None:
+    """Refuses a silence that is shorter than the time between two samples, and tasks with an orientation."""
+    rule, path = scenario.sites[name].on_stale, f"sites.{name}.on_stale"
+    if scenario.sites[name].task.space == "pose":
+        raise ScenarioError(
+            "glide goes along differences of coordinates, and orientations have none: choose hold",
+            path=f"{path}.action",
+        )
+    slowest_hz = min(scenario.sites[one].rate_hz for one in (name, *scenario.peers(name)))
+    if rule.silence_ms < 2e3 / slowest_hz:
+        raise ScenarioError(
+            f"must be at least {2e3 / slowest_hz:g} ms, two periods of {slowest_hz} Hz, "
+            f"is {rule.silence_ms:g}",
+            path=f"{path}.silence_ms",
+        )
 
 
 def check_change(change: Change, path: str) -> None:

@@ -1,0 +1,134 @@
+"""The rule `glide`: what a site does before its peers are there, while one is silent, and on its way back."""
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.virtual_runs import sampled, trajectories
+from trilat_net.core.session_life import MIN_ALIGN_NS, LifeReason
+from trilat_net.errors import ScenarioError
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, parse_scenario
+
+TEXT = """
+name = "glide"
+duration_s = {duration_s}
+rate_hz = {rate_hz}
+[arm]
+[control]
+law = "pd_d"
+K = 60.0
+Kd = 4.0
+d = 12.0
+[on_stale]
+action = "glide"
+align_speed_rad_s = {speed}
+align_limit_rad = {limit}
+[link]
+delay_ms = 100
+outages_s = {outages_s}
+[sites.m]
+q0_rad = [0.8, 0.3]
+[[sites.m.hands]]
+kind = "spring"
+to_rad = [-0.4, 0.9]
+move_start_s = 0.5
+move_end_s = 4.0
+stiffness_nm_rad = 80.0
+damping_nm_s_rad = 8.0
+[sites.s]
+role = "slave"
+q0_rad = [0.1, 0.4]
+[dominance]
+m = {{ s = 1.0 }}
+s = {{ m = 1.0 }}
+"""
+OUTAGE = "[[2.0, 2.6]]"
+
+
+def glide(duration_s: float = 5.0, rate_hz: int = 1000, outages_s: str = OUTAGE, **keys: float) -> Scenario:
+    keys = {"speed": 1.0, "limit": 1.5, **keys}
+    return parse_scenario(TEXT.format(duration_s=duration_s, rate_hz=rate_hz, outages_s=outages_s, **keys))
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return trilat_net.simulate(glide())
+
+
+def test_it_waits_at_its_own_pose_then_aligns_then_follows(log: Log) -> None:
+    for site, other in (("m", "s"), ("s", "m")):
+        part = log[site]
+        modes = part.mode
+        assert set(modes[:100]) == {"waiting"}
+        assert (part.q_des[:100] == part.q[0]).all()
+        assert (part.qd_des[:100] == 0.0).all()
+        assert modes[100] == "return"
+        engaged = int(np.argmax(modes == "run"))
+        way = np.abs(part.q[0] - log[other].q[0]).max()
+        assert (engaged - 100) * 1e-3 == pytest.approx(max(1.5 * way / 1.0, 1e-9 * MIN_ALIGN_NS), abs=0.15)
+        late = log[other].q[engaged - 100 : 1900]
+        assert np.abs(part.q_des[engaged:2000] - late).max() == 0.0
+
+
+def test_a_silent_peer_is_held_after_twenty_milliseconds(log: Log) -> None:
+    """Samples of the outage would come into use from 2.1 s on; the last one did at 2.099 s."""
+    modes = log["s"].mode
+    assert modes[2119] == "run"
+    assert modes[2120] == "hold"
+    assert (log["s"].qd_des[2140:2700] == 0.0).all()
+    assert np.ptp(log["s"].q_des[2140:2700], axis=0).max() == 0.0
+    assert modes[2700] == "return"
+
+
+@pytest.mark.parametrize("site", ["m", "s"])
+def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -> None:
+    """In all modes: a step of q_des is the integral of qd_des, to the third order of the tick."""
+    part, h_s = log[site], 1e-3
+    steps = np.diff(part.q_des, axis=0)
+    means = 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
+    # at the first tick without a new sample, what is in use stays, and so does qd_des
+    stale = np.zeros(len(steps), dtype=bool)
+    stale[2099:2120] = True
+    assert np.abs(steps - means)[~stale].max() <= 1e-6
+    assert np.abs(np.diff(part.qd_des, axis=0))[~stale].max() <= 0.06
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_the_way_to_the_peers_is_no_faster_than_it_may_be(speed: float) -> None:
+    log = trilat_net.simulate(glide(12.0, outages_s="[]", speed=speed))
+    part, other = log["s"], log["m"]
+    aligning = np.flatnonzero(part.mode == "return")
+    way_rate = part.qd_des[aligning] - other.qd[aligning - 100]
+    start = np.abs(way_rate[0]).max()
+    assert np.abs(way_rate).max() <= speed + start + 1e-12
+    assert np.abs(way_rate[-1]).max() <= 0.02
+
+
+def test_farther_than_its_limit_it_waits_and_says_so() -> None:
+    log = trilat_net.simulate(glide(1.0, outages_s="[]", limit=0.1))
+    assert set(log["s"].mode) == {"waiting"}
+    shared = 2
+    assert log["s"].states[-1].mem[2 * shared + 1] == LifeReason.ALIGN_LIMIT
+
+
+def test_every_driver_gives_the_same_bits() -> None:
+    scenario = glide(3.0)
+    ticks, fused = trajectories(scenario), sampled(scenario, (3.0,))[:, 0]
+    columns = scenario.layout("m").columns()
+    for site, row in zip(ticks.sites.values(), fused, strict=True):
+        assert all(
+            (getattr(site, name)[-1] == row[columns[name]]).all() for name in ("q", "qd", "tau", "q_des")
+        )
+    log = trilat_net.simulate(scenario)
+    assert verify(log).identical == 6000
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "silence", "words"), [(100, 5.0, "two periods of 100 Hz"), (1000, 1.0, "two periods")]
+)
+def test_a_silence_shorter_than_two_periods_is_refused(rate_hz: int, silence: float, words: str) -> None:
+    text = TEXT.replace('action = "glide"', f'action = "glide"\nsilence_ms = {silence}')
+    with pytest.raises(ScenarioError, match=words):
+        parse_scenario(text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0))
