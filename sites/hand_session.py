@@ -11,8 +11,9 @@ from trilat_net.errors import SessionError, UsageError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import resolve_member_connection
-from trilat_net.net.discovery import connect_to_session, find_site_info
+from trilat_net.net.discovery import SiteNamesOf, connect_to_session, find_site_info
 from trilat_net.net.hand_port import Hand
+from trilat_net.net.messages import Info
 from trilat_net.scenario import Scenario, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators import find_live_hand
@@ -55,13 +56,27 @@ def hand(
     )
     with reached as bus:
         assert bus is not None  # nothing stops it
-        give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-        while not (info := find_site_info(bus, clock, session, site, names)).running:
-            if clock.monotonic_ns() > give_up_ns:
-                raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+        info = _await_running(bus, clock, session, site, names, timeout_s)
         with open_hand(bus, clock, session, site, parse_embedded(info.scenario, session), source) as port:
             yield port
+
+
+def _await_running(
+    bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf, timeout_s: float
+) -> Info:
+    """Returns the identity of a site once its session runs."""
+    give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
+    while True:
+        try:
+            info = find_site_info(bus, clock, session, site, names)
+            if info.running:
+                return info
+            problem = SessionError(f"session {session!r} has not begun: {site} waits for the others")
+        except SessionError as error:
+            problem = error
+        if clock.monotonic_ns() > give_up_ns:
+            raise problem
+        clock.sleep_until(clock.monotonic_ns() + 50_000_000)
 
 
 def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenario, source: str = "") -> Hand:

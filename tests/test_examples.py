@@ -1,8 +1,13 @@
 """Examples run as they stand, with and without what they would like to have."""
 
+import itertools
+import math
+import re
 import runpy
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +15,10 @@ import pytest
 
 import trilat_net
 from tests.log_editing import recorded
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import SESSION, Session
+from trilat_net.net.bus import Bus
+from trilat_net.scenario import load_scenario
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
 
@@ -48,3 +57,90 @@ def test_springs_with_reactions_rest_where_their_sum_is_zero(monkeypatch: pytest
     assert np.abs(pulls).max() < 0.05
     np.testing.assert_allclose(poses.mean(axis=0), started, atol=0.05)
     assert trilat_net.verify(log).passed
+
+
+class PinnedArm:
+    """Stands in for a hand of a session whose arm nobody moves: a spring of 300 N/m at one place."""
+
+    def __init__(self, rounds: float = math.inf) -> None:
+        self.target, self.moves, self.released, self.rounds = (1.0, 0.5), 0, 0, rounds
+        self.pose = self.target
+
+    @property
+    def over(self) -> bool:
+        self.rounds -= 1
+        return self.rounds < 0
+
+    @property
+    def force(self) -> tuple[float, ...]:
+        return tuple(300.0 * (a - b) for a, b in zip(self.target, self.pose, strict=True))
+
+    def move(self, *target: float) -> None:
+        self.target, self.moves = target, self.moves + 1
+
+    def release(self) -> None:
+        self.released += 1
+
+
+def run_with_hand(name: str, arm: PinnedArm, monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
+    """Runs an example whose hand holds such an arm, and which does not wait."""
+    monkeypatch.setattr(trilat_net, "hand", lambda *_, **__: nullcontext(arm), raising=False)
+    monkeypatch.setattr(sys, "argv", [name, "play", "m1", *options])
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    runpy.run_path(str(LOOK.with_name(name)), run_name="__main__")
+
+
+def test_a_device_rests_where_the_spring_of_the_hand_is_as_strong_as_its_user(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """6 N at 300 N/m are 20 mm."""
+    arm = PinnedArm(rounds=3000)
+    run_with_hand("haptic_device.py", arm, monkeypatch, "--seconds", "1000")
+    assert "(0.0, 20.0) mm" in capsys.readouterr().out
+    assert arm.force == pytest.approx((0.0, 6.0), abs=1e-3)
+    assert arm.moves == 3000
+
+
+def test_a_gamepad_says_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "evdev", None)
+    with pytest.raises(SystemExit, match="pip install evdev"):
+        run_with_hand("gamepad_hand.py", PinnedArm(), monkeypatch)
+
+
+def test_a_stick_moves_the_target_and_a_button_lets_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stick held to the right for a second moves the target by 0.3 m; one let go of leaves it there."""
+    codes = SimpleNamespace(EV_ABS=3, EV_KEY=1, ABS_X=0, ABS_Y=1, BTN_SOUTH=304)
+    at_rest, rounds = SimpleNamespace(min=0, max=255), itertools.count()
+    script = {0: (3, 0, 255), 60: (3, 0, 128), 80: (1, 304, 1)}
+
+    def read_one() -> SimpleNamespace | None:
+        event = script.pop(next(rounds), None)
+        return event and SimpleNamespace(**dict(zip(("type", "code", "value"), event, strict=True)))
+
+    pad = SimpleNamespace(capabilities=lambda: {3: [(0, at_rest), (1, at_rest)]}, read_one=read_one)
+    found = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
+    monkeypatch.setitem(sys.modules, "evdev", found)
+    arm = PinnedArm(rounds=120)
+    run_with_hand("gamepad_hand.py", arm, monkeypatch)
+    assert arm.target == pytest.approx((1.3, 0.5), abs=0.012)
+    assert arm.released > 0
+
+
+@pytest.mark.long
+def test_a_program_hands_over_and_back_without_a_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The example in a session without a late tick: no reference steps further while the lead changes."""
+    example = runpy.run_path(str(LOOK.with_name("policy_hand.py")))
+    scenario = load_scenario("play", {"duration_s": 11.0})
+    session = Session.whole(scenario, tmp_path)
+
+    def act(bus: Bus, clock: RelayClock) -> None:
+        clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
+        example["report"](*example["lead"](bus, clock, SESSION, scenario, 9.0, alone=False))
+
+    session.stranger(act)
+    assert trilat_net.verify(session.run()).passed
+    times = re.findall(r"([.\d]+) times", capsys.readouterr().out)
+    assert len(times) == 3
+    assert max(map(float, times)) <= 1.2

@@ -79,6 +79,16 @@ def test_the_force_begins_and_ends_at_zero_and_its_work_is_the_operators(held: L
     assert split.operator == pytest.approx(expected, abs=1e-9)
 
 
+def test_a_table_of_records_names_what_the_hand_did(held: Log) -> None:
+    table, mode = held.table("m1"), held.scenario.sites["m1"].hands[0].mode
+    first = {"tip": "hand_target_x_m", "joint": "hand_target_q1_rad", "force": "hand_force_x_n"}[mode]
+    column = table[first]
+    assert column.known is not None
+    assert np.array_equal(column.known, held["m1"].hand[:, 2] == 7)
+    assert np.array_equal(column.values, held["m1"].hand[:, 3])
+    assert table["hand_number"].rows(300, 301) == [289]
+
+
 def test_a_changed_hand_is_found(held: Log) -> None:
     """A nanometre of a target in a record, or a nanonewton of a force, is another run."""
     states = held["m1"].states

@@ -235,13 +235,35 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
         yield Column(f"{stem}_{suffix}" if suffix else stem, values, unit, text, f"ch.{entry}")
 
 
-def build_state_table(site: SiteLog, arm: ArmModel, peer_rates_hz: Mapping[str, int]) -> Table:
+def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
+    """Yields what somebody who holds the arm does, a column per number; none without a live hand."""
+    if not site.layout.hand:
+        return
+    held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
+    yield Column("hand_grip", site.hand[:, 0].copy(), "", "how firmly the arm is held, 0 to 1", "hand[0]")
+    whose = {"number": "number of the newest message of who holds the arm", "source": "who holds the arm"}
+    for n, (name, text) in enumerate(whose.items(), 1):
+        yield Column(f"hand_{name}", site.hand[:, n].astype(np.int64), "", text, f"hand[{n}]", held)
+    names = arm.joint_names if mode == "joint" else TASK_AXES[:PLACE]
+    units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
+    size, what = (site.layout.hand - 3) // 2, "force" if mode == "force" else "target"
+    for n in range(2 * size if what == "target" else size):
+        stem, unit = (what, units[0]) if n < size else (f"{what}_rate", units[1])
+        meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
+        column = add_unit_suffix(f"hand_{stem}_{names[n % size]}", unit)
+        yield Column(column, site.hand[:, 3 + n].copy(), unit, meaning, f"hand[{3 + n}]", held)
+
+
+def build_state_table(
+    site: SiteLog, arm: ArmModel, peer_rates_hz: Mapping[str, int], hand_mode: str = "tip"
+) -> Table:
     """Returns the records of a site with its arm, a row each, in order of their ticks."""
     docs = read_field_docs(State)
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
+    columns += _make_hand_columns(site, arm, hand_mode)
     for peer, rate_hz in peer_rates_hz.items():
         used = site.used[peer]
         known: NDArray[np.bool_] = used >= 0

@@ -30,6 +30,7 @@ from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
+from ..scenario.operators import find_live_hand
 from .accounting import SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
@@ -321,7 +322,9 @@ class Log:
         match kind:
             case "" | "state":
                 rates_hz = {p: self.scenario.sites[p].rate_hz for p in site.peers}
-                return build_state_table(site, self.scenario.arms[name], rates_hz)
+                live = find_live_hand(self.scenario.sites[name].hands)
+                mode = "tip" if live is None else live.mode
+                return build_state_table(site, self.scenario.arms[name], rates_hz, mode)
             case "link":
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":

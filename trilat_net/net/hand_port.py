@@ -8,7 +8,6 @@ are what the site's records say.
 import math
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.live_hand import GRIP_NS, SILENCE_NS, HandInForce
@@ -62,14 +61,15 @@ class Hand(SitePort):
         self._heart = threading.Thread(target=self._beat, daemon=True)
         self._heart.start()
 
-    def __exit__(self, *details: object) -> None:
-        with ExitStack() as stack:
-            stack.callback(super().__exit__, *details)
-            stack.callback(self._ended.set)
+    def __exit__(self, *_: object) -> None:
+        """Lets go, and waits until the site has heard it; the connection is its owner's."""
+        try:
             self.release()
             give_up_ns = self._clock.monotonic_ns() + 2 * GRIP_NS
             while self.holds and not self.over and self._clock.monotonic_ns() < give_up_ns:
                 self._clock.sleep_until(self._clock.monotonic_ns() + 2_000_000)
+        finally:
+            self._ended.set()
 
     def move(self, *place_m: float) -> int:
         """Takes hold, if it does not, and moves the target of the end effector: x, y, in space z, m.

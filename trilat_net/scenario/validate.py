@@ -7,6 +7,7 @@ refused before anything runs, with the reason.
 import functools
 import math
 import operator
+import threading
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import get_args
@@ -135,10 +136,15 @@ _CHOICES = {
 }
 
 
+_FIRST_USE = threading.Lock()
+"""Two threads that use a type of msgspec for the first time at once end the process: it is built then."""
+
+
 def build_scenario(resolved: TomlTable) -> Scenario:
     """Turns resolved tables into types; wrong types and ranges become errors with the key's path."""
     try:
-        scenario = msgspec.convert(resolved, Scenario)
+        with _FIRST_USE:
+            scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at ")
         dotted = _name_key(resolved, path.strip("`$."))

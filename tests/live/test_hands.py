@@ -1,0 +1,130 @@
+"""People at the arms of real processes: programs that lead two arms, one that is killed, a flood."""
+
+import math
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.cli.running import PLAIN, trilat
+from tests.net.waiting import until
+from trilat_net.log.log_reader import Log
+
+from .processes import PAPER, Session, Stage, connections
+
+GONE_S = 0.320
+"""From the last sign of life of whoever holds an arm to no force on it."""
+
+HOLDER = """
+import sys, time, trilat_net
+with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be killed", timeout_s=60.0) as hand:
+    start = hand.pose
+    while True:
+        hand.move(start[0] + 0.05, start[1] + 0.05)
+        if hand.holds:
+            print("holds", flush=True)
+        time.sleep(0.01)
+"""
+
+
+class Circling(threading.Thread):
+    """A program that leads an arm in circles, sixty times a second, for some time."""
+
+    def __init__(self, session: Session, site: str, seconds: float, turn_s: float) -> None:
+        super().__init__(name=f"hand at {site}", daemon=True)
+        self._places, self._site = session.endpoints, site
+        self._rounds, self._turn = round(60.0 * seconds), 2.0 * math.pi / (60.0 * turn_s)
+        self.felt_n = 0.0
+        self._wait = threading.Event()
+
+    def run(self) -> None:
+        connected = trilat_net.hand("t", self._site, connect=self._places, source=self.name, timeout_s=60.0)
+        with connected as hand:
+            x, y = hand.pose
+            for n in range(self._rounds):
+                angle = self._turn * n
+                hand.move(x - 0.1 + 0.1 * math.cos(angle), y + 0.1 * math.sin(angle))
+                self.felt_n = max(self.felt_n, math.hypot(*hand.force))
+                self._wait.wait(1.0 / 60.0)
+
+
+def held(session: Session, seconds: float, orders: Sequence[Sequence[str]]) -> Log:
+    """A session whose masters two programs hold, while links and shares are changed; it is reproduced."""
+    session.all()
+    session.begun()
+    session.recording()
+    hands = [Circling(session, "m1", seconds, 2.0), Circling(session, "m2", seconds, 3.1)]
+    for hand in hands:
+        hand.start()
+    to = ("set", "--session", "t", *connections(session.endpoints))
+    for order in orders:
+        trilat(*to, *order, cwd=session.log.parent).succeeds()
+    for hand in hands:
+        hand.join()
+        assert hand.felt_n > 1.0
+    log = session.is_reproduced()
+    said = [event.text for event in log.events if event.kind == "hand"]
+    for site in ("m1", "m2"):
+        assert sum(text.startswith(f"{site}: hand at {site} takes hold") for text in said) == 1
+        assert np.abs(log[site].tau_x).max() > 1.0
+    return log
+
+
+DELAY = ("link", "m1->s", "--delay", "120ms")
+SHARES = ("dominance", "s", "m1=0.8", "m2=0.2", "--ramp", "1s")
+
+
+def test_a_session_of_two_programs_and_changes_is_verified_and_repeated(stage: Stage) -> None:
+    log = held(Session(stage, "play", PAPER, "--duration", "6"), 2.5, [DELAY, SHARES])
+    assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]
+
+
+@pytest.mark.long
+def test_a_minute_of_two_programs_and_ten_changes_is_verified_and_repeated(stage: Stage) -> None:
+    """The certificate books what the hands gave: V never rises by more."""
+    orders = [("link", f"{a}->{b}", "--delay", f"{20 * n + 20}ms") for n, (a, b) in enumerate(LINKS)]
+    orders += [("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s") for share in SHARED]
+    log = held(Session(stage, "play", PAPER, "--duration", "60"), 40.0, orders)
+    assert sum(len(log.changes(name)) for name in PAPER) == 10
+    found = trilat_net.certify(log)
+    assert found.balance is not None
+
+
+LINKS = [("m1", "s"), ("m2", "s"), ("s", "m1"), ("s", "m2"), ("m1", "m2"), ("m2", "m1")]
+SHARED = (0.9, 0.1, 0.7, 0.5)
+
+
+@pytest.mark.long
+def test_a_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, tmp_path: Path) -> None:
+    """By the log: from its last message to the last force, and the event that says so."""
+    session = Session(stage, "play", PAPER, "--duration", "15")
+    session.all()
+    words = [sys.executable, "-c", HOLDER, "m1", *session.endpoints]
+    root = Path(__file__).parents[2]
+    with (tmp_path / "holder.txt").open("wb") as sink:
+        holder = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
+    try:
+        until(lambda: b"holds" in (tmp_path / "holder.txt").read_bytes(), 60.0)
+        holder.send_signal(signal.SIGKILL)
+    finally:
+        holder.kill()
+        holder.wait()
+    log = session.is_reproduced()
+    part = log["m1"]
+    number, grip = part.hand[:, 1], part.hand[:, 0]
+    newest = int(np.flatnonzero(np.diff(number) > 0)[-1]) + 1
+    last = int(np.flatnonzero(grip > 0.0)[-1])
+    assert np.abs(part.tau_x[newest : last + 1]).max() > 1.0
+    assert not part.tau_x[last + 1 :].any()
+    assert part.t_s[last + 1] - part.t_s[newest] <= GONE_S
+    texts = [event.text for event in log.events if event.kind == "hand"]
+    assert [text.partition(" at t")[0] for text in texts] == [
+        "m1: to be killed takes hold",
+        "m1: to be killed is silent: let go",
+    ]
