@@ -7,6 +7,7 @@ the Jacobian, which near a singular pose gives the least force that explains the
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from trilat_net.analysis.aligned import AlignedRecords
@@ -272,4 +273,5 @@ def _link_counts(stats: LinkStats | None, peer: str) -> Json:
 def show_event(event: Event) -> Json:
     """Returns an event as a page lists it."""
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    return {"t": t_s, "member": event.member, "kind": event.kind, "text": event.text}
+    change = msgspec.json.decode(event.command) if event.command else None
+    return {"t": t_s, "member": event.member, "kind": event.kind, "text": event.text, "change": change}

@@ -87,7 +87,7 @@ class ArmCard {
 
   numbers(site) {
     const size = (force) => Math.hypot(...force);
-    const parts = [["|e|", `${site.e.toPrecision(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
+    const parts = [["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
       ["hand", `${size(site.hand).toFixed(1)} N`, "more"]];
     if (this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, ""]);
     const text = parts.map(([key, value, kind]) => `<span class="${kind}">${key} <b>${value}</b></span>`).join("");

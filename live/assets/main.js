@@ -2,7 +2,7 @@
 // Newest state wins: the server sends a frame when this page has drawn the one before.
 import { Arms } from "./arms.js";
 import { Hands } from "./hands.js";
-import { Network } from "./network.js";
+import { Network, describeLink } from "./network.js";
 import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
 
@@ -89,13 +89,19 @@ function take(frame) {
 }
 
 const LOUD = ["lost", "diverged", "failed", "refused", "clock fault"];
+function describe({ link, dominance, to, at_s: at }) {
+  const shares = () => Object.entries(to).map(([peer, share]) => `${peer} ${share.toFixed(2)}`).join(" + ");
+  const what = link ? `${link.replace("->", " → ")}: ${describeLink(to)}` : `${dominance} follows ${shares()}`;
+  return `${what}, from ${at.toFixed(2)} s on`;
+}
+
 function events(list) {
-  for (const { t, member, kind, text } of list) {
+  for (const { t, member, kind, text, change } of list) {
     const item = document.createElement("li");
     const [time, who, what] = ["time", "span", "span"].map((tag) => item.appendChild(document.createElement(tag)));
     time.textContent = t === null ? "" : `${t.toFixed(2)} s`;
     who.textContent = member;
-    what.textContent = text;
+    what.textContent = change ? describe(change) : text;
     if (LOUD.includes(kind)) what.className = "bad";
     $("event-list").prepend(item);
   }

@@ -3,11 +3,13 @@ import { css, siteColour } from "./arms.js";
 
 const SPAN_S = 20;
 const KEPT = 1500;
+const LEAST = { rad: 0.01, m: 0.001, "N m": 1, N: 1, ms: 10, J: 0.1 };
 const EVERY_MS = 66;
 
 class Plot {
   constructor(parent, title, unit, series, note = "") {
     this.series = series;
+    this.least = LEAST[unit] || 1e-3; // what is less is drawn as nothing
     this.card = document.createElement("figure");
     this.card.className = "card plot";
     this.card.style.margin = 0;
@@ -38,7 +40,7 @@ class Plot {
     const axis = (size) => ({ stroke: css("--soft"), font: "11px system-ui, sans-serif", size, grid: { stroke: css("--grid"), width: 1 }, ticks: { show: false } });
     const range = (u, low, high) => {
       if (low === null || low === undefined) return [0, 1];
-      const [bottom, top] = [Math.min(0, low), Math.max(high, 1e-9)];
+      const [bottom, top] = [Math.min(0, low), Math.max(high, this.least)];
       return [bottom < 0 ? bottom - 0.06 * (top - bottom) : 0, top + 0.1 * (top - bottom)];
     };
     this.plot = new uPlot({
