@@ -34,6 +34,7 @@ def test_the_layer_alone_diverges() -> None:
     law = {"law": "trilat_net.core.laws.tanks:Tanks", **gains, **layer}
     scenario = unit_scenario({"m": {"hands": [H50]}, "s": {}}, law, duration_s=11.5)
     run = ticked(scenario, every=10)
+    assert least_energy(run) < -1.0  # what it would have taken from a tank
     speed = np.maximum(*(np.abs(run[name].qd[:, 0]) for name in "ms"))
     assert 0.01 * (1 + np.argmax(speed > 999.0)) == pytest.approx(11.4, abs=0.05)
 

@@ -16,7 +16,7 @@ from tests.control_laws.test_positions_and_forces import PAIR, TABLE, VARIANTS, 
 from tests.transmission import balance, transmitted
 from tests.unit_arm import CLAMP, hand, unit_scenario
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.plugged_laws import complementary_shares
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
@@ -44,7 +44,7 @@ def felt(loop: LinearLoop, s: complex, site: int = 0) -> complex:
 def count_inside(f: Callable[[complex], complex], low: complex, high: complex) -> int:
     """The number of zeros of an entire function in a rectangle, by the turns of its argument."""
     corners = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
-    path = np.concatenate([np.linspace(a, z, 40001)[:-1] for a, z in pairwise(corners)])
+    path = np.concatenate([np.linspace(a, z, 4001)[:-1] for a, z in pairwise(corners)])
     values = np.array([f(s) for s in path])
     steps = np.angle(np.roll(values, -1) / values)
     assert np.abs(steps).max() < 2.0
@@ -234,3 +234,11 @@ def test_the_analysis_of_waves_is_whole() -> None:
     assert found.sampled is None
     assert any("continuous time alone" in note for note in found.notes)
     assert found.margin.words.startswith("stable for every common delay")
+
+
+def test_arms_that_a_line_holds_against_hands_are_at_rest_there() -> None:
+    """A line between passive ends has no root to the right: its torque balances that of the operator."""
+    follows = {"sites.s.control.K": 100.0, "sites.s.control.B": 10.0, "duration_s": 6.0}
+    scenario = load_scenario("two_sites", {"control.law": "wave", "scheme": "digital", **follows})
+    loop = linearise_scenario(scenario, find_equilibrium(scenario, (0.4, 1.2)))
+    assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1

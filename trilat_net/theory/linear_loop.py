@@ -29,6 +29,7 @@ from .site_dynamics import (
     ArgumentLayout,
     SiteRates,
     differentiate_site_rates,
+    evaluate_site_rates,
     has_estimate,
     lay_out_arguments,
     share_own_pose,
@@ -211,6 +212,10 @@ def differentiate_rates(
     jacobians = []
     for i, (site, own) in enumerate(zip(conditions.sites, x, strict=True)):
         at, rates = lay_out_arguments(site), differentiate_site_rates(site, own)
+        if conditions.has_forms:  # what such a law remembers holds the arm there
+            left = evaluate_site_rates(site, own).qdd
+            own[at.external_torque] -= np.linalg.solve(rates.qdd[:, at.external_torque], left)
+            rates = differentiate_site_rates(site, own)
         if (i, i) in references:  # what it follows depends on its own orientation
             of_own = references[i, i] @ rates.x[:, : at.states]
             for by in rates:
