@@ -1,3 +1,6 @@
+import numpy as np
+
+import trilat_net
 from tests.scenario.chains import six
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import compare_scenarios, describe_scenario
@@ -57,3 +60,15 @@ def test_a_chain_is_told_joint_by_joint_with_the_notes_of_its_file() -> None:
     assert "  note: joint 'wrist_1' states no limit, or 0, of effort: none is kept" in text
     assert "  wrist_1 moves wrist_1_link, 1.219 kg; -6.283 to 6.283 rad; 3.142 rad/s; drive" in text
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
+
+
+def test_it_says_how_often_a_site_will_hold_and_it_holds_so_often() -> None:
+    keys = {"on_stale.action": "glide", "link.model": "normal", "duration_s": 6.0, "seed": 3}
+    link = {"link.delay_ms": 60.0, "link.deviation_ms": 25.0, "link.loss": 0.6}
+    scenario = load_scenario("two_sites", {**keys, **link})
+    (line,) = (line for line in describe_scenario(scenario) if line.startswith("s will hold"))
+    log = trilat_net.simulate(scenario)
+    modes = log["s"].mode
+    entered = int(np.count_nonzero((modes[1:] == "hold") & (modes[:-1] != "hold")))
+    assert entered > 3
+    assert f"will hold {10 * entered:.3g} times a minute" in line

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
+from ..core.philox import link_key
 from .arms import TASK_AXES, read_arm
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition, find_link_delays
@@ -25,6 +26,7 @@ from .laws import (
     ProportionalDamped,
     ProportionalDerivativeDamped,
 )
+from .sample_uses import count_silences, draw_uses
 from .scenario_types import Scenario
 
 COUPLED_OPERATORS = (
@@ -90,6 +92,7 @@ def describe_scenario(scenario: Scenario) -> list[str]:
         *describe_law_conditions(scenario),
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
+        *_describe_silences(scenario),
         *(f"assumed: {text}" for text in scenario.assumed),
         *(
             f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
@@ -138,6 +141,29 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
             lines.append(
                 f"{name} follows along {axes}: least singular value of its start pose {least:.3g}, damped "
                 f"below {bound:g}{near}"
+            )
+    return lines
+
+
+def _describe_silences(scenario: Scenario) -> list[str]:
+    """Returns how often sites under the rule `glide` will hold, by the draws of their links."""
+    lines = []
+    for name, spec in scenario.sites.items():
+        if spec.on_stale.action != "glide":
+            continue
+        for peer in scenario.peers(name):
+            link = scenario.links[f"{peer}->{name}"]
+            if link.measured or not scenario.dominance[name].get(peer):
+                continue
+            key = link_key(scenario.seed, f"{peer}->{name}")
+            rates_hz = spec.rate_hz, scenario.sites[peer].rate_hz
+            used = draw_uses(link, key, *rates_hz, scenario.duration_s)
+            count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
+            a_minute = 60.0 * count / scenario.duration_s
+            advice = "; a play-out (playout_ms) or a longer silence_ms lessens that" if a_minute > 1.0 else ""
+            lines.append(
+                f"{name} will hold {a_minute:.3g} times a minute: {spec.on_stale.silence_ms:g} ms without a "
+                f"new sample of {peer}, outages aside{advice}"
             )
     return lines
 

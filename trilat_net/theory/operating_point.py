@@ -10,7 +10,6 @@ as a run makes.
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,16 +17,15 @@ import numpy as np
 from ..core.delay import DelayKind
 from ..core.exogenous import LIVE_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.philox import link_key
-from ..core.site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup, StaleAction
-from ..core.site_step import Site
+from ..core.site_setup import Gains, Scheme, SiteSetup, StaleAction
 from ..core.ticks import NS_PER_S
-from ..core.two_link_arm import PARAMETERS
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.imported_law import ImportedLaw, PluggedLaw
 from ..scenario.linear_form import LinearForm, LinearSituation
+from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .site_dynamics import SiteRates, evaluate_site_rates
@@ -212,39 +210,15 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
     return age
 
 
-@lru_cache(maxsize=256)
 def _count_ages(
     link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
 ) -> EffectiveDelay | None:
-    """Returns the ages from the first sample in use on, counted at a site with nothing but this link."""
-    receiver = Site(
-        SiteSetup(
-            name="receiver",
-            rate_hz=own_hz,
-            scheme=Scheme.DIGITAL,
-            gains=Gains(Law.KNOWN),
-            theta=np.ones(PARAMETERS),
-            g_m_s2=0.0,
-            lengths_m=(1.0, 1.0),
-            tau_limit_nm=1.0,
-            qd_limit_rad_s=1.0,
-            q0=(0.0, 0.0),
-            qd0=(0.0, 0.0),
-            actors=(),
-            links=(LinkSetup("peer", 1.0, peer_hz, (0.0, 0.0), key, (link.core(),), (link.points,)),),
-        )
-    )
-    ticks = max(2, round(duration_s * own_hz))
-    newest = np.full(ticks, -1, dtype=np.int64)
-    for sample in range(round(duration_s * peer_hz)):
-        release = receiver.release_tick(0, sample)
-        if release is not None and release < ticks:
-            newest[release] = max(newest[release], sample)
-    used = np.maximum.accumulate(newest)
+    """Returns the ages from the first sample in use on."""
+    used = draw_uses(link, key, own_hz, peer_hz, duration_s)
     if used[-1] < 0:
         return None
     first = int(np.argmax(used >= 0))
-    now_ns = np.arange(first, ticks) * NS_PER_S // own_hz
+    now_ns = np.arange(first, len(used)) * NS_PER_S // own_hz
     ages_s = (now_ns - used[first:] * NS_PER_S // peer_hz) * 1e-9
     return EffectiveDelay(float(ages_s.mean()), float(ages_s.min()), float(ages_s.max()))
 
