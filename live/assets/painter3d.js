@@ -88,7 +88,9 @@ class ArmScene {
     const block = this.mesh(new THREE.BoxGeometry(3 * size, 0.3 * size, this.card.about.planar ? 0.3 * size : 3 * size), this.wallColour, true);
     block.quaternion.setFromUnitVectors(Y, normal);
     block.position.copy(at).addScaledVector(normal, -0.15 * size);
-    if (!this.card.about.planar) block.scale.set(0.35, 0.2, 0.35);
+    if (this.card.about.planar) return;
+    block.scale.set(0.35, 0.2, 0.35);
+    this.wallColour.opacity = 0.55;
   }
 
   colour() {
