@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -10,9 +11,10 @@ from trilat_net.core.vectors import Vector
 from trilat_net.errors import SessionError, UsageError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import resolve_member_connection
+from trilat_net.net.connection import resolve_member_connection, secure_connection
 from trilat_net.net.discovery import SiteNamesOf, connect_to_session, find_site_info
 from trilat_net.net.hand_port import Hand
+from trilat_net.net.member_keys import read_member_keys
 from trilat_net.net.messages import Info
 from trilat_net.scenario import Scenario, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
@@ -25,6 +27,8 @@ def hand(
     site: str,
     *,
     connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
     source: str = "",
     timeout_s: float = 5.0,
 ) -> Iterator[Hand]:
@@ -38,6 +42,8 @@ def hand(
         session: the session's name, by default the scenario's.
         site: the site of the arm; its scenario must have an operator of kind "live".
         connect: endpoints, as of --connect; without them the session's default ones on this machine.
+        router: endpoints of routers to go through instead, as of --router.
+        keys: folder of the operator's keys, as of --keys.
         source: who this is, for people.
         timeout_s: longest wait until the session runs.
 
@@ -46,7 +52,9 @@ def hand(
         UsageError: nobody can hold that arm, or an endpoint cannot be used.
     """
     clock = SystemClock()
-    connection = resolve_member_connection(None, connect, None, None, [], None)
+    known = None if keys is None else read_member_keys(Path(keys))
+    connection = resolve_member_connection(None, connect, router, None, [], None)
+    connection = secure_connection(connection, known, insecure=False)
 
     def names(text: str) -> tuple[str, ...]:
         return parse_embedded(text, session).names

@@ -202,8 +202,21 @@ def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
 def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None:
     table = np.array([[0.0, 1.2, 1.0], [9.0, 1.0, 1.0]])
     vectors = {"a": (1.0, 0.0), "b": (-1.0, 0.0), "K": (9.0, 9.0), "B": (1.0, 1.0)}
-    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table)
+    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0)
     q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
         assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]
     assert torque(2.5, q, qd, actor).any()
+
+
+@pytest.mark.parametrize(("acts", "like"), [("LIVE_TIP", "TASK_HAND"), ("LIVE_JOINT", "HAND")])
+def test_a_live_hand_is_a_spring_whose_target_stands_where_somebody_put_it(acts: str, like: str) -> None:
+    """As far as it is held, and within its limit: then the direction stays and the size is the limit."""
+    q, qd = np.array([0.1, 0.2]), np.zeros(2)
+    vectors = {"a": (1.2, 0.3), "b": (1.2, 0.3), "K": (50.0, 50.0), "B": (4.0, 4.0)}
+    spring = torque(1.0, q, qd, TorqueSource(TorqueKind[like], **vectors))
+    half = torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=0.5))
+    np.testing.assert_allclose(half, 0.5 * spring, rtol=1e-14)
+    limited = torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=1.0, limit=2.0))
+    at = tip(q) if acts == "LIVE_TIP" else q
+    np.testing.assert_allclose(limited, spring * 2.0 / (50.0 * np.hypot(*(vectors["a"] - at))), rtol=1e-12)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from trilat_net.analysis.aligned import align_records
+from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand
 from trilat_net.core.site_step import Site
@@ -117,3 +118,10 @@ def test_a_changed_hand_is_found(held: Log) -> None:
 def test_a_live_hand_that_cannot_be_is_refused(changes: dict[str, object], problem: str) -> None:
     with pytest.raises(ScenarioError, match=problem):
         load_scenario("paper", changes)
+
+
+def test_the_certificate_books_the_work_of_people_as_that_of_scripted_hands(held: Log) -> None:
+    """V changes by what its terms say, to 2e-5 of its largest value: `paper` itself closes to 1e-5."""
+    balance = compute_energy_balance(compute_site_energies(held))
+    assert np.abs(balance.external_work).max() > 0.1
+    assert np.abs(balance.residual).max() < 2e-5 * balance.V.max()

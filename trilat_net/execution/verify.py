@@ -190,6 +190,9 @@ class SiteVerifier:
             except LawFailed as failed:
                 self._law_failed = True
                 result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
+            except ValueError as error:  # no site takes so many changes
+                self._certain = False
+                result.add_difference(RecordDifference(name, state.tick, "cmd", "here", str(error)))
         result.coverage.judged[name] = result.records - result.unjudged - before
         if expected <= self._own_end:
             result.gaps.append((name, expected, self._own_end))

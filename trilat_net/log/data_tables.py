@@ -243,7 +243,9 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     yield Column("hand_grip", site.hand[:, 0].copy(), "", "how firmly the arm is held, 0 to 1", "hand[0]")
     whose = {"number": "number of the newest message of who holds the arm", "source": "who holds the arm"}
     for n, (name, text) in enumerate(whose.items(), 1):
-        yield Column(f"hand_{name}", site.hand[:, n].astype(np.int64), "", text, f"hand[{n}]", held)
+        yield Column(
+            f"hand_{name}", np.clip(site.hand[:, n], -1, 2**53).astype(np.int64), "", text, f"hand[{n}]", held
+        )
     names = arm.joint_names if mode == "joint" else TASK_AXES[:PLACE]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
     size, what = (site.layout.hand - 3) // 2, "force" if mode == "force" else "target"
