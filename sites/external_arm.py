@@ -35,7 +35,7 @@ class ExternalArm:
     """
 
     def __init__(
-        self, site: Site, ring: StampedInbox, clock: Clock, dropped: Counter[str], place: str
+        self, site: Site, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str], place: str
     ) -> None:
         self.newest: PlantState | None = None
         self.taken = 0

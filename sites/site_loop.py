@@ -2,8 +2,8 @@
 
 Invariant (L1): tick k lies at epoch + k periods of the leader's grid. Lateness is telemetry and enters no
 formula; a late loop runs its missed ticks back to back and counts them. No arriving payload can raise out
-of the loop: it is a peer's sample, or it is counted by reason and dropped. Samples carry the instants of
-their arrival, not of their draining.
+of the loop: it is a peer's sample, or it is counted by reason and dropped. Samples are decoded as they
+arrive, before their tick, and carry the instants of their arrival, not of their draining.
 """
 
 from collections import Counter
@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.live_hand import HandInForce
-from trilat_net.core.site_setup import Layout, LinkSetup
+from trilat_net.core.site_setup import LinkSetup, SiteSetup
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
@@ -21,7 +21,13 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, SiteTiming
-from trilat_net.net.wire import encode, encode_sample, encode_state, make_decoder
+from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
+
+
+def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
+    """Returns for each peer of a site what reads its samples, in threads that nothing may raise in."""
+    layouts = [setup.layout._replace(sent=link.channel.floats) for link in setup.links]
+    return [make_reader(PeerSample, layout) for layout in layouts]
 
 
 class PeerInbox:
@@ -33,17 +39,14 @@ class PeerInbox:
     def __init__(
         self,
         peers: Sequence[str],
-        rings: Sequence[StampedInbox],
+        rings: Sequence[StampedInbox[PeerSample | WireError]],
         rates: Sequence[int],
         boots: Sequence[int],
         monitors: Sequence[LinkTimingMonitor],
         dropped: Counter[str],
         links: Sequence[LinkSetup],
-        layout: Layout,
     ) -> None:
         self._links = links
-        layouts = [layout._replace(sent=link.channel.floats) for link in links]
-        self._decoders = [make_decoder(PeerSample, layout=own) for own in layouts]
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = boots, monitors, dropped
         self._last = [-1] * len(peers)
@@ -58,11 +61,11 @@ class PeerInbox:
                     arrivals.append(arrival)
         return arrivals
 
-    def _read(self, index: int, payload: bytes, arrived_ns: int, since_epoch_ns: int) -> Arrival | None:
-        try:
-            sample: PeerSample = self._decoders[index](payload)
-        except WireError as error:
-            self._dropped[error.reason] += 1
+    def _read(
+        self, index: int, sample: PeerSample | WireError, arrived_ns: int, since_epoch_ns: int
+    ) -> Arrival | None:
+        if isinstance(sample, WireError):
+            self._dropped[sample.reason] += 1
             return None
         if sample.site != self._peers[index] or sample.boot != self._boots[index]:
             self._dropped["stranger"] += 1

@@ -31,7 +31,7 @@ from .hand_server import MESSAGES_KEPT, HandServer
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
-from .site_loop import StateBlock
+from .site_loop import StateBlock, make_sample_readers
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +92,13 @@ class SiteParts:
         law = scenario.sites[name].control
         self.watchdog = LawWatchdog(self.site, law.code, clock) if isinstance(law, ImportedLaw) else None
         self.rings = [
-            bus.stamped(topics.key(session, peer, topics.SAMPLE), clock.monotonic_ns) for peer in peers
+            bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
+            for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
         ]
         self.arm: ExternalArm | None = None
         if name in scenario.external:
             key = topics.key(session, name, topics.MEASURED)
-            ring = bus.stamped(key, clock.monotonic_ns, MEASUREMENTS_KEPT)
+            ring = bus.stamped(key, clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             place = " at ".join([key, *map(str, options.connection.places[:1])])
             self.arm = ExternalArm(self.site, ring, clock, self.stats.dropped, place)
         self.hand: HandServer | None = None

@@ -147,7 +147,6 @@ class RunningSite:
             self._timing.meters,
             parts.stats.dropped,
             parts.setup.links,
-            site.layout,
         )
         publisher.update(
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots

@@ -25,7 +25,7 @@ def pair(network: Network) -> tuple[Bus, Bus]:
     return network.join(), network.join()
 
 
-def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox) -> None:
+def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]) -> None:
     """Returns once every inbox hears the publisher, with nothing more under way and all of them empty."""
     deaf = list(inboxes)
 
@@ -208,7 +208,7 @@ class Ticking:
 def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     clock = Ticking()
-    inbox, publish = receiver.stamped("t/a", clock), sender.publisher("t/a")
+    inbox, publish = receiver.stamped("t/a", clock, bytes), sender.publisher("t/a")
     opened(publish, inbox)
     before = clock.readings
     for number in NUMBERS:
@@ -221,7 +221,7 @@ def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> Non
 
 def test_a_stamped_ring_that_is_full_counts_the_oldest_that_it_loses(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    inbox, publish = receiver.stamped("t/a", Ticking(), 16), sender.publisher("t/a")
+    inbox, publish = receiver.stamped("t/a", Ticking(), bytes, 16), sender.publisher("t/a")
     opened(publish, inbox)
     before = inbox.overflowed
     for number in NUMBERS:
@@ -234,7 +234,7 @@ def test_a_stamped_ring_that_is_full_counts_the_oldest_that_it_loses(pair: tuple
 
 @given(capacity=st.integers(1, 5), takes=st.lists(st.booleans(), max_size=60))
 def test_a_stamped_message_is_polled_or_waits_or_is_counted(capacity: int, takes: list[bool]) -> None:
-    ring = StampingRing(Ticking(), capacity)
+    ring = StampingRing(Ticking(), bytes, capacity)
     held: list[int] = []
     taken = lost = 0
     for take in takes:

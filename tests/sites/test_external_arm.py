@@ -199,7 +199,7 @@ class Heard:
 
     def __init__(self) -> None:
         self.clock = ManualClock()
-        self.ring = StampingRing(self.clock.monotonic_ns, MEASUREMENTS_KEPT)
+        self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
         self.dropped: Counter[str] = Counter()
         site = Site(load_scenario("two_sites").setup("s"))
         self.arm = ExternalArm(site, self.ring, self.clock, self.dropped, "here")

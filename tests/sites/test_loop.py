@@ -57,7 +57,7 @@ class Alone:
         self._clock, self._ticks = clock, scenario.ticks("m")
 
     def run(self) -> object:
-        inbox = PeerInbox((), (), (), (), (), self.stats.dropped, (), self.site.layout)
+        inbox = PeerInbox((), (), (), (), (), self.stats.dropped, ())
         timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
         states = StateBlock(self.site, 1, self.publish_states, 0, single=True)
         return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, states, self)

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.site_loop import PeerInbox
+from sites.site_loop import PeerInbox, make_sample_readers
 from trilat_net.core.link import AHEAD_LIMIT_NS
-from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import MAX_ARRIVALS
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
@@ -21,7 +20,7 @@ from trilat_net.net.wire import MAX_BYTES
 from trilat_net.scenario import load_scenario
 
 PEERS = ("m2", "s")
-LINKS = load_scenario("paper").setup("m1").links
+SETUP = load_scenario("paper").setup("m1")
 BOOTS = (11, 12)
 RATE_HZ = 1000
 
@@ -42,14 +41,18 @@ class Desk:
         network = LocalNetwork()
         receiver, sender = network.join(), network.join()
         self.clock = ManualClock(EPOCH_NS)
-        rings = [receiver.stamped(name, self.clock.monotonic_ns, capacity) for name in PEERS]
+        read = make_sample_readers(SETUP)
+        rings = [
+            receiver.stamped(name, self.clock.monotonic_ns, one, capacity)
+            for name, one in zip(PEERS, read, strict=True)
+        ]
         self.send = [sender.publisher(name) for name in PEERS]
         self.dropped: Counter[str] = Counter()
         self.meters = [
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, LINKS, Layout())
+        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, SETUP.links)
 
     def wait(self, until_ns: int) -> None:
         """Time goes on, to an instant since the epoch."""

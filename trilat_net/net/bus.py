@@ -1,8 +1,9 @@
 """The bus: the Protocol of a member's network connection, and an in-process implementation for tests.
 
-Invariant: an arriving message triggers no more in a site than a stamp, an append or a short reply. Messages
-wait in bounded rings until the loop polls them; on overflow the oldest is dropped. Stamped rings count the
-loss; elsewhere the receiver sees it in the tick numbers. Only the recorder takes callbacks.
+Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append or a short
+reply; what reads it raises nothing. Messages wait in bounded rings until the loop polls them; on overflow the
+oldest is dropped. Stamped rings count the loss; elsewhere the receiver sees it in the tick numbers. Only the
+recorder takes callbacks.
 
 `zenoh_bus` is the real implementation; `LocalBus` joins members of one process. Both pass the same contract
 tests.
@@ -35,8 +36,8 @@ PresenceInbox = PolledRing[tuple[str, bool]]
 """Liveliness changes: (key, whether it is alive now)."""
 
 
-class StampedInbox(PolledRing[tuple[bytes, int]], Protocol):
-    """Messages with the instants of their arrival: (payload, ns)."""
+class StampedInbox(PolledRing[tuple[Polled, int]], Protocol[Polled]):
+    """Messages with the instants of their arrival: (what was read, ns)."""
 
     @property
     def overflowed(self) -> int:
@@ -69,8 +70,13 @@ class Bus(Protocol):
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """Returns a ring of the messages that others publish under a key expression."""
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
-        """Returns a ring whose messages are stamped by `now_ns` on arrival, in a thread of the bus."""
+    def stamped(
+        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+    ) -> StampedInbox[T]:
+        """Returns a ring whose messages are stamped by `now_ns` on arrival, and then read, in a bus thread.
+
+        `read` turns a payload into the entry (`bytes`: itself); it is short, and raises nothing.
+        """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Calls back with (key, payload) on arrival, in a thread of the bus."""
@@ -126,27 +132,28 @@ class BoundedRing(Generic[T]):
         return self._entries.popleft() if self._entries else None
 
 
-class StampingRing:
+class StampingRing(Generic[T]):
     """The `StampedInbox` of every bus; `take` may run in another thread than `poll`.
 
     Every message taken is polled, waits, or is counted in `overflowed`.
     """
 
-    def __init__(self, now_ns: Callable[[], int], capacity: int) -> None:
+    def __init__(self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int) -> None:
         self.overflowed = 0
-        self._now_ns, self._capacity = now_ns, capacity
-        self._entries: deque[tuple[bytes, int]] = deque()
+        self._now_ns, self._read, self._capacity = now_ns, read, capacity
+        self._entries: deque[tuple[T, int]] = deque()
 
     def take(self, payload: bytes) -> None:
-        """Stamps a message and appends it."""
-        self._entries.append((payload, self._now_ns()))
+        """Stamps a message, reads it and appends it."""
+        now_ns = self._now_ns()
+        self._entries.append((self._read(payload), now_ns))
         # not `maxlen`: a full deque cannot distinguish what it drops from what `poll` has just taken
         if len(self._entries) > self._capacity:
             with suppress(IndexError):  # `poll` has emptied it since the line before
                 self._entries.popleft()
                 self.overflowed += 1
 
-    def poll(self) -> tuple[bytes, int] | None:
+    def poll(self) -> tuple[T, int] | None:
         """See `StampedInbox`."""
         try:  # an exception costs ten times a look
             return self._entries.popleft() if self._entries else None
@@ -205,9 +212,11 @@ class LocalBus:
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
+    def stamped(
+        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+    ) -> StampedInbox[T]:
         """See `Bus`."""
-        ring = StampingRing(now_ns, capacity)
+        ring = StampingRing(now_ns, read, capacity)
         self._sinks.append((key, lambda _, payload: ring.take(payload)))
         return ring
 

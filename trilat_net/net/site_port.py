@@ -27,7 +27,7 @@ class SitePort:
         self._record: State | None = None
         self._came_ns = 0
         self._present = self._gone = False
-        self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, 64)
+        self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64)
         self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
         self._presence = bus.presence(topics.presence_key(session, site))
 

@@ -229,6 +229,19 @@ def make_decoder(
     return read
 
 
+def make_reader(kind: type[msgspec.Struct], layout: Layout) -> Callable[[bytes], Any | WireError]:
+    """Returns a decoder that returns its error: for threads of the bus, in which nothing may be raised."""
+    decoder = make_decoder(kind, layout=layout)
+
+    def read(payload: bytes) -> Any | WireError:
+        try:
+            return decoder(payload)
+        except WireError as error:
+            return error
+
+    return read
+
+
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
     for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
         if (count := len(vector)) != length:

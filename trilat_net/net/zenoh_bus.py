@@ -135,9 +135,11 @@ class ZenohBus:
         """See `Bus`."""
         return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
-    def stamped(self, key: str, now_ns: Callable[[], int], capacity: int = RING_CAPACITY) -> StampedInbox:
+    def stamped(
+        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+    ) -> StampedInbox[T]:
         """See `Bus`."""
-        ring = StampingRing(now_ns, capacity)
+        ring = StampingRing(now_ns, read, capacity)
         take = ring.take
         handler = _handle_samples(lambda sample: take(sample.payload.to_bytes()))
         self._kept.append(self._subscribe(key, handler))
