@@ -17,11 +17,20 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.bench import BenchResults, plan_bench, prepare_bench_folder, run_bench
 from trilat_net.studies.bench.bench_cell import BenchRun, BenchRunTask, run_bench_task
-from trilat_net.studies.bench.bench_gains import choose_round_trip, find_stale, read_gains
+from trilat_net.studies.bench.bench_gains import (
+    choose_round_trip,
+    find_stale,
+    name_settings,
+    read_gains,
+    tune_laws,
+    write_gains,
+)
 from trilat_net.studies.bench.bench_plan import BenchCell, BenchPlan
 from trilat_net.studies.bench.bench_run import BenchPlace
 from trilat_net.studies.bench.bench_tables import build_bench_page, encode_places, encode_runs
 from trilat_net.studies.bench.bench_tasks import LINKS, STUDIES, TUNED_ROUND_TRIPS_MS, build_settings
+from trilat_net.studies.tuning import plan_tuning
+from trilat_net.studies.tuning.final_posture import CandidateClass
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
@@ -161,6 +170,23 @@ def test_the_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
                     knobs = {knob.name: knob for knob in SEARCH_SPACES[law].knobs}
                     assert kept.keys() == knobs.keys()
                     assert all(knobs[key].low <= value <= knobs[key].high for key, value in kept.items())
+
+
+@pytest.mark.long
+def test_kept_gains_are_the_least_error_that_the_procedure_finds(tmp_path: Path) -> None:
+    found = tune_laws({"level": ["p_d"]}, 1, budget=4)
+    assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
+    settings = name_settings(build_settings("level", "contact", "rtt272"))
+    (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=4).run(1).found
+    errors = [score.error_rad for score in search.scores]
+    settled = [score.error_rad for score in search.scores if score.outcome is CandidateClass.SETTLED]
+    least = min(filter(None, settled or errors))
+    assert (found[1].error_rad, found[1].gains) == (least, search.tried[errors.index(least)])
+    assert (found[1].settled, found[1].tried) == (len(settled), 4)
+    write_gains(found[:2], tmp_path / "gains.json")
+    write_gains(found[1:], tmp_path / "gains.json")
+    assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(map(str, found))
+    assert find_stale(found) == []
 
 
 def test_gains_are_those_of_the_next_longer_round_trip() -> None:
