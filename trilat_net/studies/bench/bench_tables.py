@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from ...analysis.certificate.observed_energy import ObservedFinding
 from ...analysis.json_values import JsonObject
 from ...analysis.run_end import Stability
 from ...reporting.text_table import TextTable
@@ -109,19 +110,18 @@ def _describe_place(place: BenchPlace, quantity: str) -> str:
 
 
 def tabulate_energies(results: BenchResults) -> TextTable:
-    """Returns a row per law that declares energies, and what they show in the first run of each cell."""
+    """Returns a row per law that declares energies: the runs in which none is below zero, of those seen."""
     tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
 
     def cell(law: str, task: str) -> str:
         seen = [run for place in results.of(task, law) for run in place.runs if run.observed]
-        words = list(dict.fromkeys(run.observed for run in seen))
-        least = [run.least_j for run in seen if run.least_j is not None]
-        counts = [f"{sum(run.observed == word for run in seen)} {word}" for word in words]
-        return "; ".join([*counts, *([f"least {min(least):.2g} J"] if least else [])]) or "-"
+        passive = sum(run.observed == ObservedFinding.PASSIVE for run in seen)
+        least = min((run.least_j for run in seen if run.least_j is not None), default=0.0)
+        return f"{passive}/{len(seen)}, least {least:.2g} J" if seen else "-"
 
     laws = [one for one in list_laws(results) if declares_energies(one[0])]
     rows = [(name_law(*one), *(cell(one[0], task) for task in tasks)) for one in laws]
-    return TextTable(("observed energy", *tasks), rows)
+    return TextTable(("observed energy never below zero", *tasks), rows, align="lr")
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
