@@ -58,6 +58,22 @@ def test_v_without_some_records_is_that_of_a_log_that_lacks_them() -> None:
     assert np.isfinite(course.V).all()
 
 
+def test_v_of_a_session_that_is_joined_late_begins_when_all_under_way_is_known() -> None:
+    log, whole = runs.run("rich").log, runs.run("rich").balance
+    windows = make_windows(log.scenario, log.sites, kept_s=4.0)
+    running, found = RunningEnergy(log.scenario, windows), []
+    for first in range(1200, 2400, BLOCK):
+        for site in log.sites:
+            for record in log[site].states[first : first + BLOCK]:
+                windows[site].take(record)
+        found.append(running.advance({site: windows[site].newest for site in log.sites}))
+    assert found[0] is None
+    course = joined([one for one in found if one is not None])
+    assert 2.4 < course.t_s[0] < 3.2
+    rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
+    assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()
+
+
 def test_a_law_without_such_a_v_says_so() -> None:
     log = runs.run("jitter", {"duration_s": 0.3}).log
     running = RunningEnergy(log.scenario, make_windows(log.scenario, log.sites))

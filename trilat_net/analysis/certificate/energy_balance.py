@@ -114,7 +114,7 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     energies = derive_site_energies(
         log.scenario, records, pasts, lambda site, t_s: trace_dominance(log, site, t_s)
     )
-    return energies if energies and len(_find_common_times(energies)) > 1 else {}
+    return energies if energies and len(find_common_times(energies)) > 1 else {}
 
 
 def derive_site_energies(
@@ -155,7 +155,7 @@ def derive_site_energies(
     return energies
 
 
-def _find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
+def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
     """Returns the ticks of the fastest site from when every V_i is known to the end of the records, s."""
     records = [energy.motion.records for energy in energies.values()]
     times = max(records, key=lambda own: own.rate_hz).t_s
@@ -239,7 +239,7 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
 
     With `ones` every site weighs the same, as in the paper; then it need not close.
     """
-    times, grids = _find_common_times(energies), {}
+    times, grids = find_common_times(energies), {}
     columns, sites, unjudged = [], {}, np.zeros(len(times))
     sums: dict[tuple[str, str], Array] = {}
     for n, (site, energy) in enumerate(energies.items()):

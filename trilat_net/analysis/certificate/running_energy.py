@@ -17,7 +17,12 @@ from ..aligned import PeerTrajectory
 from ..dominance_history import DominanceHistory, evaluate_ramps, forget_ramps, list_scripted_ramps
 from ..lyapunov_weights import find_closed_groups
 from ..record_window import RecordWindow
-from .energy_balance import compute_energy_balance, derive_site_energies, find_dominance_matrices
+from .energy_balance import (
+    compute_energy_balance,
+    derive_site_energies,
+    find_common_times,
+    find_dominance_matrices,
+)
 from .premises import check_scenario_premises, describe_closed_groups
 
 STEP_S = 0.1
@@ -105,12 +110,12 @@ class RunningEnergy:
                 others = tuple(tuple(records)[n] for n in groups[1])
                 self.reason = describe_closed_groups((names, others))
                 return None
-        balance = compute_energy_balance(energies)
+        balance = compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
         for site in self._start:
             self._start[site], self._ramps[site] = forget_ramps(
                 self._start[site], self._ramps[site], begin_s - 1.0
             )
-        if len(balance.t_s) < 2:
+        if balance is None:  # a session that was joined late: what was under way then is not known
             return None
         supplied = self._supplied + balance.external_work
         self._supplied = float(supplied[-1])
