@@ -242,3 +242,14 @@ def test_arms_that_a_line_holds_against_hands_are_at_rest_there() -> None:
     scenario = load_scenario("two_sites", {"control.law": "wave", "scheme": "digital", **follows})
     loop = linearise_scenario(scenario, find_equilibrium(scenario, (0.4, 1.2)))
     assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
+
+
+def test_a_pull_that_saturates_is_linearised_where_it_does_not() -> None:
+    """Its loop is that of P+d with the same K and d, and the analysis says so."""
+    loops = []
+    for law in ({"law": "saturated_pd", "P": 5.0}, {"law": "p_d"}):
+        scenario = unit_scenario({"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0})
+        found = analyse_linear_loop(scenario, pose=(0.0, 0.0))
+        loops.append([root.s for root in found.decisive.roots])
+        assert any("small errors" in note for note in found.notes) == (law["law"] == "saturated_pd")
+    assert loops[0] == loops[1]

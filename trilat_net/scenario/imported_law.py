@@ -40,6 +40,8 @@ class PluggedLaw(Frozen, frozen=True):
     """
 
     core_class: ClassVar[Any] = None
+    linear_note: ClassVar[str] = ""
+    """What its small motions leave out."""
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core: none."""

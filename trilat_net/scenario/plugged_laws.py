@@ -126,6 +126,7 @@ class SaturatedPositions(PluggedLaw, frozen=True, tag_field="law", tag="saturate
     """
 
     core_class = SaturatedPd
+    linear_note = "saturated_pd has the slope K of small errors: where sites disagree at rest it pulls less"
 
     K: PositiveJoints = (10.0,)
     P: PositiveJoints = (5.0,)

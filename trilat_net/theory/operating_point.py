@@ -124,6 +124,7 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
     alpha = _final_dominance(scenario, sites, notes)
     age_s, varying = np.zeros_like(alpha), []
     laws = tuple(spec.control for spec in scenario.sites.values())
+    notes += [law.linear_note for law in laws if isinstance(law, PluggedLaw) and law.linear_note]
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
     links = ~np.eye(len(alpha), dtype=bool) if conditions.has_forms else alpha != 0.0
     if conditions.has_forms:
