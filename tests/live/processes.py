@@ -227,6 +227,6 @@ def equal_to_virtual_time(log: Log) -> None:
     assert twins.fed.identical == twins.fed.records == records
     if twins.excused_from is None:
         assert twins.plain.first is None
+        assert twins.plain.identical == twins.plain.records == records
     else:
         assert twins.plain.first is None or twins.plain.first.tick >= twins.excused_from
-        assert twins.plain.identical == twins.plain.records == records

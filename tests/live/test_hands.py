@@ -71,7 +71,7 @@ def held(session: Session, seconds: float, orders: Sequence[Sequence[str]]) -> L
     log = session.is_reproduced()
     said = [event.text for event in log.events if event.kind == "hand"]
     for site in ("m1", "m2"):
-        assert sum(text.startswith(f"{site}: hand at {site} takes hold") for text in said) == 1
+        assert any(text.startswith(f"{site}: hand at {site} takes hold") for text in said)
         assert np.abs(log[site].tau_x).max() > 1.0
     return log
 
