@@ -164,7 +164,7 @@ def external_log() -> bytes:
     stream = io.BytesIO()
     run = virtual.execute_virtual
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual, "execute_virtual", lambda s, n=None: run(s, n, measured={"s": moves}))
+        patch.setattr(virtual, "execute_virtual", lambda s, n=None, **_: run(s, n, measured={"s": moves}))
         patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
         virtual.write_virtual_log(scenario, stream)
     return stream.getvalue()
