@@ -26,8 +26,8 @@ pytestmark = pytest.mark.skipif(
 SHORTER_THEN = {"4g": "30", "p_d_margin": "60"}
 """How long these ran then, s."""
 
-PUSHED = ("4g", "contact", "paper", "two_sites")
-"""What a push looks at: random delays, force reflection at a wall, the paper's hands, two sites."""
+PUSHED = ("contact", "paper", "two_sites")
+"""What a push looks at: force reflection at a wall, the paper's hands, two sites."""
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_the_map_in_contact_has_its_edge() -> None:
     ("B", "b"),
     [
         (0.0, 5.0),
-        (2.0, 10.0),
+        pytest.param(2.0, 10.0, marks=pytest.mark.long),
         pytest.param(5.0, 10.0, marks=pytest.mark.long),
         pytest.param(0.0, 20.0, marks=pytest.mark.long),
     ],

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
 from tests.net.waiting import until
@@ -52,6 +53,7 @@ def keys(journal: Path) -> list[tuple[int, int]]:
     return [(one["cell"], one["seed"]) for one in found]
 
 
+@pytest.mark.long
 def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Path) -> None:
     """SIGKILL to all its processes, then Ctrl-C; two processes, where the whole sweep had one."""
     (tmp_path / "trio.toml").write_text(LONGER)
