@@ -19,7 +19,7 @@ from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
-from trilat_net.scenario import parse_embedded
+from trilat_net.scenario import embedded_names_reader
 
 from .page_server import LOOPBACK, PageServer
 
@@ -113,7 +113,7 @@ def watch_with_page(
             connection,
             clock,
             session,
-            lambda text: parse_embedded(text, session).names,
+            embedded_names_reader(session),
             stopped=interrupt.requested,
             timeout_s=timeout_s,
             say=say,

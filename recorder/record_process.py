@@ -23,7 +23,7 @@ from trilat_net.net.membership import Epoch, EventPublisher, describe_member, ne
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.process import Interrupt
-from trilat_net.scenario import parse_embedded
+from trilat_net.scenario import embedded_names_reader, parse_embedded
 
 from .inbound_queue import InboundQueue
 from .session_recording import RecorderReport, Recording
@@ -189,7 +189,7 @@ def record_session(
                 connection,
                 clock,
                 session,
-                lambda text: parse_embedded(text, session).names,
+                embedded_names_reader(session),
                 stopped=interrupt.requested,
                 timeout_s=join_timeout_s,
                 say=lambda text: say(f"recorder: {text}"),

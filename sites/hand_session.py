@@ -16,7 +16,7 @@ from trilat_net.net.discovery import SiteNamesOf, connect_to_session, find_site_
 from trilat_net.net.hand_port import Hand
 from trilat_net.net.member_keys import read_member_keys
 from trilat_net.net.messages import Info
-from trilat_net.scenario import Scenario, find_site, parse_embedded
+from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators import find_live_hand
 
@@ -56,9 +56,7 @@ def hand(
     connection = resolve_member_connection(None, connect, router, None, [], None)
     connection = secure_connection(connection, known, insecure=False)
 
-    def names(text: str) -> tuple[str, ...]:
-        return parse_embedded(text, session).names
-
+    names = embedded_names_reader(session)
     reached = connect_to_session(
         connection, clock, session, names, stopped=lambda: False, timeout_s=timeout_s
     )
@@ -112,6 +110,7 @@ def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
     rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
 
     def place(q: Vector) -> Sequence[float]:
+        """Returns the place of the end effector, m."""
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return place_end_effector(rows, tip)
 

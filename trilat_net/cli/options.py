@@ -77,6 +77,12 @@ def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackP
 check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
 """Refuses a waiting time out of range."""
 
+AnswerOption = Annotated[
+    float,
+    typer.Option(
+        "--timeout", metavar="S", help="Longest wait for the first answer, s.", callback=check_seconds
+    ),
+]
 ClockOffsetOption = Annotated[
     float,
     typer.Option(

@@ -28,15 +28,7 @@ def ping_command(
     count: Annotated[
         int, typer.Option("--count", metavar="N", help="Round trips to each member.", callback=_check_count)
     ] = 50,
-    timeout: Annotated[
-        float,
-        typer.Option(
-            "--timeout",
-            metavar="S",
-            help="Longest wait for the first answer, s.",
-            callback=options.check_seconds,
-        ),
-    ] = 3.0,
+    timeout: options.AnswerOption = 3.0,
     as_json: options.JsonOption = False,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,

@@ -106,7 +106,7 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     from ..net.clock import SystemClock
     from ..net.discovery import request_change
     from ..net.requests import ChangeRequest
-    from ..scenario import parse_embedded
+    from ..scenario import embedded_names_reader
 
     session, connection = context.obj
     if session is None:
@@ -117,7 +117,7 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
         session,
         site,
         ChangeRequest(**order),
-        lambda text: parse_embedded(text, session).names,
+        embedded_names_reader(session),
     )
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")

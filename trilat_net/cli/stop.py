@@ -23,7 +23,7 @@ def stop_command(
 
     from ..net.clock import SystemClock
     from ..net.discovery import REPLY_TIMEOUT_S, connect_to_session
-    from ..scenario import parse_embedded
+    from ..scenario import embedded_names_reader
 
     name, clock = options.check_session_name(session), SystemClock()
     connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
@@ -31,7 +31,7 @@ def stop_command(
         connection,
         clock,
         name,
-        lambda text: parse_embedded(text, name).names,
+        embedded_names_reader(name),
         stopped=lambda: False,
         timeout_s=REPLY_TIMEOUT_S,
     ) as bus:

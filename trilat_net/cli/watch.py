@@ -14,15 +14,7 @@ def watch_command(
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
-    timeout: Annotated[
-        float,
-        typer.Option(
-            "--timeout",
-            metavar="S",
-            help="Longest wait for the first answer, s.",
-            callback=options.check_seconds,
-        ),
-    ] = 10.0,
+    timeout: options.AnswerOption = 10.0,
 ) -> None:
     """Shows a running session in a terminal, a line for each site, until it ends or Ctrl-C.
 
@@ -34,7 +26,7 @@ def watch_command(
     from ..net.clock import SystemClock
     from ..net.discovery import connect_to_session
     from ..process import Interrupt
-    from ..scenario import parse_embedded
+    from ..scenario import embedded_names_reader
 
     name, clock = options.check_session_name(session), SystemClock()
     connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
@@ -43,7 +35,7 @@ def watch_command(
             connection,
             clock,
             name,
-            lambda text: parse_embedded(text, name).names,
+            embedded_names_reader(name),
             stopped=interrupt.requested,
             timeout_s=timeout,
         ) as bus:

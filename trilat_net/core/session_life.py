@@ -31,6 +31,7 @@ MIN_ALIGN_NS = 250_000_000
 
 _RUN, _DIVERGED, _HOLD = int(Mode.RUN), int(Mode.DIVERGED), int(Mode.HOLD)
 _ALIGN, _WAITING = int(Mode.RETURN), int(Mode.WAITING)
+_START = int(LifeReason.START)
 _PEERS_HERE, _ALIGNED = int(LifeReason.PEERS_HERE), int(LifeReason.ALIGNED)
 _PEER_SILENT, _PEERS_BACK = int(LifeReason.PEER_SILENT), int(LifeReason.PEERS_BACK)
 _ALIGN_LIMIT = int(LifeReason.ALIGN_LIMIT)
@@ -112,7 +113,7 @@ def update_session_life(t_ns: int, before_ns: int, site: Row, links: RowArray) -
         for i in range(site.q_held.shape[0]):
             site.q_held[i] = site.x[i] if site.task else site.q[i]
             site.qd_held[i] = 0.0
-        _enter(0, _WAITING, 0, site)
+        _enter(0, _WAITING, _START, site)
     _update_mode(t_ns, before_ns, site, links)
     if site.mode == _RUN:
         return

@@ -103,6 +103,7 @@ def _hold(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     """Yields what comes from a member (ingress) and what goes to it (egress)."""
 
     def keys(whose: str, channels: Sequence[str]) -> list[str]:
+        """Returns the keys of some channels of a member, or of every one, in any session."""
         return [topics.key("*", whose, channel) for channel in channels]
 
     says = keys(member, role.publishes) + keys("*", role.addresses)

@@ -18,6 +18,7 @@ from .run_changes import parse_core_change as parse_core_change
 from .run_changes import resolve_change as resolve_change
 from .run_changes import scheduled_link_tables as scheduled_link_tables
 from .run_changes import to_core_change as to_core_change
+from .scenario_reader import embedded_names_reader as embedded_names_reader
 from .scenario_reader import find_site as find_site
 from .scenario_reader import list_shipped as list_shipped
 from .scenario_reader import load_scenario as load_scenario

@@ -5,7 +5,7 @@ Invariant: text from a log or a peer is not trusted: it names no file, and its l
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -166,3 +166,13 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
                 source=source,
             )
     return scenario
+
+
+def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
+    """Returns the function that reads the sites' names of embedded scenarios; errors call these `source`."""
+
+    def read_names(text: str) -> tuple[str, ...]:
+        """Returns the names of the sites; as `parse_embedded`."""
+        return parse_embedded(text, source).names
+
+    return read_names
