@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo play setup test pytest sessions live containers lint test-long bench lock clean
+.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -48,12 +48,15 @@ test: pytest
 	@$(MAKE) --no-print-directory -j2 sessions lint
 	@$(MAKE) --no-print-directory live
 
-pytest: $(VENV)/dev.stamp
-	$(BIN)/python -m tests.compile_core
+pytest:
+	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp compiled
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
 
+compiled: setup
+	$(BIN)/python -m tests.compile_core
+
 sessions: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -q -m "live and not long"
+	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
 test-long: $(VENV)/robots.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
@@ -61,7 +64,7 @@ test-long: $(VENV)/robots.stamp
 
 live: setup
 	rm -rf runs/check
-	$(BIN)/trilat demo paper --duration 10 --out runs/check
+	$(BIN)/trilat demo paper --duration 5 --out runs/check
 	$(BIN)/trilat verify --virtual runs/check/run.mcap
 
 containers: setup

@@ -108,14 +108,15 @@ def test_random_runs_do_not_fool_it(first: int) -> None:
 
 
 def _kinds(seeds: range) -> list[int]:
-    """The first seed of every kind."""
-    return list({draw_experiment(seed).kind: seed for seed in reversed(seeds)}.values())
+    """The first seed of the kinds that are found anew on a push; walls and delays that swing take longer."""
+    kinds = {draw_experiment(seed).kind: seed for seed in reversed(seeds)}
+    return [seed for kind, seed in kinds.items() if kind in ("network", "adaptive", "operator")]
 
 
 @pytest.mark.parametrize(
     "seeds",
     [
-        pytest.param(_kinds(range(60)), id="one of each kind"),
+        pytest.param(_kinds(range(60)), id="one of three kinds"),
         *(pytest.param(range(n, n + 100), id=str(n), marks=pytest.mark.long) for n in range(0, SEEDS, 100)),
     ],
 )

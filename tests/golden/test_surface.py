@@ -15,6 +15,20 @@ from .surface import all_options, keys
 
 HERE = Path(__file__).parent
 BEFORE = json.loads((HERE / "surface.json").read_text())
+LONG = ("report live-4g.mcap", "report v2.mcap", "linear free", "linear training", "certify v2.mcap")
+"""Cases beside which another one says nearly the same."""
+
+
+def _params(cases: list[dict]) -> list:
+    """The cases as parameters of a test, named by what was asked."""
+    return [
+        pytest.param(case, id=" ".join(case["asked"]) or "nothing", marks=_marks(case["asked"]))
+        for case in cases
+    ]
+
+
+def _marks(asked: list[str]) -> tuple:
+    return (pytest.mark.long,) if " ".join(asked[:2]) in LONG else ()
 
 
 def test_every_command_and_option_is_still_there() -> None:
@@ -23,14 +37,7 @@ def test_every_command_and_option_is_still_there() -> None:
     assert not {c: gone for c, names in BEFORE["options"].items() if (gone := set(names) - set(now[c]))}
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, marks=pytest.mark.long if case["asked"][:2] == ["report", "live-4g.mcap"] else ())
-        for case in BEFORE["json"]
-    ],
-    ids=lambda case: " ".join(case["asked"][:2]),
-)
+@pytest.mark.parametrize("case", _params(BEFORE["json"]))
 def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path) -> None:
     asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
     made = subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True, text=True)
@@ -39,7 +46,7 @@ def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path)
     assert made.returncode == case["exit"], made.stderr
 
 
-@pytest.mark.parametrize("case", BEFORE["exit"], ids=lambda case: " ".join(case["asked"]) or "nothing")
+@pytest.mark.parametrize("case", _params(BEFORE["exit"]))
 def test_every_exit_code_stays(case: dict, tmp_path: Path) -> None:
     asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
     assert subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True).returncode == case["exit"]

@@ -33,6 +33,7 @@ def test_a_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Sta
     assert {state.mode for state in log["s"].states} == {Mode.RUN.name.lower(), Mode.HOLD.name.lower()}
 
 
+@pytest.mark.long
 def test_what_is_set_while_it_runs_is_answered_recorded_and_reproduced(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "6")
     session.all()

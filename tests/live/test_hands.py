@@ -80,6 +80,7 @@ DELAY = ("link", "m1->s", "--delay", "120ms")
 SHARES = ("dominance", "s", "m1=0.8", "m2=0.2", "--ramp", "1s")
 
 
+@pytest.mark.long
 def test_a_session_of_two_programs_and_changes_is_verified_and_repeated(stage: Stage) -> None:
     log = held(Session(stage, "play", PAPER, "--duration", "6"), 2.5, [DELAY, SHARES])
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]

@@ -68,6 +68,7 @@ def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) ->
     assert router.code() == 128 + signal.SIGTERM
 
 
+@pytest.mark.long
 def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stage) -> None:
     """The loops never stop; what was made meanwhile comes into the log from the sites' memory."""
     session = Keyed(stage, "8")

@@ -56,7 +56,13 @@ def test_panels_of_joints_fill_their_rows():
     assert len(arrange_joints(7, narrow=True)) == 4
 
 
-@pytest.mark.parametrize("form", [REPORT_SIZE, make_print_size(3.5)], ids=["report", "narrow"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        pytest.param(REPORT_SIZE, id="report"),
+        pytest.param(make_print_size(3.5), id="narrow", marks=pytest.mark.long),
+    ],
+)
 @pytest.mark.parametrize(
     ("draw", "panels"),
     [

@@ -95,6 +95,7 @@ def workers_of(cluster: Cluster) -> int:
         return opened.workers
 
 
+@pytest.mark.long
 @pytest.mark.timeout(120)
 def test_a_sweep_on_two_workers_of_which_one_is_killed_gives_the_same_bytes(
     cluster: Cluster, tmp_path: Path

@@ -152,6 +152,7 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
     assert np.abs(build_admittance(whole)(w_rad_s) - Y).max() <= 1e-9 * np.abs(Y).max()
 
 
+@pytest.mark.long
 def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     """Of what is left out, each state counts as a root at zero; the shared pose is the others."""
     case = six("adaptive")

@@ -47,6 +47,7 @@ def test_every_panel_has_its_own_lines() -> None:
     assert made.remarks == ()
 
 
+@pytest.mark.long
 def test_lines_do_not_depend_on_what_ran_nor_on_how_many_processes_there_are() -> None:
     everything = results()
     one = everything._replace(rows=[row for row in everything.rows if row["cell"] != 7])
