@@ -8,7 +8,15 @@ export function css(name) {
   if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
   return colours.get(name);
 }
+const sizes = new WeakMap(); // asking an element for its size makes the browser lay out the page at once
+const sizer = new ResizeObserver((entries) => { for (const { target, contentRect } of entries) sizes.set(target, contentRect); });
+export function sizeOf(element) {
+  if (!sizes.has(element)) { sizes.set(element, { width: element.clientWidth, height: element.clientHeight }); sizer.observe(element); }
+  return sizes.get(element);
+}
+export const WORDS_MS = 200; // nobody reads numbers that change more often, and each makes the browser lay out the page
 export const siteColour = (index) => css(`--site-${index % 6}`);
+const FADE = 15;
 const SLOW_MS = 45;
 const SLOW_FRAMES = 40;
 const MODES = { hold: "HOLDS: peer stale", brake: "BRAKED: peer stale", return: "RETURNS", waiting: "WAITS FOR PEERS", diverged: "DIVERGED" };
@@ -55,6 +63,7 @@ class ArmCard {
     this.view = { centre: this.middle(), half: 0 };
     this.hold = null; // what this page's hand does: { at, to } in the arm's frame
     this.trail = [];
+    this.nextWords = 0;
   }
 
   middle() {
@@ -86,6 +95,8 @@ class ArmCard {
   }
 
   numbers(site) {
+    if (performance.now() < this.nextWords) return;
+    this.nextWords = performance.now() + WORDS_MS;
     const size = (force) => Math.hypot(...force);
     const parts = [["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
       ["hand", `${size(site.hand).toFixed(1)} N`, "more"]];
@@ -118,8 +129,8 @@ class ArmCard {
 
   size() {
     const ratio = Math.min(devicePixelRatio || 1, 2);
-    const { clientWidth, clientHeight } = this.canvas;
-    const [width, height] = [Math.max(1, Math.round(clientWidth * ratio)), Math.max(1, Math.round(clientHeight * ratio))];
+    const box = sizeOf(this.canvas);
+    const [width, height] = [Math.max(1, Math.round(box.width * ratio)), Math.max(1, Math.round(box.height * ratio))];
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     return ratio;
   }
@@ -144,12 +155,14 @@ class ArmCard {
     const at = this.project(tip);
     g.lineJoin = "round";
     g.strokeStyle = siteColour(this.index);
-    this.trail.forEach((point, n) => {
-      if (!n) return;
-      g.globalAlpha = (0.5 * n) / this.trail.length;
-      g.lineWidth = 1.5 * ratio;
-      g.beginPath(); g.moveTo(...this.project(this.trail[n - 1])); g.lineTo(...this.project(point)); g.stroke();
-    });
+    g.lineWidth = 1.5 * ratio;
+    const way = this.trail.map((point) => this.project(point));
+    for (let n = 1; n < way.length; n += FADE) { // a few paths are drawn sooner than one for each step
+      g.globalAlpha = (0.5 * n) / way.length;
+      g.beginPath(); g.moveTo(...way[n - 1]);
+      for (const point of way.slice(n, n + FADE)) g.lineTo(...point);
+      g.stroke();
+    }
     g.globalAlpha = 1;
     const push = (force, colour, label) => {
       const size = Math.hypot(...force);

@@ -1,6 +1,7 @@
 // People's hands: drag an end effector, a gamepad, or keys. What they ask for goes to the server at most sixty
-// times a second, and again while they rest, so that the site knows that they still hold.
+// times a second, and now and then while they rest, so that the site knows that they still hold.
 const EVERY_MS = 1000 / 60;
+const STILL_MS = 50;
 const REACH_PX = 34;
 
 export class Hands {
@@ -12,6 +13,7 @@ export class Hands {
     addEventListener("blur", () => this.letGo());
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
     this.keys = new Set();
+    addEventListener("gamepadconnected", () => { this.padded = true; });
     setInterval(() => this.beat(), EVERY_MS);
   }
 
@@ -92,7 +94,7 @@ export class Hands {
   tell(card) {
     const now = performance.now();
     if (now - card.hold.told < EVERY_MS - 1) return;
-    card.hold.told = now;
+    Object.assign(card.hold, { told: now, asked: card.hold.to });
     this.send({ do: "hand", site: card.name, grip: true, to: this.goal(card) });
   }
 
@@ -104,7 +106,7 @@ export class Hands {
       card.card.classList.toggle("watched", !card.graspable);
       if (!card.hold) continue;
       if (!card.graspable || this.page.frame?.ended) this.release(card);
-      else this.tell(card);
+      else if (card.hold.to !== card.hold.asked || card.about.hand.mode === "force" || performance.now() - card.hold.told > STILL_MS) this.tell(card);
     }
   }
 
@@ -139,7 +141,8 @@ export class Hands {
     card.hold.to = this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to);
   }
 
-  gamepads() { // the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad
+  gamepads() { // asked for only once there is one; the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad
+    if (!this.padded) return;
     const pads = (navigator.getGamepads?.() || []).filter(Boolean);
     pads.forEach((pad, n) => {
       const card = pads.length > 1 ? this.arms.cards[n] : this.chosen || this.arms.cards[0];

@@ -1,6 +1,6 @@
 // The page of a running session: the socket, the state of the page, and what belongs to no single part.
 // Newest state wins: the server sends a frame when this page has drawn the one before.
-import { Arms } from "./arms.js";
+import { Arms, WORDS_MS } from "./arms.js";
 import { Hands } from "./hands.js";
 import { Network, describeLink } from "./network.js";
 import { Plots } from "./plots.js";
@@ -22,6 +22,7 @@ export function send(message) {
 }
 
 let hidesAt = 0;
+let nextWords = 0;
 function notice(text, ms = 6000) {
   $("notice").textContent = text;
   $("notice").hidden = false;
@@ -70,7 +71,6 @@ function take(frame) {
     $("part").setAttribute("aria-pressed", frame.takes_part);
     $("part").textContent = frame.takes_part ? "taking part" : "take part";
   }
-  $("clock").textContent = `${frame.t.toFixed(1)} s`;
   const silent = parts.names.filter((name) => frame.sites[name].silent);
   const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
   if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
@@ -81,6 +81,9 @@ function take(frame) {
   if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
   events(frame.events);
   parts.plots.take(frame);
+  if (performance.now() < nextWords) return;
+  nextWords = performance.now() + WORDS_MS;
+  $("clock").textContent = `${frame.t.toFixed(1)} s`;
   const pages = frame.pages === 1 ? "1 page" : `${frame.pages} pages`;
   const late = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
   const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";

@@ -1,5 +1,5 @@
 // The links: samples under way, numbers, and how to change them.
-import { css, siteColour } from "./arms.js";
+import { css, siteColour, sizeOf } from "./arms.js";
 
 const $ = (id) => document.getElementById(id);
 const PRESETS = [["none", 0], ["100 ms", 100], ["300 ms", 300], ["900 ms", 900]];
@@ -86,7 +86,7 @@ export class Network {
     this.follow();
     const { canvas } = this;
     const ratio = Math.min(devicePixelRatio || 1, 2);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const { width, height } = sizeOf(canvas);
     if (canvas.width !== Math.round(width * ratio)) Object.assign(canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
     const g = canvas.getContext("2d");
     g.setTransform(ratio, 0, 0, ratio, 0, 0);

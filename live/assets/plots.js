@@ -1,5 +1,5 @@
 // Streaming plots of the last seconds: errors, torques, forces of hands and walls, ages, and V.
-import { css, siteColour } from "./arms.js";
+import { css, siteColour, sizeOf } from "./arms.js";
 
 const SPAN_S = 20;
 const KEPT = 1500;
@@ -44,7 +44,7 @@ class Plot {
       return [bottom < 0 ? bottom - 0.06 * (top - bottom) : 0, top + 0.1 * (top - bottom)];
     };
     this.plot = new uPlot({
-      width: Math.max(this.box.clientWidth, 120), height: 132, padding: [6, 16, 0, 0], legend: { show: false }, cursor: { show: false },
+      width: Math.max(sizeOf(this.box).width, 120), height: 132, padding: [6, 16, 0, 0], legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false, range: () => [this.now - SPAN_S, this.now] }, y: { range } },
       axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => `${v} s`) }, axis(46)],
       series: [{}, ...this.series.map(({ colour, dash, width = 1.6 }) => ({
@@ -60,7 +60,7 @@ class Plot {
   draw(now) {
     if (this.box.hidden || !this.data[0].length) return;
     this.now = now;
-    const width = Math.max(this.box.clientWidth, 120);
+    const width = Math.max(sizeOf(this.box).width, 120);
     if (width !== this.plot.width) this.plot.setSize({ width, height: 132 });
     this.plot.setData(this.data);
   }
