@@ -22,7 +22,7 @@ from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
 from .inbound_queue import InboundMessage, InboundQueue
-from .site_reception import SiteReception
+from .site_reception import SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""
@@ -30,6 +30,8 @@ UNDER_WAY_NS = 100_000_000
 """A message that arrives within this time of the end of its site's token was under way."""
 AWAY_NS = 15_000_000_000
 """Time for a site that is gone without an end event: a cut link may heal."""
+STARTS_KEPT = 4096
+"""Starts that went before they were admitted."""
 LAST_NS = 6_000_000_000
 """Longest stay of a site after its last due tick: 5 s, and a margin."""
 
@@ -56,6 +58,9 @@ class Recording:
         self.dropped: Counter[str] = Counter()
         self._writer = writer
         self.session, self.epoch, self.publisher = session, epoch, publisher
+        self._scenario, self._bus = scenario, bus
+        self._boots, self._candidates = dict(epoch.boots), dict[str, int]()
+        self._vanished: set[tuple[str, str]] = set()
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {name: SiteReception(scenario, name, epoch.boots.get(name)) for name in scenario.names}
         self._repairs = {
@@ -101,6 +106,7 @@ class Recording:
     def write(self, queue: InboundQueue, now_ns: int) -> None:
         """Writes the queue, requests missing messages, and sends `stored` to sites that are complete."""
         self._drain(queue, now_ns)
+        self._admit_starts()
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in self._repairs.items():
             for channel, message, payload in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
@@ -128,6 +134,43 @@ class Recording:
             except WireError as error:
                 self.dropped[error.reason] += 1
 
+    def _admit_starts(self) -> None:
+        """Goes over to another start of a site where the one before is gone or has ended."""
+        for name, boot in list(self._candidates.items()):
+            before = self._sites[name]
+            if name not in self._gone and before.made is None and name in self._boots:
+                continue
+            del self._candidates[name]
+            self._boots[name] = boot
+            site = self._sites[name] = SiteReception(self._scenario, name, boot, before)
+            repair = self._repairs[name] = GapRepair(self._bus, self.session, site, self.dropped)
+            repair.probe()
+            for channel in site.accounts:
+                key = topics.key(self.session, name, channel)
+                self._channels[key], self.accounts[key] = (site, channel), site.accounts[channel]
+            self._stored.discard(name)
+            self._gone_ns.pop(name, None)
+            (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(name)
+
+    def _note_start(self, name: str, payload: bytes) -> None:
+        """Notes another start of a site that says that it comes, or that it is there."""
+        event = decode(payload, Event)
+        comes = event.kind in ("coming", "join") and event.boots.get(name) == event.boot
+        if comes and event.member == name and self._scenario.sites_may_return:
+            self._candidates[name] = event.boot
+            self._admit_starts()
+
+    def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
+        site, channel = self._channels[key]
+        try:
+            return site, site.read(channel, payload)
+        except WireError:
+            if channel != topics.EVENT:
+                raise
+            self._note_start(site.name, payload)
+            site, channel = self._channels[key]
+            return site, site.read(channel, payload)
+
     def _take(self, arrived: InboundMessage) -> None:
         since_ns = arrived.mono_ns - self.epoch.mono_ns
         log_time_ns = self.epoch.unix_ns + since_ns
@@ -136,8 +179,8 @@ class Recording:
             return
         if arrived.key not in self._channels:
             raise WireError("stranger", arrived.key)
-        site, channel = self._channels[arrived.key]
-        message = site.read(channel, arrived.payload)
+        site, message = self._read(arrived.key, arrived.payload)
+        channel = self._channels[arrived.key][1]
         if site.take(channel, message, arrived.mono_ns):
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
             self._writer.add(
@@ -163,8 +206,12 @@ class Recording:
     def presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""
         parts = topics.parse_key(key)
-        if parts is not None and str(self.epoch.boots.get(parts.member)) == parts.boot:
+        if parts is None or parts.member not in self._sites:
+            return
+        if str(self._boots.get(parts.member)) == parts.boot:
             (self._gone.discard if alive else self._gone.add)(parts.member)
+        elif not alive and len(self._vanished) < STARTS_KEPT:
+            self._vanished.add((parts.member, parts.boot))
 
     def _silent_since_ns(self, site: str, now_ns: int) -> int | None:
         """Returns since when a site is gone; None while its token is present.
@@ -212,8 +259,12 @@ class Recording:
 
     def account_texts(self, queue: InboundQueue) -> dict[str, str]:
         """Returns the accounts as they stand in the file: per topic, and dropped messages by reason."""
+        before = {
+            topics.key(self.session, name, topics.EVENT): site.event_accounts
+            for name, site in self._sites.items()
+        }
         texts = {
-            f"/{key}": f"{account.as_text()}, overflowed {queue.overflowed[key]}"
+            f"/{key}": f"{account.as_text(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
             for key, account in self.accounts.items()
         }
         return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self._dropped_counts()}}
@@ -227,12 +278,15 @@ class Recording:
         for name, site in self._sites.items():
             account = site.accounts[topics.STATE]
             total = (
-                " records of a number that it never said" if site.made is None else f" of {site.made} records"
+                " records of a number that it never said"
+                if site.made is None
+                else f" of {account.expected} records"
             )
             lines.append(
                 f"recorder: {name}: {account.received}{total}, {account.missing} missing, "
                 f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
                 + (f", {account.refilled} from its memory" if account.refilled else "")
+                + (f", {account.unmade} not made while it was away" if account.unmade else "")
             )
         if self._overflowed:
             lines.append(f"recorder: {self._overflowed} messages turned away because the queue was full")

@@ -38,17 +38,30 @@ class SiteMessage(NamedTuple):
 class SiteReception:
     """The messages received from one start of one site, and those missing.
 
+    Args:
+        scenario: what it runs.
+        name: the site.
+        boot: its start; None: it is not there yet.
+        before: the reception of the start before, whose ticks this one continues.
+
     Attributes:
         name: the site.
-        accounts: its messages by channel.
+        accounts: its messages by channel; those of events begin anew with every start.
+        event_accounts: those of the starts before.
         made: number of its ticks, once its end event has arrived; else None.
         heard_ns: arrival of its last message, on the recorder's clock; None before.
         period_ns: its tick period.
     """
 
-    def __init__(self, scenario: Scenario, name: str, boot: int | None) -> None:
-        self.name = name
+    def __init__(
+        self, scenario: Scenario, name: str, boot: int | None, before: "SiteReception | None" = None
+    ) -> None:
+        self.name, self._before = name, before
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
+        self.event_accounts: tuple[Account, ...] = ()
+        if before is not None:
+            self.accounts = {**before.accounts, topics.EVENT: Account()}
+            self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
         self.made: int | None = None
         self.heard_ns: int | None = None
         self._boot = boot
@@ -114,6 +127,11 @@ class SiteReception:
         """Counts the messages that must exist because this one does."""
         if isinstance(content, LinkStats):
             self.expect(topics.STATE, content.tick + 1)
+        elif isinstance(content, Event) and content.kind == "join":
+            made = 0 if self._before is None or self._before.made is None else self._before.made
+            for channel in (topics.STATE, topics.LINK):
+                numbers = (count_messages(channel, ticks, self._rate_hz) for ticks in (content.ticks, made))
+                self.accounts[channel].begin_anew(*numbers)
         elif isinstance(content, Event) and content.kind == "end":
             self.made = content.ticks
             for channel in (topics.STATE, topics.LINK):

@@ -9,7 +9,7 @@ from array import array
 from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
-from trilat_net.net.loop_stats import STATS_PER_SECOND
+from trilat_net.net.loop_stats import STATS_PER_SECOND, ticks_per_stats
 from trilat_net.net.pinging import answer_backfill
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 
@@ -39,6 +39,10 @@ class ChannelBuffer:
         self._bytes = bytearray().ljust(size_bytes, b"\xff")  # touched, so that the pages exist
         self._starts, self._lengths = array("q", bytes(8 * capacity)), array("q", bytes(8 * capacity))
         self._head = 0  # bytes written since the start, with those skipped at the end of the memory
+
+    def begin_at(self, number: int) -> None:
+        """Lets the first message have a number, before there is any."""
+        self.made = self.oldest = number
 
     def keep(self, payload: bytes) -> None:
         """Adds the next message; drops the oldest ones to make room."""
@@ -89,6 +93,11 @@ class RetransmitBuffer:
             topics.LINK: ChannelBuffer(statistics, statistics * STATISTICS_BYTES),
             topics.EVENT: ChannelBuffer(EVENTS_KEPT, EVENTS_BYTES),
         }
+
+    def begin_at(self, tick: int, rate_hz: int) -> None:
+        """Lets tick be the first one of the site."""
+        self.channels[topics.STATE].begin_at(tick)
+        self.channels[topics.LINK].begin_at(-(-tick // ticks_per_stats(rate_hz)))
 
     def answer_query(self) -> bool:
         """Answers the oldest query; False without one."""

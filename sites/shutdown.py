@@ -3,10 +3,10 @@
 Invariant: the wait ends when every recorder present has all messages that it can have, and it is bounded.
 """
 
-from collections.abc import Mapping
+import signal
 
 from trilat_net.core.ticks import NS_PER_S, Mode, TickRecord, describe_divergence
-from trilat_net.errors import RunFailed
+from trilat_net.errors import PeerLeft, RunFailed
 from trilat_net.net import topics
 from trilat_net.net.membership import EventPublisher
 
@@ -30,11 +30,10 @@ class LeavingSite:
         self,
         parts: SiteParts,
         publisher: EventPublisher,
-        boots: Mapping[str, int],
         output: TickRecord | None,
         failure: RunFailed | None,
     ) -> None:
-        self._parts, self._publisher, self._boots = parts, publisher, boots
+        self._parts, self._publisher = parts, publisher
         self._ticks = 0 if output is None else output.tick + 1
         self._t_ns = -1 if output is None else output.t_ns
         self._end_kind, self._failure = "failed", failure
@@ -45,7 +44,7 @@ class LeavingSite:
         """Publishes the end, waits for the recorders, and returns the exit code.
 
         Raises:
-            RunFailed: the run ended badly, here or at a peer.
+            RunFailed: the run ended badly, here or at a peer; as `PeerLeft`, without a peer.
         """
         parts, interrupt = self._parts, self._parts.interrupt
         if self._failure is not None:
@@ -53,11 +52,11 @@ class LeavingSite:
         if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
             self._publish("law", hiccups)
             parts.say(hiccups)
-        asked = ", as many as it was asked for" if parts.changes.stopped else ""
-        self._publish("end", f"{parts.name} made {self._ticks} ticks{asked}")
+        about, why = self._find_cause()
+        self._publish("end", f"{parts.name} made {self._ticks} ticks{why}", about=about)
         code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)
-        if topics.RECORDER in self._boots or parts.monitor.recorders:
+        if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
             self._await_recorders()
         dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
         parts.say(
@@ -68,10 +67,32 @@ class LeavingSite:
             raise self._failure
         if parts.monitor.ended_by:
             raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
+        if not code and self._away:
+            raise PeerLeft(f"{parts.name} made {self._ticks} ticks; {self._away}, and did not come back")
         return code
 
-    def _publish(self, kind: str, text: str) -> None:
-        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks)
+    @property
+    def _away(self) -> str:
+        """What sites that have left said of it, "" if all are there."""
+        return "; ".join(text for _, text in self._parts.monitor.away.values())
+
+    def _find_cause(self) -> tuple[str, str]:
+        """Returns whose end it was if the run ends before its time, and why, to be put behind a sentence."""
+        parts, monitor = self._parts, self._parts.monitor
+        if self._failure is not None:
+            return parts.name, f": {self._failure}"
+        if monitor.ended_by:
+            return monitor.ended_member, f": {monitor.ended_by}"
+        if parts.changes.stopped:
+            return "", ", as many as it was asked for"
+        if self._ticks == parts.scenario.ticks(parts.name):
+            return "", ""
+        if parts.interrupt.requested():
+            return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
+        return next(iter(monitor.away), ""), f": {self._away}"
+
+    def _publish(self, kind: str, text: str, about: str = "") -> None:
+        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
         """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""

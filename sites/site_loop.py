@@ -14,7 +14,7 @@ from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.site_setup import LinkSetup, SiteSetup
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
+from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord, first_tick_at
 from trilat_net.errors import WireError
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
@@ -33,7 +33,8 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
 class PeerInbox:
     """The samples of a site's peers; every sequence has one entry for each, in scenario order.
 
-    Messages of other boots are dropped; `dropped` counts what is dropped, by reason.
+    Messages of other boots are dropped; `dropped` counts what is dropped, by reason. A site that joins late
+    passes over samples stamped before its own first tick, at `from_ns`: it takes nothing for the past.
     """
 
     def __init__(
@@ -45,11 +46,19 @@ class PeerInbox:
         monitors: Sequence[LinkTimingMonitor],
         dropped: Counter[str],
         links: Sequence[LinkSetup],
+        from_ns: int = 0,
     ) -> None:
-        self._links = links
+        self._links, self._from_ns = links, from_ns
         self._peers, self._rings, self._rates = peers, rings, rates
-        self._boots, self._monitors, self._dropped = boots, monitors, dropped
-        self._last = [-1] * len(peers)
+        self._boots, self._monitors, self._dropped = list(boots), monitors, dropped
+        self._last = [first_tick_at(from_ns, rate_hz) - 1 for rate_hz in rates]
+        if from_ns:
+            self.drain(from_ns)  # what came while it waited must not burden the first tick
+
+    def admit(self, index: int, boot: int, first: int) -> None:
+        """Takes from now on the samples of another start of a peer, which begins at a tick of its own."""
+        self._boots[index] = boot
+        self._last[index] = max(self._last[index], first - 1)
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS."""
@@ -71,6 +80,8 @@ class PeerInbox:
             self._dropped["stranger"] += 1
             return None
         stamp_ns = sample.tick * NS_PER_S // self._rates[index]
+        if stamp_ns < self._from_ns:
+            return None
         if stamp_ns - since_epoch_ns > AHEAD_LIMIT_NS:
             self._dropped["ahead"] += 1
             return None
@@ -164,12 +175,13 @@ def run_loop(
     stats: LoopStats,
     states: StateBlock,
     io: LoopIO,
+    first: int = 0,
 ) -> TickRecord | None:
-    """Runs a site in real time, from tick 0, and returns its last record; None without a tick."""
+    """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
     busy_us, mode, last, asked = 0, Mode.RUN, None, False
-    deadline_ns = timing.schedule.deadline(0)
-    for k in range(ticks):
+    deadline_ns = timing.schedule.deadline(first)
+    for k in range(first, ticks):
         clock.sleep_until(deadline_ns)
         if io.should_stop():
             break

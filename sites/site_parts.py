@@ -44,6 +44,8 @@ class SiteOptions:
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
         clock_offset_s: injected offset of the clock from the machine's, s.
         clock_drift_ppm: injected drift of the clock, ppm.
+        without: sites without which the session begins; they may join it while it runs.
+        leave_timeout_s: how long to go on after a site has left that does not come back, s; None: to the end.
     """
 
     session: str
@@ -54,6 +56,8 @@ class SiteOptions:
     stay_s: float = 0.0
     clock_offset_s: float = 0.0
     clock_drift_ppm: float = 0.0
+    without: tuple[str, ...] = ()
+    leave_timeout_s: float | None = None
 
 
 class SiteParts:
@@ -109,10 +113,11 @@ class SiteParts:
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
-        turn, single = scenario.names.index(name), self.arm is not None
+        turn = scenario.names.index(name)
+        single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
         self.states = StateBlock(self.site, self.boot, self._states_publisher(), turn, single=single)
         self.publish_link = self._keeping_publisher(topics.LINK)
-        self.monitor = PeerMonitor(bus, session, name, peers)
+        self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self.changes = ChangeServer(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
         warm_up(scenario, name, clock)
 

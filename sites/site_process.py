@@ -13,7 +13,7 @@ from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
-from trilat_net.net.membership import Epoch, EventPublisher, describe_member
+from trilat_net.net.membership import Epoch, EventPublisher, LateSites, describe_member
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
@@ -27,6 +27,8 @@ from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
+NOBODY = -1
+"""No start of a peer that is not there yet."""
 STATUS_TICKS_S = 5
 """Between two lines that say how a site does, s."""
 
@@ -81,10 +83,12 @@ class JoiningSite:
         scenario, options = parts.scenario, parts.options
         needs = {"needs_recorder": options.needs_recorder}
         info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
+        late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
         self._parts = parts
         keep = parts.buffer.channels[topics.EVENT].keep
         self._publisher = EventPublisher(parts.bus, options.session, info, keep)
-        self._joining = SessionJoin(parts.bus, parts.clock, options.session, self._publisher, scenario.names)
+        meets = (parts.bus, parts.clock, options.session, self._publisher)
+        self._joining = SessionJoin(*meets, scenario.names, late)
 
     def join(self, give_up_ns: int) -> "RunningSite | None":
         """Waits for the others; None if a signal comes first.
@@ -102,6 +106,7 @@ class JoiningSite:
             if now_ns > give_up_ns:
                 missing = membership.missing()
                 reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+                reason = self._joining.refusal or reason
                 for member, problem in membership.unreadable.items():
                     reason += f"; the answer of {member} cannot be read: {problem}"
                 raise SessionError(
@@ -119,6 +124,7 @@ class RunningSite:
         scenario, site = parts.scenario, parts.site
         self._parts, self._publisher, self._epoch = parts, publisher, epoch
         self._failure: RunFailed | None = None
+        self._given_up = False
         self._mode = Mode.RUN
         self._output: TickRecord | None = None
         self._status_s = 0
@@ -126,19 +132,22 @@ class RunningSite:
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.admit(epoch.boots)
+        boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
         peers = [
             PeerClock(
                 peer,
-                epoch.epochs[peer],
+                epoch.epochs.get(peer, epoch.mono_ns),
                 scenario.peers(peer).index(parts.name),
-                pinger.estimate(epoch.boots[peer]),
-                pinger.estimator(epoch.boots[peer]),
+                pinger.estimate(boot),
+                pinger.estimator(boot),
             )
-            for peer in site.peers
+            for peer, boot in zip(site.peers, boots, strict=True)
         ]
+        if epoch.first:
+            site.begin_at(epoch.first)
+            parts.buffer.begin_at(epoch.first, site.rate_hz)
         self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0])
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
-        boots = [epoch.boots[peer] for peer in site.peers]
         self._inbox = PeerInbox(
             site.peers,
             parts.rings,
@@ -147,6 +156,7 @@ class RunningSite:
             self._timing.meters,
             parts.stats.dropped,
             parts.setup.links,
+            tick_ns(epoch.first, site.rate_hz),
         )
         publisher.update(
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
@@ -159,8 +169,8 @@ class RunningSite:
         with parts.watchdog or nullcontext():
             ticks = parts.scenario.ticks(parts.name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
-            output = run_loop(parts.site, parts.boot, *timed, parts.states, self)
-        return LeavingSite(parts, self._publisher, self._epoch.boots, output, self._failure)
+            output = run_loop(parts.site, parts.boot, *timed, parts.states, self, self._epoch.first)
+        return LeavingSite(parts, self._publisher, output, self._failure)
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
@@ -171,7 +181,12 @@ class RunningSite:
             epoch_mono_ns=self._epoch.mono_ns,
             clock=parts.clock.identity(),
         )
-        parts.say(f"the session begins; {obtained['scheduling']}, memory {obtained['memory']}")
+        begins = "the session begins"
+        if first := self._epoch.first:
+            begins = f"joins the running session at t = {tick_ns(first, parts.site.rate_hz) * 1e-9:.3f} s"
+            text, about = f"{parts.name} {begins}", {"boots": self._epoch.boots, "ticks": first}
+            self._publisher.publish("join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about)
+        parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
         self._publish_clocks(self._timing.opening(), 0)
         if parts.arm is not None and (text := parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)):
             self._publisher.publish("arm", f"{parts.name}: {text}")
@@ -190,7 +205,7 @@ class RunningSite:
             parts.arm.poll()
             self._failure = self._failure or parts.arm.failure
         ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
-        return bool(ended) or parts.interrupt.requested()
+        return bool(ended) or parts.interrupt.requested() or self._given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """See `LoopIO`."""
@@ -209,7 +224,7 @@ class RunningSite:
         self._publisher.update(ticks=k + 1)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
-        self._parts.monitor.watch(self._publisher, t_ns)
+        self._watch_members(t_ns)
         for news in () if self._parts.hand is None else self._parts.hand.take_news():
             self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
             self._parts.say(news.text.partition(": ")[2])
@@ -220,6 +235,22 @@ class RunningSite:
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))
+
+    def _watch_members(self, t_ns: int) -> None:
+        """Takes in who has come, and gives up where somebody has been away for too long."""
+        parts, monitor = self._parts, self._parts.monitor
+        monitor.watch(self._publisher, t_ns)
+        for event in monitor.admitted:
+            index, rate_hz = parts.site.peers.index(event.member), parts.scenario.sites[event.member].rate_hz
+            bound_ns = None if event.clock == parts.clock.identity() else event.bound_ns
+            joins = (tick_ns(event.ticks, rate_hz), event.epoch_mono_ns, bound_ns)
+            self._publish_clocks(self._timing.admit(index, *joins), t_ns)
+            self._inbox.admit(index, event.boot, event.ticks)
+            parts.say(f"{event.member} joins at t = {joins[0] * 1e-9:.3f} s")
+        monitor.admitted.clear()
+        patience_s = parts.options.leave_timeout_s
+        since_ns = min((since_ns for since_ns, _ in monitor.away.values()), default=t_ns)
+        self._given_up = patience_s is not None and t_ns - since_ns > patience_s * NS_PER_S
 
     def _describe_status(self, output: TickRecord) -> str:
         """Returns how the site does, in a line."""

@@ -73,6 +73,12 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
     """A run or a comparison that failed: divergence, a dead site, records that differ."""
 
 
+class PeerLeft(RunFailed):
+    """A run of which another site ended its part before the end, and did not come back."""
+
+    exit_code = 3
+
+
 class LawFailed(RunFailed):
     """A user's control law that raised, was too slow, or returned no torque.
 

@@ -1,4 +1,4 @@
-"""Process control: garbage collection, SIGINT and SIGTERM, worker processes.
+"""Process control: garbage collection, SIGINT, SIGTERM and SIGHUP, worker processes.
 
 Invariants: garbage collection pauses only around code whose many objects form no cycles (records, lists of
 numbers). A signal ends nothing by itself: a loop polls it and ends in order. Worker processes leave Ctrl-C
@@ -79,8 +79,16 @@ class LinePrinter:
                 self._say(text)
 
 
+_HANG_UP = getattr(signal, "SIGHUP", None)
+ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None)
+"""Signals that end a program in order."""
+
+
 class Interrupt:
-    """A context that records the first SIGINT or SIGTERM, as `number` (else 0), and restores the handlers."""
+    """A context that records the first signal that ends a program, as `number` (else 0).
+
+    Whoever ignores the end of its terminal (`nohup`) goes on doing so.
+    """
 
     def __init__(self) -> None:
         self.number = 0
@@ -88,8 +96,9 @@ class Interrupt:
         self._raises = False
 
     def __enter__(self) -> "Interrupt":
-        for name in (signal.SIGINT, signal.SIGTERM):
-            self._before[name] = signal.signal(name, self._take)
+        for name in ENDING_SIGNALS:
+            if name != _HANG_UP or signal.getsignal(name) is not signal.SIG_IGN:
+                self._before[name] = signal.signal(name, self._take)
         return self
 
     def __exit__(

@@ -70,12 +70,18 @@ class Relay:
         return self._epoch_unix_ns + self.now_ns
 
 
+class Killed(Exception):  # noqa: N818 - it is no error of the program
+    """Ends a runner wherever it sleeps."""
+
+
 class RelayClock:
     """One runner's `Clock`."""
 
     def __init__(self, relay: Relay, seat: int) -> None:
         self._relay, self._seat = relay, seat
         self._stalls: list[tuple[int, int]] = []
+        self.dies_ns: int | None = None
+        """When its runner is killed."""
 
     def stall(self, at_ns: int, for_ns: int) -> None:
         """The first sleep that would end at a time or after it ends so much later."""
@@ -95,3 +101,5 @@ class RelayClock:
             deadline_ns += self._stalls.pop(0)[1]
         if deadline_ns > self._relay.now_ns:
             self._relay.sleep(self._seat, deadline_ns)
+        if self.dies_ns is not None and self._relay.now_ns >= self.dies_ns:
+            raise Killed

@@ -24,7 +24,7 @@ from trilat_net.net.wire import decode, encode_state
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 
-from .relay import Relay, RelayClock
+from .relay import Killed, Relay, RelayClock
 
 SESSION = "t"
 RECORDER_BOOT = 77
@@ -51,6 +51,8 @@ class Session:
     """How long the sites wait for the recorder to leave, and how long it works on when it has all."""
     left_ns: dict[str, int] = field(default_factory=dict)
     """When a member left, and when the log was whole ("log")."""
+    options: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Further options of sites, by name."""
     ends: dict[str, object] | None = None
     """What each site came to, its exit code or its error; None where an error fails the test."""
 
@@ -70,6 +72,8 @@ class Session:
         def run(clock: RelayClock) -> object:
             try:
                 end: object = self.live(name, clock, needs_recorder=needs_recorder)
+            except Killed:
+                end = "killed"
             except (RunFailed, SessionError) as failed:
                 if self.ends is None:
                     raise
@@ -82,7 +86,9 @@ class Session:
 
     def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
         """A site's life, from its connection to its exit code."""
-        options = SiteOptions(SESSION, Connection(), 10.0, needs_recorder, stay_s=self.stay_s)
+        options = SiteOptions(
+            SESSION, Connection(), 10.0, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
+        )
         interrupt = self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
         bus = self.network.join()

@@ -1,9 +1,13 @@
 """`trilat site`: runs one site of a scenario as one process."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+if TYPE_CHECKING:
+    from ..scenario import Scenario
+
+from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from . import options
 
@@ -42,6 +46,23 @@ def site_command(
             callback=options.check_seconds,
         ),
     ] = 0.0,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without",
+            metavar="SITE",
+            help="Option of the first site: begin without this one, which may join later; repeatable.",
+        ),
+    ] = None,
+    leave_timeout: Annotated[
+        float | None,
+        typer.Option(
+            "--leave-timeout",
+            metavar="S",
+            help="Under glide: how long to go on without a site that has left, s; default: to the end.",
+            callback=options.check_seconds,
+        ),
+    ] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
     duration: options.DurationOption = None,
@@ -83,5 +104,20 @@ def site_command(
         stay_s=stay,
         clock_offset_s=clock_offset,
         clock_drift_ppm=clock_drift,
+        without=_check_without(chosen, name, without or []),
+        leave_timeout_s=leave_timeout,
     )
     raise typer.Exit(run_site(chosen, name, how, terminal.print_line))
+
+
+def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
+    """Refuses sites that cannot come late."""
+    from ..scenario import find_site
+
+    for late in without:
+        find_site(scenario, late)
+        if name != scenario.names[0] or late == name:
+            raise UsageError(f"--without is an option of {scenario.names[0]}, who begins, for other sites")
+        if not scenario.sites_may_return:
+            raise UsageError('--without asks for on_stale.action = "glide" at every site')
+    return tuple(without)

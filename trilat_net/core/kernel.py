@@ -55,7 +55,7 @@ def _advance_estimate(s: Row, chain: RowArray | None, gain_s: float, Yr: Vector)
 @leaf
 def _update_estimate(k: int, s: Row, chain: RowArray | None) -> None:
     """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
-    if s.scheme == _DIGITAL or k == 0 or s.mode == _DIVERGED or s.law != _ADAPTIVE:
+    if s.scheme == _DIGITAL or k == s.first or s.mode == _DIVERGED or s.law != _ADAPTIVE:
         return
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -138,7 +138,7 @@ def _advance(
     if s.external == 0:
         for i in range(s.u.shape[0]):
             torque = s.tau[i]
-            if s.scheme != _DIGITAL and k > 0:
+            if s.scheme != _DIGITAL and k > s.first:
                 torque = control.limit_torque(1.5 * s.tau[i] - 0.5 * s.tau_before[i], s.tau_limit[i])
             s.u[i] = torque + s.held[i]
         if not _advance_arm(t_ns * 1e-9, h_s, s, chain, actors, table):

@@ -11,7 +11,7 @@ faster than `align_speed` beyond what it had. A peer that holds or aligns itself
 from enum import IntEnum
 
 from .jit import leaf
-from .ticks import Mode
+from .ticks import Mode, tick_ns
 from .vectors import Row, RowArray, put
 
 
@@ -109,11 +109,11 @@ def update_session_life(t_ns: int, before_ns: int, site: Row, links: RowArray) -
     """
     if site.mode == _DIVERGED:
         return
-    if t_ns == 0:  # from its own pose, at rest
+    if t_ns == tick_ns(site.first, site.rate_hz):  # from its own pose, at rest
         for i in range(site.q_held.shape[0]):
             site.q_held[i] = site.x[i] if site.task else site.q[i]
             site.qd_held[i] = 0.0
-        _enter(0, _WAITING, _START, site)
+        _enter(t_ns, _WAITING, _START, site)
     _update_mode(t_ns, before_ns, site, links)
     if site.mode == _RUN:
         return

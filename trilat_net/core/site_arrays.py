@@ -23,7 +23,7 @@ from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
 _SETTINGS = (
-    *("rate_hz", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
+    *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
     *("theta_known", "needs_model", "remembered", "asked"),
 )
 _COUNTS = ("joints", "shared", "parameters", "task", "sent")

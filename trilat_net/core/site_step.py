@@ -107,6 +107,19 @@ class Site:
                 raise ValueError(f"at most {MAX_RAMPS} changes of the shares of a site wait to begin")
             add_ramp(self._arrays, command.ramp)
 
+    def begin_at(self, k: int) -> None:
+        """Lets tick k be the first one, of a site that joins a running session; for a site without ticks.
+
+        Its arm stands where it starts, no sample of a peer is in use, and none is under way; its channels are
+        where they would be.
+        """
+        self._site["first"] = k
+        for n, link in enumerate(self._links):
+            sample = (k - 1) * int(link["rate_hz"]) // self.rate_hz
+            if sample >= 0:
+                find_release(n, sample, self._arrays)
+        self._links["copies"] = 0
+
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one tick and returns its record.
 

@@ -53,6 +53,7 @@ class LogCheckReport(NamedTuple):
             "judged": result.coverage.to_json(),
             "integrity": result.integrity.state.name.lower(),
             "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
+            "not_made": [{"site": site, "first": a, "last": b} for site, a, b in result.absences],
             "first_difference": None
             if first is None
             else {**first._asdict(), "logged": repr(first.logged), "computed": repr(first.computed)},
@@ -97,6 +98,9 @@ def _checks(
         yield CheckLine("scenario", "is not the one whose hash the log names: it was changed", False)
     if virtual and recorded:
         yield CheckLine("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
+    elif virtual and log.absences:
+        away = " and ".join(log.absences)
+        yield CheckLine("virtual time", f"is another run: {away} left, or came while it ran", True)
     elif virtual:
         twins = compare_with_virtual(log, progress)
         gap = min((first for _, first, _ in result.gaps), default=None)  # what arrived there is unknown
@@ -132,6 +136,8 @@ def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
     text = f"{result.identical}/{result.records} records identical ({how})"
     if result.gaps:
         text += f"; no records of {_gaps_text(result.gaps)}"
+    if result.absences:
+        text += f"; not made, between two starts: {_gaps_text(result.absences)}"
     if recorded:
         text += f"; {recorded} as recorded"
         if result.coverage.share < result.min_coverage:

@@ -53,6 +53,7 @@ class VerifyResult:
         unjudged: records behind gaps that could not be judged.
         first: the difference of the earliest tick.
         gaps: missing ticks: (site, first, last).
+        absences: ticks that a site did not make between two of its starts, likewise.
     """
 
     whole_run: bool
@@ -65,6 +66,7 @@ class VerifyResult:
     differing: int = 0
     first: RecordDifference | None = None
     gaps: list[tuple[str, int, int]] = field(default_factory=list)
+    absences: list[tuple[str, int, int]] = field(default_factory=list)
 
     @property
     def agreed(self) -> bool:
@@ -78,7 +80,7 @@ class VerifyResult:
 
     def add(self, other: "VerifyResult") -> None:
         """Adds the result of other sites, which were executed from another log."""
-        for name in ("records", "identical", "unjudged", "differing", "gaps"):
+        for name in ("records", "identical", "unjudged", "differing", "gaps", "absences"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.whole_run &= other.whole_run
         self.coverage.judged.update(other.coverage.judged)
@@ -148,9 +150,15 @@ class SiteVerifier:
         by_tick: Mapping[str, Mapping[int, State]],
         ends: Mapping[str, int],
         result: VerifyResult,
+        starts: Sequence[tuple[int, int]] = (),
+        absences: Sequence[tuple[int, int]] = (),
     ) -> None:
-        setup = scenario.setup(site_log.name)
+        self._setup = setup = scenario.setup(site_log.name)
         self._site, self._channel = Site(setup), setup.channel
+        self._starts = {boot: first for first, boot in starts}
+        self._absences = {last + 1: first for first, last in absences}
+        self._boot: int | None = None
+        self._began = 0  # the place of the first record of this start
         self._scenario, self._log, self._result = scenario, site_log, result
         self._external = site_log.name in scenario.external
         self._law_failed = False
@@ -168,15 +176,18 @@ class SiteVerifier:
             if report is not None and n % PROGRESS_EVERY == 0:
                 report(result.records)
             result.records += 1
-            if state.tick == expected - 1:
+            if state.tick == expected - 1 and state.boot not in self._starts:
                 result.add_difference(RecordDifference(state.site, state.tick, "tick", state.tick, expected))
                 continue
+            if self._boot is None or (state.boot != self._boot and state.boot in self._starts):
+                expected = self._begin_start(n, expected)
             if state.tick != expected:
                 result.gaps.append((name, expected, state.tick - 1))
                 self._certain = False
             expected = state.tick + 1
             try:
-                if not self._certain and not self._law_failed and self._inputs.can_resume(n):
+                resumes = not self._certain and not self._law_failed and n - 2 >= self._began
+                if resumes and self._inputs.can_resume(n):
                     for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
                         self._site.order(change, state.t_ns)
                     self._inputs.resume(self._site, n)
@@ -197,10 +208,26 @@ class SiteVerifier:
         if expected <= self._own_end:
             result.gaps.append((name, expected, self._own_end))
 
+    def _begin_start(self, n: int, expected: int) -> int:
+        """Goes over to the start of the site that made record n; returns its first tick."""
+        self._boot, self._began = self._log.states[n].boot, n
+        first = self._starts.get(self._boot)
+        if first is None or first < expected:
+            return expected
+        absent = max(self._absences.get(first, first), expected)
+        if expected < absent:
+            self._result.gaps.append((self._log.name, expected, absent - 1))
+        if absent < first:
+            self._result.absences.append((self._log.name, absent, first - 1))
+        self._inputs.take_changes(first - 1)  # the start before took them in
+        self._site, self._certain = Site(self._setup), True
+        self._site.begin_at(first)
+        return first
+
     def _find_other_sender(self, state: State) -> RecordDifference | None:
         """Returns the difference of a record that another start, or another site, made; else None."""
         name = self._log.name
-        if state.boot != (boot := self._log.states[0].boot):
+        if state.boot != (boot := self._boot):
             return RecordDifference(name, state.tick, "boot", state.boot, boot)
         return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
 
@@ -208,7 +235,7 @@ class SiteVerifier:
         """Executes the tick of record n and compares the result with the record."""
         result, states, peers = self._result, self._log.states, self._log.peers
         difference = self._find_other_sender(state)
-        if not result.whole_run and n >= 2 and states[n - 2].tick == state.tick - 2:
+        if not result.whole_run and n - 2 >= self._began and states[n - 2].tick == state.tick - 2:
             self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
         arrivals, missing = self._inputs.arrivals(state.rx)
         invalid = None
@@ -297,7 +324,8 @@ def _execute_sites(
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
     for name in sites:
-        SiteVerifier(log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result).run(report)
+        read = (log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result)
+        SiteVerifier(*read, log.starts.get(name, ()), log.absences.get(name, ())).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:

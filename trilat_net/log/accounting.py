@@ -1,9 +1,9 @@
 """Accounts of channels: received and missing messages by number, counted live or from a log.
 
 Invariant: expected = received + missing, always. A message's number is its tick for a record, its place
-from 0 for statistics and events. Memory is bounded: of more gaps than `MAX_GAPS`, the lowest are only
-counted. Accounts made from a file decode events only, and count a later part of a log from its first
-message on.
+from 0 for statistics and events. Ticks between two starts of a site were not made: they are neither expected
+nor missing. Memory is bounded: of more gaps than `MAX_GAPS`, the lowest are only counted. Accounts made from
+a file decode events only, and count a later part of a log from its first message on.
 """
 
 import math
@@ -48,17 +48,24 @@ class RangeSet:
             self._lasts.append(last)
         self._drop_lowest()
 
-    def remove(self, number: int) -> bool:
-        """Removes one number; returns False if it is not in."""
+    def remove(self, number: int, last: int | None = None) -> bool:
+        """Removes one number, or those up to the last one of a range; returns False if it is not in."""
         place = bisect_right(self._firsts, number) - 1
         if place < 0 or number > self._lasts[place]:
             return False
-        first, last = self._firsts[place], self._lasts[place]
-        parts = [(a, b) for a, b in ((first, number - 1), (number + 1, last)) if a <= b]
+        sides = (self._firsts[place], number - 1), ((last or number) + 1, self._lasts[place])
+        parts = [(a, b) for a, b in sides if a <= b]
         self._firsts[place : place + 1] = [a for a, _ in parts]
         self._lasts[place : place + 1] = [b for _, b in parts]
         self._drop_lowest()
         return True
+
+    def find(self, number: int) -> tuple[int, int] | None:
+        """Returns the range that a number is in, None if it is in none."""
+        place = bisect_right(self._firsts, number) - 1
+        if place < 0 or number > self._lasts[place]:
+            return None
+        return self._firsts[place], self._lasts[place]
 
     def find_from(self, number: int) -> tuple[int, int] | None:
         """Returns the first range at or above a number, cut off below it; None if there is none."""
@@ -88,12 +95,13 @@ class Account:
         duplicate: messages that came though their number was there.
         reordered: messages that came after one with a higher number.
         refilled: messages from the sender's memory, after they had been missing.
+        unmade: numbers that no message has: the sender ended before them and began anew behind them.
         last: largest number that is known to exist, -1 before the first.
         silence_ns: the longest time between two that came, ns; 0 if they are not stamped.
     """
 
     def __init__(self) -> None:
-        self.received = self.duplicate = self.reordered = self.refilled = 0
+        self.received = self.duplicate = self.reordered = self.refilled = self.unmade = 0
         self.last = -1
         self.silence_ns = 0
         self._lost_below = 0  # missing numbers below this one cannot be had from any member
@@ -132,6 +140,17 @@ class Account:
             self._gaps.append(self.last + 1, made - 1)
             self.last = made - 1
 
+    def begin_anew(self, first: int, made: int = 0) -> None:
+        """Takes the gap just below a number for not made: another start of the sender begins with it.
+
+        The start before had `made` as many messages at least; what is missing of those stays missing.
+        """
+        self.expect(first)
+        gap = self._gaps.find(first - 1)
+        if gap is not None and (begin := max(gap[0], made)) < first:
+            self._gaps.remove(begin, first - 1)
+            self.unmade += first - begin
+
     def give_up(self, below: int) -> None:
         """Marks what is missing below a number as lost for good; if it comes all the same, it counts."""
         self._lost_below = max(self._lost_below, below)
@@ -143,7 +162,7 @@ class Account:
     @property
     def expected(self) -> int:
         """Number of messages that are known to exist."""
-        return self.last + 1
+        return self.last + 1 - self.unmade
 
     @property
     def missing(self) -> int:
@@ -160,15 +179,23 @@ class Account:
         """Number of messages that the largest gap has."""
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
-    def as_text(self) -> str:
-        """Returns the account in one line, for the file and for people."""
+    def as_text(self, *before: "Account") -> str:
+        """Returns the account in one line, for the file and for people.
+
+        It is together with those `before`, of earlier starts that counted their messages from 0 as well.
+        """
+        counts = {
+            name: sum(getattr(one, name) for one in (*before, self))
+            for name in ("expected", "received", "missing", "duplicate", "reordered", "refilled")
+        }
         gaps = self.gap_texts(SHOWN_GAPS)
         named = f" ({' '.join(gaps)}{' ...' if len(self._gaps) > len(gaps) else ''})" if gaps else ""
         silence = f", longest silence {self.silence_ns / 1e6:.1f} ms" if self.silence_ns else ""
+        unmade = f", not made {self.unmade}" if self.unmade else ""
+        starts = f", of {len(before) + 1} starts" if before else ""
         return (
-            f"expected {self.expected}, received {self.received}, missing {self.missing}, "
-            f"duplicate {self.duplicate}, reordered {self.reordered}, refilled {self.refilled}, "
-            f"largest gap {self.largest_gap}{named}{silence}"
+            ", ".join(f"{name} {count}" for name, count in counts.items())
+            + f", largest gap {self.largest_gap}{named}{silence}{unmade}{starts}"
         )
 
     def gap_texts(self, most: int, base: int = 0) -> list[str]:
@@ -238,6 +265,8 @@ def _percent(share: float) -> str:
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
+MAX_STARTS = 64
+"""Starts of a member whose events are counted apart."""
 EVENTS_NUMBERED_SINCE = 3
 """Events have numbers from this version of the schema on."""
 
@@ -263,9 +292,10 @@ class SessionAccounts:
         ticks: Mapping[str, int] | None = None,
     ) -> None:
         self._session, self._rates_hz, self._continued = session, rates_hz, continued
-        self._ticks = dict(ticks or {})
+        self._ticks, self._ends = dict(ticks or {}), dict[str, int]()
         self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
+        self._starts: dict[str, dict[int, Account]] = {}  # of events, by boot: each counts from 0
         self._bases: dict[str, int] = {}
 
     def _topic(self, member: str, channel: str) -> str:
@@ -279,28 +309,56 @@ class SessionAccounts:
 
     def take(self, topic: str, sequence: int, payload: bytes = b"") -> None:
         """Counts a message by its sequence number; the payload of an event may state the number of ticks."""
-        account = self._accounts.get(topic)
-        if account is None:
+        if topic not in self._accounts:
             return
         member, channel = topic.split("/")[-2:]
+        event = self._decode_event(payload) if channel == topics.EVENT and payload else None
         number = number_message(channel, sequence, self._rates_hz.get(member, 0))
-        base = self._bases.setdefault(topic, number if self._continued else 0)
-        if number >= base:
-            account.take(number - base)
+        if event is None:
+            self._count(topic, number)
+        else:
+            self.take_event(topic, number, event)
         if channel == topics.LINK:
             self._expect(member, topics.STATE, sequence + 1)
-        elif channel == topics.EVENT and payload:
-            self._take_end(payload)
 
-    def _take_end(self, payload: bytes) -> None:
+    def take_event(self, topic: str, number: int, event: Event) -> None:
+        """Counts an event, and what it says of the ticks of a site."""
+        starts = self._starts.setdefault(topic, {})
+        if event.boot not in starts and len(starts) < MAX_STARTS:
+            starts[event.boot] = Account() if starts else self._accounts[topic]
+            self._accounts[topic] = starts[event.boot]
+        account = starts.get(event.boot, self._accounts[topic])
+        if account is next(iter(starts.values())):
+            self._count(topic, number, account)
+        else:
+            account.take(number)
+        if event.member in self._rates_hz and 0 <= event.ticks < 1 << 32:
+            if event.kind == "end":
+                self.expect(event.member, event.ticks)
+                self._ends[event.member] = event.ticks
+            elif event.kind == "join":
+                self.begin_anew(event.member, event.ticks, self._ends.pop(event.member, 0))
+
+    def _count(self, topic: str, number: int, account: Account | None = None) -> None:
+        base = self._bases.setdefault(topic, number if self._continued else 0)
+        if number >= base:
+            (account or self._accounts[topic]).take(number - base)
+
+    @staticmethod
+    def _decode_event(payload: bytes) -> Event | None:
         try:
-            event = decode(payload, Event, READABLE)
+            return decode(payload, Event, READABLE)
         except WireError:
-            return
-        if event.kind == "end" and event.member in self._rates_hz and 0 <= event.ticks < 1 << 32:
-            self.expect(event.member, event.ticks)
-            if event.member in self._ticks:
-                self._ticks[event.member] = min(event.ticks, self._ticks[event.member])
+            return None
+
+    def begin_anew(self, site: str, first: int, made: int) -> None:
+        """Takes what a site did not make between the ticks of one start and the first one of the next."""
+        for channel in (topics.STATE, topics.LINK):
+            topic, rate_hz = self._topic(site, channel), self._rates_hz[site]
+            if topic in self._accounts:
+                base = self._bases.get(topic, 0)
+                numbers = (count_messages(channel, ticks, rate_hz) - base for ticks in (first, made))
+                self._accounts[topic].begin_anew(*numbers)
 
     def expect(self, site: str, ticks: int) -> None:
         """Counts as missing what a site published in so many ticks and is not there."""
@@ -315,7 +373,8 @@ class SessionAccounts:
     def texts(self) -> dict[str, str]:
         """Returns the accounts by topic, as a file holds them."""
         return {
-            topic: (f"from {base} on: " if (base := self._bases.get(topic, 0)) else "") + account.as_text()
+            topic: (f"from {base} on: " if (base := self._bases.get(topic, 0)) else "")
+            + account.as_text(*list(self._starts.get(topic, {}).values())[:-1])
             for topic, account in self._accounts.items()
             if account.expected or topic.split("/")[-2] in self._rates_hz
         }
@@ -324,7 +383,12 @@ class SessionAccounts:
         """Returns the records that are there, of the ticks that each site made, else those of the run."""
         accounts = {site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz}
         there = {site: account.received for site, account in accounts.items() if account is not None}
-        return Coverage(there, self._ticks)
+        ticks = {
+            site: min(most, self._ends.get(site, most)) - (account.unmade if account is not None else 0)
+            for site, most in self._ticks.items()
+            for account in [accounts.get(site)]
+        }
+        return Coverage(there, ticks)
 
     def missing(self) -> Iterator[str]:
         """Yields a text per site that lacks records."""

@@ -39,6 +39,7 @@ def _find_unexplained(log: Log, site: str) -> str:
         found = " and ".join(f"{n} {word}" for word, n in there.items())
         return f"records of {site} were taken out or put in: its account says {told}, the file has {found}"
     inner = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
+    inner -= min(inner, log.absent_ticks(site))
     if not inner or log.chain.state is ChainState.INTACT:
         return ""
     counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]

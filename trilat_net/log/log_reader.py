@@ -178,13 +178,15 @@ class Log:
             sequences = {
                 self._topic(name, topics.STATE): self[name].tick.tolist(),
                 self._topic(name, topics.LINK): [stats.tick for stats in self.link_stats(name)],
-                self._topic(name, topics.EVENT): [e.n for e in self.events if e.member == name and e.n >= 0],
             }
-            for topic in sequences:
+            for topic in (*sequences, self._topic(name, topics.EVENT)):
                 accounts.open(topic)
             for topic, numbers in sequences.items():
                 for number in numbers:
                     accounts.take(topic, number)
+            for event in self.events:
+                if event.member == name and event.n >= 0:
+                    accounts.take_event(self._topic(name, topics.EVENT), event.n, event)
         for name, ticks in self._stated_ticks.items():
             accounts.expect(name, ticks)
         return {**accounts.texts(), **written}
@@ -200,23 +202,55 @@ class Log:
         ends = [event for event in self.events if event.kind == "end" and event.member in most]
         return {event.member: min(max(event.ticks, 0), most[event.member]) for event in ends}
 
+    @cached_property
+    def starts(self) -> dict[str, list[tuple[int, int]]]:
+        """Per site that joined the running session the first ticks of those starts, and their boots."""
+        joins = [e for e in self.events if e.kind == "join" and e.member in self.scenario.sites]
+        found: dict[str, list[tuple[int, int]]] = {}
+        for event in joins:
+            if 0 < event.ticks < self.scenario.ticks(event.member):
+                found.setdefault(event.member, []).append((event.ticks, event.boot))
+        return {site: sorted(starts) for site, starts in found.items()}
+
+    @cached_property
+    def absences(self) -> dict[str, list[tuple[int, int]]]:
+        """Per site the ticks before each of these starts that were not made, as (first, last).
+
+        They begin after those of which there are records, or that the start before stated at its end.
+        """
+        return {site: list(self._find_absences(site, starts)) for site, starts in self.starts.items()}
+
+    def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+        ends = [event.ticks - 1 for event in self.events if event.kind == "end" and event.member == site]
+        made = np.array([*self[site].tick.tolist(), *ends], dtype=np.int64)
+        for first, _ in starts:
+            before = int(made[made < first].max(initial=-1)) + 1
+            if before < first:
+                yield before, first - 1
+
+    def absent_ticks(self, site: str) -> int:
+        """Returns how many ticks that is for a site."""
+        return sum(last - first + 1 for first, last in self.absences.get(site, ()))
+
     def expected_ticks(self, site: str) -> int:
         """Returns how many ticks of a site belong to the run.
 
         Those that it stated at its end; of a site that others lost for good, those up to its last known one;
-        else those of the scenario.
+        else those of the scenario; without those that it did not make between two of its starts.
         """
         stated, there = self._stated_ticks.get(site), self[site].last_tick + 1
         if stated is None:
-            told = [event for event in self.events if event.about == site and event.kind in ("lost", "back")]
-            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind == "lost"
+            kinds = ("lost", "left", "back", "admit")
+            told = [event for event in self.events if event.about == site and event.kind in kinds]
+            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind in ("lost", "left")
             stated = there if gone and there else self.scenario.ticks(site)
-        return max(stated, there)
+        return max(stated, there) - self.absent_ticks(site)
 
     def missing(self, site: str) -> int:
         """Returns how many records of a site are missing: of those that it made, else up to its last one."""
         part = self[site]
-        return part.missing + max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
+        missing = part.missing + max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
+        return max(0, missing - self.absent_ticks(site))
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:

@@ -121,7 +121,8 @@ class ChannelCheck:
     Attributes:
         accounts: received and missing messages, by the member's boot.
         first, last: number and publish time of the messages with the lowest and the highest number.
-        ticks: how many ticks the member made, once it has stated that.
+        ends: by boot how many ticks the member made, of those that have stated it.
+        joins: by boot the first tick, of those that joined the running session.
     """
 
     def __init__(
@@ -138,7 +139,8 @@ class ChannelCheck:
         self.accounts: dict[int, Account] = defaultdict(Account)
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
-        self.ticks: int | None = None
+        self.ends: dict[int, int] = {}
+        self.joins: dict[int, int] = {}
         self._epoch_ns, self._version, self._problems = epoch_ns, version, problems
         self._in_file: dict[int, Account] = self.accounts
         self._file, self._log_ns = "", 0
@@ -164,10 +166,15 @@ class ChannelCheck:
         all_gaps = (gap for account in self.accounts.values() for gap in account.gaps)
         return [(max(first, begins), last) for first, last in all_gaps if last >= begins]
 
-    def expect(self, ticks: int) -> None:
-        """Counts as missing what the member sent in so many ticks and is not there."""
-        for account in self.accounts.values():
-            account.expect(count_messages(self.kind, ticks, self.rate_hz))
+    def expect(self, events: "ChannelCheck", most: int) -> None:
+        """Counts as missing what every start of the member sent, by its events, and is not there."""
+        for boot, account in self.accounts.items():
+            ends, first = events.ends, events.joins.get(boot, 0)
+            if len(self.accounts) == 1 or boot in ends:
+                stated = ends.get(boot, max(ends.values(), default=0))
+                account.expect(count_messages(self.kind, min(stated, most), self.rate_hz))
+            if 0 < first <= most:
+                account.begin_anew(count_messages(self.kind, first, self.rate_hz))
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
         """Begins with another file, and checks how it describes the channel."""
@@ -221,8 +228,9 @@ class ChannelCheck:
                 number = number_message(self.kind, message.tick, self.rate_hz)
                 return MessageIdentity(message.site, message.boot, number, message.tick, message.t_ns)
             case Event():
-                if message.kind == "end":
-                    self.ticks = message.ticks
+                stated = {"end": self.ends, "join": self.joins}.get(message.kind, {})
+                if message.boot in stated or len(stated) < MAX_BOOTS:
+                    stated[message.boot] = message.ticks
                 # a recorder's own events are stamped as it hears them; before the epoch there is no time
                 stamped = message.t_ns >= 0 and message.member != topics.RECORDER
                 event_ns = message.t_ns if stamped else None
@@ -385,11 +393,11 @@ class SessionCheck:
             if self._problems["chain"].wrong:
                 yield self._problems["chain"].finding("chain", "")
             return
-        ticks = {check.member: check.ticks for check in self.channels.values() if check.ticks is not None}
+        told = {check.member: check for check in self.channels.values() if check.kind == topics.EVENT}
         for check in self.channels.values():  # what a member published in the ticks that it stated
-            if check.kind in (topics.STATE, topics.LINK) and check.member in ticks:
+            if check.kind in (topics.STATE, topics.LINK) and check.member in told:
                 most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
-                check.expect(min(ticks[check.member], most))
+                check.expect(told[check.member], most)
         yield self._check_sequence()
         yield self._check_accounts()
         yield self._problems["chain"].finding("chain", self._chain_text)

@@ -3,8 +3,8 @@
 Invariant: a different scenario, a running session and a second start of the same member are refused at
 the first exchange; replies of strangers are ignored and kept for the error message. A recorder may join a
 running session, and several recorders may be present. It then takes identities, epoch and boots from the
-running members, waits for those that are present and can be pinged, and not for those that left. Sites do
-not join late: their arm would be in the wrong place.
+running members, waits for those that are present and can be pinged, and not for those that left. A site
+joins late only if it `returns`: if every site of the scenario waits for its peers and aligns with them.
 """
 
 import hashlib
@@ -115,6 +115,23 @@ class MemberQuery:
         self._query.repeat()
 
 
+class LateSites(NamedTuple):
+    """Which sites may join a session that runs, as one of its sites knows it.
+
+    Attributes:
+        returns: True if this site may: every one of the scenario waits for its peers and aligns with them.
+        without: sites without which the session begins, if this one leads.
+        rate_hz: its tick rate.
+    """
+
+    returns: bool = False
+    without: tuple[str, ...] = ()
+    rate_hz: int = 1
+
+
+NEVER_LATE = LateSites()
+
+
 class Membership:
     """The other members of a session, as one member knows them; a recorder, without sites, learns these.
 
@@ -124,11 +141,18 @@ class Membership:
     """
 
     def __init__(
-        self, bus: Bus, clock: Clock, session: str, publisher: EventPublisher, sites: Sequence[str]
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        publisher: EventPublisher,
+        sites: Sequence[str],
+        late: LateSites = NEVER_LATE,
     ) -> None:
         self.met: dict[str, Info] = {}
         self.gone: set[str] = set()
         self._session, self._publisher, self._sites = session, publisher, tuple(sites)
+        self._late = late
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
         self._refused: set[int] = set()
@@ -163,8 +187,19 @@ class Membership:
         needed = any(info.needs_recorder for info in (self.own, *self.met.values()))
         recorder = [topics.RECORDER] if needed or self._recorders else []
         return [
-            name for name in (*self._sites, *recorder) if name != self.own.member and name not in self.met
+            name
+            for name in (*self._sites, *recorder)
+            if name != self.own.member and name not in self.met and name not in self._late.without
         ]
+
+    def running(self) -> list[Info]:
+        """Returns the sites of a running session that were met, of those that agree on its members."""
+        infos = [
+            info
+            for _, info in sorted(self.met.items())
+            if info.running and info.scenario and info.boots.get(info.member) == info.boot
+        ]
+        return [info for info in infos if info.boots == infos[0].boots]
 
     def poll(self, *, invited: bool) -> None:
         """Takes answers, repeats the query, and forgets members that are gone.
@@ -193,13 +228,16 @@ class Membership:
         own = self.own
         if info.boot == own.boot or (not self._sites and info.member == topics.RECORDER):
             return
-        if info.running and not invited and (self._sites or not info.boots):
+        comes_late = self._late.returns and info.member != own.member
+        if info.running and not invited and (not comes_late if self._sites else not info.boots):
             raise SessionError(f"session {self._session!r} is running; {info.member} is at tick {info.ticks}")
         if info.member == own.member:
             if info.boot < own.boot:
                 raise SessionError(f"there is a {own.member} in session {self._session!r} already")
             return
         if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
+            if info.running and not invited:
+                raise SessionError(f"session {self._session!r} runs another scenario, {info.member} says")
             self._refuse(info)
             return
         if info.member == topics.RECORDER and self.met.get(info.member, info).boot != info.boot:
@@ -226,16 +264,18 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class Epoch(NamedTuple):
-    """Tick 0 of a session.
+    """Tick 0 of a session, and the first tick of a site that joins late.
 
     Attributes:
         mono_ns: on this process's monotonic clock.
         unix_ns: in Unix time, as the leader read it.
         boots: the members and their boots.
         epochs: the same instant on every member's own clock; empty for a recorder that joins late.
+        first: the first tick of this site.
     """
 
     mono_ns: int
     unix_ns: int
     boots: Mapping[str, int]
     epochs: Mapping[str, int] = {}
+    first: int = 0

@@ -3,7 +3,8 @@
 Invariant: one epoch for any start order. The first site of the scenario leads: once every member has replied
 consistently, it announces an epoch with the boots it is for; once all have replied `ready` in time it sends
 `start`, and otherwise announces another epoch. No member starts without `start`; a late recorder learns the
-epoch from the running members.
+epoch from the running members. So does a site that `returns`: it says `coming` with a first tick, and joins
+when every running site has said `admit` in time, which they do once the start before it is gone.
 
 The epoch is an instant of the leader's monotonic clock. A member on another clock converts it by pings, to
 half a round trip, and is ready only when it knows all clocks it needs; wall clocks decide nothing.
@@ -12,11 +13,21 @@ Everything is polled, on a given `Bus` and `Clock`; nothing waits.
 
 from collections.abc import Mapping, Sequence
 
+from ..core.ticks import first_tick_at, tick_ns
 from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import LATE_GATHER_NS, Epoch, EventPublisher, Membership, liveliness_token, read_events
+from .membership import (
+    LATE_GATHER_NS,
+    NEVER_LATE,
+    Epoch,
+    EventPublisher,
+    LateSites,
+    Membership,
+    liveliness_token,
+    read_events,
+)
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
@@ -27,15 +38,28 @@ DECIDE_NS = 150_000_000
 
 
 class SessionJoin:
-    """The way of a member, whose subscriptions are declared, into a session; call `poll` for the epoch."""
+    """The way of a member, whose subscriptions are declared, into a session; call `poll` for the epoch.
+
+    Attributes:
+        refusal: why a running site has not admitted this one, "" if none has said so.
+    """
 
     def __init__(
-        self, bus: Bus, clock: Clock, session: str, publisher: EventPublisher, sites: Sequence[str]
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        publisher: EventPublisher,
+        sites: Sequence[str],
+        late: LateSites = NEVER_LATE,
     ) -> None:
         self._clock, self._session, self._publisher = clock, session, publisher
-        self._sites = tuple(sites)
+        self._sites, self._late = tuple(sites), late
+        self.refusal = ""
+        self._coming: tuple[Event, Epoch] | None = None
+        self._admitted: set[str] = set()
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        self.membership = Membership(bus, clock, session, publisher, sites)
+        self.membership = Membership(bus, clock, session, publisher, sites, late)
         self.pinger = Pinger(bus, clock, session)
         self._met_ns: int | None = None  # the first member of a running session
         answer_pings(bus, clock, session, publisher.info)
@@ -63,35 +87,80 @@ class SessionJoin:
         epoch = self._read_events()
         if epoch is None:
             self._reply_ready()
-            if membership.leads:
+            running = membership.running()
+            if running and (self._late.returns or not self._sites):
+                if self._announced is None or now_ns >= self._epoch_ns:  # else `start` may be under way
+                    epoch = self._join_late(running, now_ns)
+            elif membership.leads:
                 epoch = self._lead()
-            elif not self._sites and (self._announced is None or now_ns >= self._epoch_ns):
-                epoch = self._join_late(now_ns)  # not while `start` may still be under way
+            if not running:
+                self._met_ns = None
         return epoch
 
-    def _join_late(self, now_ns: int) -> Epoch | None:
-        """Returns a recorder's epoch of a running session once all its present members have been met."""
-        infos = [
-            info
-            for _, info in sorted(self.membership.met.items())
-            if info.running and info.scenario and info.boots.get(info.member) == info.boot
-        ]
-        running = [info for info in infos if info.boots == infos[0].boots]
-        if not running:
-            self._met_ns = None
-            return None
+    def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
+        """Returns the epoch of a running session once all its present members have been met.
+
+        A site must have been admitted by all of them besides.
+        """
         if self._met_ns is None:
             self._met_ns = now_ns
-        sites = set(running[0].boots) - {topics.RECORDER}
+        sites = set(running[0].boots) - {topics.RECORDER, self._own.member}
         if {info.member for info in running} < sites and now_ns - self._met_ns < LATE_GATHER_NS:
             return None
-        own = self.membership.own.clock
-        for info in sorted(running, key=lambda info: info.clock != own):
+        own = self._own.clock
+        foreign = {info.boot for info in running if info.clock != own}
+        if self._sites and not self.pinger.know(foreign):
+            return None
+        for info in sorted(running, key=lambda info: (info.clock != own, *self._rank(info))):
             if info.clock == own or self.pinger.know([info.boot]):
                 # as the clocks stand now: their drift apart since the epoch is unknown
                 offset_ns = 0 if info.clock == own else self.pinger.estimate(info.boot).offset_at(now_ns)
-                return Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
+                epoch = Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
+                return self._ask_to_join(epoch, running, now_ns) if self._sites else epoch
         return None
+
+    def _rank(self, info: Info) -> tuple[int, ...]:
+        """Returns the place of a site in the scenario: ticks follow the grid of the first one."""
+        return (self._sites.index(info.member),) if info.member in self._sites else ()
+
+    def _ask_to_join(self, epoch: Epoch, running: Sequence[Info], now_ns: int) -> Epoch | None:
+        """Says `coming`, again and again; returns the epoch when every running site has admitted it."""
+        own, rate_hz, slowest_ns = self._own, self._late.rate_hz, self.pinger.slowest_ns()
+        if self._coming is not None:
+            event, told = self._coming
+            first_ns = told.mono_ns + tick_ns(event.ticks, rate_hz)
+            if now_ns < first_ns - DECIDE_NS:
+                if self._admitted < {info.member for info in running}:
+                    return None
+                epochs = {info.member: info.epoch_mono_ns for info in running} | {own.member: told.mono_ns}
+                boots = {**running[0].boots, own.member: own.boot}
+                return told._replace(boots=boots, epochs=epochs, first=event.ticks)
+        since_ns = now_ns - epoch.mono_ns
+        first = first_tick_at(since_ns + EPOCH_AHEAD_NS + 2 * slowest_ns, rate_hz)
+        self._attempt += 1
+        self._admitted = set()
+        event = self._publisher.publish(
+            "coming",
+            f"{own.member} comes to the running session, from tick {first} on",
+            t_ns=since_ns,
+            ticks=first,
+            attempt=self._attempt,
+            epoch_mono_ns=epoch.mono_ns,
+            clock=own.clock,
+            bound_ns=slowest_ns,
+            boots={own.member: own.boot},
+        )
+        self._coming = event, epoch
+        return None
+
+    def _note_answer(self, event: Event) -> None:
+        """Notes that a running site admits this one, or why it does not."""
+        own = self._own
+        if event.about == own.member and event.boots.get(own.member) == own.boot:
+            if event.kind == "refused":
+                self.refusal = event.text
+            elif event.kind == "admit" and event.attempt == self._attempt:
+                self._admitted.add(event.member)
 
     def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
         """Returns the boots of the sites on another clock."""
@@ -109,6 +178,8 @@ class SessionJoin:
             if event.kind == "epoch":
                 self._consider(event)
                 continue
+            if self._coming is not None:
+                self._note_answer(event)
             announced = self._announced
             if announced is None or (event.attempt, event.boots) != (announced.attempt, announced.boots):
                 continue

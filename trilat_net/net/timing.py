@@ -1,8 +1,9 @@
 """Timing of a running site: tick deadlines, stamps, and delays and clock offset of each link.
 
 Invariant (L1): tick k is due at `k * 10^9 // rate_hz` ns after the epoch, to the nanosecond, on the leader's
-clock. A site on another clock follows by slewing, at most SLEW_LIMIT, never by a step. Measuring changes no
-number of a run: an impossible stamp is counted, and its sample is used.
+clock. A site on another clock follows by slewing, at most SLEW_LIMIT, never by a step; while the leader is
+away, along its clock as last estimated. Measuring changes no number of a run: an impossible stamp is
+counted, and its sample is used.
 
 Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of the record that the peer
 echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the echo.
@@ -14,7 +15,15 @@ from typing import Any, NamedTuple
 
 from ..core.ticks import NS_PER_S
 from .messages import PeerSample
-from .offset import OffsetEstimate, OffsetEstimator, OffsetLimit, SlewedOffset, format_offset
+from .offset import (
+    DRIFT_LIMIT,
+    OffsetEstimate,
+    OffsetEstimator,
+    OffsetLimit,
+    SlewedOffset,
+    exact_offset,
+    format_offset,
+)
 
 SLEW_LIMIT = 200_000.0
 """Largest deviation of a schedule's rate from its clock, ns/s (200 ppm)."""
@@ -103,19 +112,27 @@ class LinkTimingMonitor:
         faults: impossible stamps since the start.
         worst_ns: largest time by which a sample arrived before it was sent, since the last report.
         contradicted: whether windows contradicted each other since then.
+        unheard: True once the peer was found not to hear this site, until it hears it again.
     """
 
     def __init__(self, peer: PeerClock, sent: SentStamps) -> None:
+        self.faults = 0
+        self._sent = sent
+        self._delays: list[int] = []
+        self._rtt_ns = _FAR_NS
+        self.admit(peer)
+
+    def admit(self, peer: PeerClock) -> None:
+        """Begins with a start of the peer, and its clock."""
         self.peer = peer
         self.offset = SlewedOffset(peer.estimate)
         self.newest: tuple[int, int] | None = None
-        self.faults = 0
         self.worst_ns = 0
-        self.contradicted = False
-        self._epoch_ns, self._place, self._sent = peer.epoch_ns, peer.place, sent
+        self.contradicted = self.unheard = False
+        self._heard_ns = self._acknowledged_ns = -1
+        self._acknowledged = -1
+        self._epoch_ns, self._place = peer.epoch_ns, peer.place
         self._shared_ns = peer.estimate.offset_ns if peer.estimator is None else None
-        self._delays: list[int] = []
-        self._rtt_ns = _FAR_NS
         self._windows = 0
         self._opened_ns: int | None = None
         self._open_window()
@@ -139,8 +156,11 @@ class LinkTimingMonitor:
             self.worst_ns = max(self.worst_ns, -delay_ns)
         if self.newest is None or sample.tick > self.newest[0]:
             self.newest = sample.tick, arrived_ns
+        self._heard_ns = arrived_ns
         for place, tick, at_ns in sample.echo:
             if place == self._place and (own_ns := self._sent.at(tick)) is not None:
+                if tick > self._acknowledged:
+                    self._acknowledged, self._acknowledged_ns = tick, arrived_ns
                 reached_ns = at_ns + self._epoch_ns
                 there_ns = reached_ns - offset_ns - own_ns
                 if there_ns < self._there_ns:
@@ -149,6 +169,15 @@ class LinkTimingMonitor:
                 if there_ns + delay_ns < self._rtt_ns:
                     self._rtt_ns = there_ns + delay_ns
         return delay_ns
+
+    def hears(self, now_ns: int) -> bool | None:
+        """True if the peer acknowledged a newer sample within UNHEARD_NS.
+
+        None before its first acknowledgement, and while it is silent itself.
+        """
+        if self._acknowledged < 0 or now_ns - self._heard_ns > UNHEARD_NS:
+            return None
+        return self._heard_ns - self._acknowledged_ns <= UNHEARD_NS
 
     def close(self, now_ns: int, from_ns: int) -> OffsetEstimate | None:
         """Closes the window if it is due, and slews to the new estimate from an instant on; else None."""
@@ -190,10 +219,14 @@ class LinkTimingMonitor:
 
 
 FAULT_EVERY_NS = 1_000_000_000
+UNHEARD_NS = 200_000_000
+"""A peer that is heard and acknowledges no newer sample for longer does not hear this site."""
+FIRST_BOUND_NS = 2_000_000
+"""How far the clock of a site that joins may be from what it says, besides the bound that it states."""
 
 
 ClockNotice = dict[str, Any]
-"""The fields of an event about a clock."""
+"""The fields of an event about a clock, or about a peer that does not hear this site."""
 
 
 class SiteTiming:
@@ -206,14 +239,36 @@ class SiteTiming:
         self.meters = [LinkTimingMonitor(peer, self._sent) for peer in peers]
         for meter in self.meters:
             meter.offset.slew_to(epoch_ns, meter.peer.estimate)
-        self._estimated = [meter for meter in self.meters if meter.peer.estimator is not None]
-        self._leader = next((meter for meter in self._estimated if meter.peer.name == leader), None)
+        self._leader_name = leader
         self._turn = 0
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def opening(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
-        return [_estimate_notice(meter, 0, self._epoch_ns) for meter in self._estimated]
+        meters = (meter for meter in self.meters if meter.peer.estimator is not None)
+        return [_estimate_notice(meter, 0, self._epoch_ns) for meter in meters]
+
+    def admit(self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None) -> list[ClockNotice]:
+        """Begins with another start of a peer, which joins at a time since the epoch; returns the events.
+
+        Args:
+            index: the peer's.
+            t_ns: the time of its first tick.
+            epoch_ns: the epoch on its clock, as it counts.
+            bound_ns: how far it may be wrong about that; None if its clock is this site's.
+        """
+        meter = self.meters[index]
+        known = meter.peer._replace(epoch_ns=epoch_ns, estimate=exact_offset(0), estimator=None)
+        if bound_ns is None:
+            meter.admit(known)
+            return []
+        k = t_ns * self._rate_hz // NS_PER_S
+        at_ns = self.schedule.deadline(k)
+        offset_ns, wide_ns = epoch_ns + k * NS_PER_S // self._rate_hz - at_ns, bound_ns + FIRST_BOUND_NS
+        sides = offset_ns - wide_ns, offset_ns + wide_ns, -DRIFT_LIMIT, DRIFT_LIMIT
+        estimate = OffsetEstimate(at_ns, offset_ns, 0.0, *sides)
+        meter.admit(known._replace(estimate=estimate, estimator=OffsetEstimator()))
+        return [_estimate_notice(meter, k, at_ns)]
 
     def sent(self, tick: int, now_ns: int) -> int:
         """Notes the time of sending of a record; returns it since the epoch, ns."""
@@ -246,9 +301,14 @@ class SiteTiming:
                 self._faults_ns[n] = now_ns
                 notices.append(_fault_notice(meter))
                 meter.worst_ns, meter.contradicted = 0, False
-        if self._leader is not None:
-            offset = self._leader.offset
-            leader_ns = due_ns + offset.at(due_ns) - self._leader.peer.epoch_ns
+            if meter.unheard is meter.hears(now_ns):  # None, of a silent peer, is neither
+                meter.unheard = not meter.unheard
+                notices.append(_hearing_notice(meter, k))
+        names = [meter.peer.name for meter in self.meters if meter.peer.estimator is not None]
+        if self._leader_name in names:
+            leader = next(meter for meter in self.meters if meter.peer.name == self._leader_name)
+            offset = leader.offset
+            leader_ns = due_ns + offset.at(due_ns) - leader.peer.epoch_ns
             error_ns = leader_ns - k * NS_PER_S // self._rate_hz
             self.schedule.steer(k, error_ns, offset.estimate.drift)
         return notices
@@ -290,3 +350,12 @@ def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
         what = f"a sample came {before_ns / 1e6:.3f} ms before it was sent"
     text = f"clock of {name}: {what}; one of the two clocks has stepped"
     return {"kind": "clock fault", "text": text, "about": name, "offset_ns": before_ns, "bound_ns": bound_ns}
+
+
+def _hearing_notice(meter: LinkTimingMonitor, k: int) -> ClockNotice:
+    """Reports that a peer, which is heard, does not hear this site, or that it does again."""
+    name = meter.peer.name
+    if meter.unheard:
+        text = f"{name} is heard and does not hear: for {UNHEARD_NS // 1_000_000} ms it acknowledged nothing"
+        return {"kind": "unheard", "text": text, "about": name, "ticks": k}
+    return {"kind": "heard", "text": f"{name} hears again", "about": name, "ticks": k}

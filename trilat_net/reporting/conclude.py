@@ -95,7 +95,7 @@ def _site_row(log: Log, site: str) -> tuple[str, ...]:
     part = log[site]
     if not len(part):
         return (site, "0", *("",) * (len(_HEADERS) - 1))
-    missing = max(log.last_ticks[site], part.last_tick) + 1 - len(part)
+    missing = max(log.last_ticks[site], part.last_tick) + 1 - len(part) - log.absent_ticks(site)
     late = np.percentile(part.late_us, (50, 99, 100))
     busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
     numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")

@@ -313,6 +313,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         """The sites whose arms are outside of the program."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
+    @property
+    def sites_may_return(self) -> bool:
+        """True if a session outlives its sites: each waits for its peers, and aligns with them anew."""
+        return all(spec.on_stale.action == "glide" for spec in self.sites.values())
+
     def channel(self, site: str) -> LawChannel:
         """Returns what the law of a site sends to its peers."""
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
