@@ -81,3 +81,26 @@ def page_address(process: Process) -> str:
 def shows(page: Page, expression: str, timeout_s: float = 30.0) -> Any:
     """The first true value of a JavaScript expression."""
     return until(lambda: page.evaluate(expression), timeout_s)
+
+
+def tip_px(page: Page, arm: int) -> tuple[float, float]:
+    """Where an end effector is on the screen."""
+    x, y = page.evaluate(
+        """(n) => { const card = trilat.parts.arms.cards[n], box = card.canvas.getBoundingClientRect();
+        const tip = card.project(trilat.frame.sites[card.name].points.at(-1));
+        const ratio = card.canvas.width / box.width;
+        return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; }""",
+        arm,
+    )
+    return x, y
+
+
+def take_hold(page: Page, arm: int, dx: float, dy: float) -> tuple[float, float]:
+    """Presses the pointer on an end effector and drags it by so many pixels; returns where it was."""
+    shows(page, f"trilat.parts.arms.cards[{arm}].graspable")
+    x, y = tip_px(page, arm)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for n in range(1, 11):
+        page.mouse.move(x + dx * n / 10, y + dy * n / 10)
+    return x, y

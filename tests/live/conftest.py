@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from .namespaces import Machines, NoNamespaces, machines
 from .processes import PLAIN, Stage
 
 
@@ -26,3 +27,13 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     made = Stage(tmp_path)
     yield made
     made.clear()
+
+
+@pytest.fixture
+def apart() -> Iterator[Machines]:
+    """Machines; none of them, and no cable, outlives the test."""
+    try:
+        with machines() as made:
+            yield made
+    except NoNamespaces as reason:
+        pytest.skip(str(reason))

@@ -121,7 +121,7 @@ class Session:
     """
 
     def __init__(self, stage: Stage, scenario: str, sites: Sequence[str], *options: str) -> None:
-        self._stage, self._scenario, self._options = stage, scenario, options
+        self.stage, self._scenario, self._options = stage, scenario, options
         self.sites = tuple(sites)
         *self.endpoints, self.recorder_endpoint = find_free_endpoints(len(sites) + 1)
         self.log = stage.folder / "run.mcap"
@@ -145,7 +145,7 @@ class Session:
 
     def _start(self, name: str, words: Sequence[str], more: Sequence[str], called: str) -> Process:
         words = (*words, "--session", "t", *self.ways(name), *more)
-        self.processes[called] = self._stage.start(called, *words, before=self.before.get(name, ()))
+        self.processes[called] = self.stage.start(called, *words, before=self.before.get(name, ()))
         return self.processes[called]
 
     def all(self, *order: str) -> None:

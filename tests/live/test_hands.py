@@ -16,6 +16,8 @@ from tests.cli.running import PLAIN, trilat
 from tests.net.waiting import until
 from trilat_net.log.log_reader import Log
 
+from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .namespaces import Machines, bridged
 from .processes import PAPER, Session, Stage, connections
 
 GONE_S = 0.320
@@ -31,6 +33,24 @@ with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be kille
             print("holds", flush=True)
         time.sleep(0.01)
 """
+
+
+class Holder:
+    """A process that holds m1 until it is killed."""
+
+    def __init__(self, session: Session, folder: Path, before: Sequence[str] = ()) -> None:
+        words = [*before, sys.executable, "-c", HOLDER, "m1", *session.endpoints]
+        self._printed, root = folder / "holder.txt", Path(__file__).parents[2]
+        with self._printed.open("wb") as sink:
+            self._process = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
+
+    def holds(self) -> bool:
+        return b"holds" in self._printed.read_bytes()
+
+    def end(self) -> None:
+        """Kills it."""
+        self._process.kill()
+        self._process.wait()
 
 
 class Circling(threading.Thread):
@@ -54,8 +74,11 @@ class Circling(threading.Thread):
                 self._wait.wait(1.0 / 60.0)
 
 
-def held(session: Session, seconds: float, orders: Sequence[Sequence[str]]) -> Log:
-    """A session whose masters two programs hold, while links and shares are changed; it is reproduced."""
+def held(session: Session, seconds: float, orders: Sequence[Sequence[str]], page_moves: int = 0) -> Log:
+    """A session whose masters two programs hold, while links and shares are changed; it is reproduced.
+
+    A page holds the slave for so many moves of its pointer, if for any.
+    """
     session.all()
     session.begun()
     session.recording()
@@ -65,6 +88,8 @@ def held(session: Session, seconds: float, orders: Sequence[Sequence[str]]) -> L
     to = ("set", "--session", "t", *connections(session.endpoints))
     for order in orders:
         trilat(*to, *order, cwd=session.log.parent).succeeds()
+    if page_moves:
+        hold_by_page(session, page_moves)
     for hand in hands:
         hand.join()
         assert hand.felt_n > 1.0
@@ -74,6 +99,22 @@ def held(session: Session, seconds: float, orders: Sequence[Sequence[str]]) -> L
         assert any(text.startswith(f"{site}: hand at {site} takes hold") for text in said)
         assert np.abs(log[site].tau_x).max() > 1.0
     return log
+
+
+def hold_by_page(session: Session, moves: int) -> None:
+    """A pointer on a page takes the slave, leads it about and lets go."""
+    server = session.stage.start(
+        "page", "live", "--session", "t", "--no-browser", *connections(session.endpoints)
+    )
+    with browser_page(page_address(server)) as page:
+        shows(page, "trilat.frame && trilat.takesPart")
+        x, y = take_hold(page, 2, 20.0, 0.0)
+        shows(page, "trilat.frame.holds.includes('s')")
+        for n in range(moves):
+            page.mouse.move(x + 20.0 * math.cos(0.2 * n), y + 20.0 * math.sin(0.2 * n))
+        page.mouse.up()
+    server.signal(signal.SIGINT)
+    server.code()
 
 
 DELAY = ("link", "m1->s", "--delay", "120ms")
@@ -86,12 +127,16 @@ def test_a_session_of_two_programs_and_changes_is_verified_and_repeated(stage: S
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]
 
 
+@needs_browser
 @pytest.mark.long
-def test_a_minute_of_two_programs_and_ten_changes_is_verified_and_repeated(stage: Stage) -> None:
+def test_a_minute_of_two_programs_a_page_and_ten_changes_is_verified_and_repeated(stage: Stage) -> None:
     """The certificate books what the hands gave: V never rises by more."""
     orders = [("link", f"{a}->{b}", "--delay", f"{20 * n + 20}ms") for n, (a, b) in enumerate(LINKS)]
     orders += [("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s") for share in SHARED]
-    log = held(Session(stage, "play", PAPER, "--duration", "60"), 40.0, orders)
+    log = held(Session(stage, "play", PAPER, "--duration", "60"), 40.0, orders, 300)
+    said = [event.text for event in log.events if event.kind == "hand"]
+    assert any(text.startswith("s: page 1 takes hold") for text in said)
+    assert np.abs(log["s"].hand[:, 0]).max() == 1.0
     assert sum(len(log.changes(name)) for name in PAPER) == 10
     found = trilat_net.certify(log)
     assert found.balance is not None
@@ -106,17 +151,17 @@ def test_a_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, t
     """By the log: from its last message to the last force, and the event that says so."""
     session = Session(stage, "play", PAPER, "--duration", "15")
     session.all()
-    words = [sys.executable, "-c", HOLDER, "m1", *session.endpoints]
-    root = Path(__file__).parents[2]
-    with (tmp_path / "holder.txt").open("wb") as sink:
-        holder = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
+    holder = Holder(session, tmp_path)
     try:
-        until(lambda: b"holds" in (tmp_path / "holder.txt").read_bytes(), 60.0)
-        holder.send_signal(signal.SIGKILL)
+        until(holder.holds, 60.0)
     finally:
-        holder.kill()
-        holder.wait()
+        holder.end()
     log = session.is_reproduced()
+    assert_let_go(log)
+
+
+def assert_let_go(log: Log) -> None:
+    """Soon after its last message there is no force on m1, and the log says why."""
     part = log["m1"]
     number, grip = part.hand[:, 1], part.hand[:, 0]
     newest = int(np.flatnonzero(np.diff(number) > 0)[-1]) + 1
@@ -129,3 +174,24 @@ def test_a_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, t
         "m1: to be killed takes hold",
         "m1: to be killed is silent: let go",
     ]
+
+
+@pytest.mark.long
+def test_a_program_whose_cable_is_cut_in_grip_leaves_no_force_behind(
+    stage: Stage, tmp_path: Path, apart: Machines
+) -> None:
+    """The session is on one machine, the program on another; no tick is missing because of the cut."""
+    bridged(apart, ("lab", "holder"))
+    session = Session(stage, "play", PAPER, "--duration", "15", "--insecure")
+    session.before = dict.fromkeys((*PAPER, "recorder"), apart.on("lab"))
+    session.endpoints = [place.replace("127.0.0.1", apart.address["lab"]) for place in session.endpoints]
+    session.all()
+    holder = Holder(session, tmp_path, apart.on("holder"))
+    try:
+        until(holder.holds, 60.0)
+        apart.part("lab", "holder")
+        log = session.is_reproduced()
+    finally:
+        holder.end()
+    assert_let_go(log)
+    assert all(log.missing(site) == 0 for site in log.sites)

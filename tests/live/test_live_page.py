@@ -14,7 +14,16 @@ from tests.net.waiting import until
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.log.log_reader import Log, open_log
 
-from .browsers import browser_page, chromium_pid, launch, needs_browser, page_address, shows
+from .browsers import (
+    browser_page,
+    chromium_pid,
+    launch,
+    needs_browser,
+    page_address,
+    shows,
+    take_hold,
+    tip_px,
+)
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
 pytestmark = needs_browser
@@ -40,28 +49,6 @@ def assert_energies_are_those_of(log: Log, energies: list[list[float]]) -> None:
 def end_by_button(page: Page) -> None:
     page.on("dialog", lambda dialog: dialog.accept())
     page.click("#end")
-
-
-def tip_px(page: Page, arm: int) -> tuple[float, float]:
-    """Where an end effector is on the screen."""
-    x, y = page.evaluate(
-        """(n) => { const card = trilat.parts.arms.cards[n], box = card.canvas.getBoundingClientRect();
-        const tip = card.project(trilat.frame.sites[card.name].points.at(-1));
-        const ratio = card.canvas.width / box.width;
-        return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; }""",
-        arm,
-    )
-    return x, y
-
-
-def take_hold(page: Page, arm: int, dx: float, dy: float) -> None:
-    """Presses the pointer on an end effector and drags it by so many pixels."""
-    shows(page, f"trilat.parts.arms.cards[{arm}].graspable")
-    x, y = tip_px(page, arm)
-    page.mouse.move(x, y)
-    page.mouse.down()
-    for n in range(1, 11):
-        page.mouse.move(x + dx * n / 10, y + dy * n / 10)
 
 
 def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
@@ -100,6 +87,60 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
     first = next(event.text for event in log.events if event.kind == "hand")
     assert first.startswith("m1: page 1 takes hold")
     assert grips(log, "m1")[:, 1].max() == 1.0
+
+
+@pytest.mark.long
+def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
+    running = live(stage, "play")
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    with browser_page(page_address(running), **phone) as page:
+        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
+        page.locator(".arm").first.scroll_into_view_if_needed()
+        before = page.evaluate("trilat.frame.sites.m1.points.at(-1)")
+        x, y = tip_px(page, 0)
+        finger = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *points: dict[str, float]) -> None:
+            finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})
+
+        touch("touchStart", {"x": x, "y": y})
+        for n in range(1, 11):
+            touch("touchMove", {"x": x + 4.0 * n, "y": y})
+        shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
+        assert page.evaluate("trilat.frame.holds") == ["m1"]
+        touch("touchEnd")
+        shows(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
+        assert page.evaluate("scrollY") == 0  # the page does not scroll under a finger that leads an arm
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
+
+
+PAD = """
+const buttons = Array.from({ length: 17 }, () => ({ pressed: false, value: 0 }));
+const pad = { index: 0, connected: true, buttons, axes: [0, 0, 0, 0] };
+navigator.getGamepads = () => [pad];
+window.pad = pad;
+"""
+
+
+@pytest.mark.long
+def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
+    """The browser's own interface, with a pad that is none: no machine of the tests has one."""
+    running = live(stage, "play")
+    with browser_page(page_address(running)) as page:
+        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[1].graspable")
+        page.evaluate(PAD)
+        page.evaluate("dispatchEvent(new Event('gamepadconnected'))")
+        page.keyboard.press("2")
+        before = page.evaluate("trilat.frame.sites.m2.points.at(-1)")
+        page.evaluate("pad.buttons[0].pressed = true")
+        shows(page, "trilat.frame.holds.includes('m2')")
+        page.evaluate("pad.axes[0] = 0.5")
+        shows(page, f"trilat.frame.sites.m2.points.at(-1)[0] > {before[0]} + 0.02")
+        page.evaluate("Object.assign(pad.axes, [0, 0]); pad.buttons[0].pressed = false")
+        shows(page, "trilat.frame.sites.m2.grip === 0 && !trilat.frame.holds.length")
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
 
 
 @pytest.mark.long

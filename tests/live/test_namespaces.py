@@ -1,6 +1,5 @@
 """Separate machines: the README's recipes, as written, in network namespaces with addresses of their own."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,7 +10,7 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net.clock import SystemClock
 
-from .namespaces import Machines, NoNamespaces, bridged, machines, pairs, reaches, starred
+from .namespaces import Machines, bridged, pairs, reaches, starred
 from .processes import Session, Stage, connections, executed_again, whole
 
 SITES = ("m1", "m2", "s")
@@ -19,16 +18,6 @@ ALL = (*SITES, "recorder")
 PORT = "tcp/0.0.0.0:7447"
 CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
 """How far each clock is ahead, s, and by how much it runs faster, ppm."""
-
-
-@pytest.fixture
-def apart() -> Iterator[Machines]:
-    """Machines; none of them, and no cable, outlives the test."""
-    try:
-        with machines() as made:
-            yield made
-    except NoNamespaces as reason:
-        pytest.skip(str(reason))
 
 
 class Apart(Session):

@@ -31,7 +31,7 @@ class Routed(Session):
         return ["--router", self.endpoint, *self.network(name)]
 
     def router(self, called: str = "router") -> Process:
-        return self._stage.start(called, "router", "--listen", self.endpoint, *self.network("router"))
+        return self.stage.start(called, "router", "--listen", self.endpoint, *self.network("router"))
 
 
 class Keyed(Routed):
@@ -42,7 +42,7 @@ class Keyed(Routed):
         create_keys(stage.folder / "keys", [*SITES, RECORDER, ROUTER], [], 1)
 
     def network(self, name: str) -> list[str]:
-        return ["--keys", str(self._stage.folder / "keys" / name)]
+        return ["--keys", str(self.stage.folder / "keys" / name)]
 
 
 @pytest.mark.long
