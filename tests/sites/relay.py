@@ -80,12 +80,17 @@ class RelayClock:
     def __init__(self, relay: Relay, seat: int) -> None:
         self._relay, self._seat = relay, seat
         self._stalls: list[tuple[int, int]] = []
+        self._acts: list[tuple[int, Callable[[], None]]] = []
         self.dies_ns: int | None = None
         """When its runner is killed."""
 
     def stall(self, at_ns: int, for_ns: int) -> None:
         """The first sleep that would end at a time or after it ends so much later."""
         self._stalls.append((at_ns, for_ns))
+
+    def at(self, at_ns: int, act: Callable[[], None]) -> None:
+        """Does something in the first sleep that ends at a time or after it."""
+        self._acts.append((at_ns, act))
 
     def monotonic_ns(self) -> int:
         return self._relay.now_ns
@@ -101,5 +106,7 @@ class RelayClock:
             deadline_ns += self._stalls.pop(0)[1]
         if deadline_ns > self._relay.now_ns:
             self._relay.sleep(self._seat, deadline_ns)
+        while self._acts and self._relay.now_ns >= self._acts[0][0]:
+            self._acts.pop(0)[1]()
         if self.dies_ns is not None and self._relay.now_ns >= self.dies_ns:
             raise Killed

@@ -67,11 +67,11 @@ class Session:
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
         """Adds a site."""
-        self.interrupts[name] = Interrupt()
+        interrupt = self.interrupts[name] = Interrupt()
 
         def run(clock: RelayClock) -> object:
             try:
-                end: object = self.live(name, clock, needs_recorder=needs_recorder)
+                end: object = self.live(name, clock, interrupt, needs_recorder=needs_recorder)
             except Killed:
                 end = "killed"
             except (RunFailed, SessionError) as failed:
@@ -84,12 +84,19 @@ class Session:
 
         self.clocks[name] = self.relay.add(name, run, at_ns)
 
-    def live(self, name: str, clock: RelayClock, *, needs_recorder: bool = False) -> int:
+    def live(
+        self,
+        name: str,
+        clock: RelayClock,
+        interrupt: Interrupt | None = None,
+        *,
+        needs_recorder: bool = False,
+    ) -> int:
         """A site's life, from its connection to its exit code."""
         options = SiteOptions(
             SESSION, Connection(), 10.0, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
         )
-        interrupt = self.interrupts.get(name, Interrupt())
+        interrupt = interrupt or self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
         bus = self.network.join()
         try:
@@ -101,7 +108,7 @@ class Session:
     def _own(self, name: str, clock: RelayClock) -> Clock:
         return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
 
-    def recorder(self, stopped: Callable[[], bool] = lambda: False) -> None:
+    def recorder(self, stopped: Callable[[], bool] = lambda: False, at_ns: int = 0) -> None:
         """Adds the recorder."""
 
         def run(clock: RelayClock) -> Sequence[str]:
@@ -124,7 +131,12 @@ class Session:
             finally:
                 bus.close()
 
-        self.relay.add("recorder", run)
+        self.relay.add("recorder", run, at_ns)
+
+    def interrupt(self, name: str, at_ns: int, number: int = 2) -> None:
+        """Sends a site a signal at a time."""
+        interrupt = self.interrupts[name]
+        self.clocks[name].at(at_ns, lambda: setattr(interrupt, "number", number))
 
     def stranger(self, act: Stranger, at_ns: int = 0) -> None:
         """Adds somebody who does what `act` does."""

@@ -4,12 +4,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log
+from trilat_net.log.session_check import check_log
 from trilat_net.scenario import Scenario, load_scenario
 
+from .relay import RelayClock
 from .sessions import Session
 
 S = 1_000_000_000
@@ -48,3 +52,131 @@ def test_a_site_that_is_killed_comes_back_and_the_log_is_whole(tmp_path: Path) -
     assert result.passed
     assert result.absences == [("m", *log.absences["m"][0])]
     assert run_log_checks(log, virtual=True).passed
+
+
+def kinds_about(log: Log, member: str, about: str) -> list[str]:
+    return [event.kind for event in log.events if event.member == member and event.about == about]
+
+
+def test_whose_end_it_was_is_said_to_the_others_who_go_on(tmp_path: Path) -> None:
+    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    session.interrupt("s", 3 * S)
+    log = session.run()
+    assert session.ends is not None
+    assert session.ends["s"] == 130
+    failed = session.ends["m"]
+    assert isinstance(failed, PeerLeft)
+    assert failed.exit_code == 3
+    assert "s made" in str(failed)
+    assert "SIGINT" in str(failed)
+    (end,) = (event for event in log.events if (event.member, event.kind) == ("s", "end"))
+    assert end.about == "s"
+    assert end.ticks < 800
+    assert kinds_about(log, "m", "s") == ["left"]
+    assert len(log["m"]) == 800
+    assert log["m"].mode[-1] == "hold"
+    assert verify(log).passed
+    assert log.expected_ticks("s") == end.ticks
+
+
+def test_a_site_waits_for_one_that_left_no_longer_than_it_is_told(tmp_path: Path) -> None:
+    session = Session.whole(gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}})
+    session.clocks["s"].dies_ns = 3 * S
+    log = session.run()
+    assert session.ends is not None
+    assert isinstance(session.ends["m"], PeerLeft)
+    (lost,) = (event for event in log.events if event.kind == "lost")
+    (end,) = (event for event in log.events if event.kind == "end")
+    assert end.about == "s"
+    assert 1.0 < end.ticks / 200 - lost.t_ns / S < 1.3
+
+
+def test_a_site_that_left_in_order_may_come_back_and_leave_again(tmp_path: Path) -> None:
+    session = Session.whole(gliding(9.0), tmp_path, ends={})
+    session.interrupt("s", 3 * S, 15)
+    session.site("s", at_ns=4 * S)
+    session.clocks["s"].dies_ns = 6 * S
+    session.site("s", at_ns=7 * S)
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    assert len(log.starts["s"]) == len(log.absences["s"]) == 2
+    (early,) = (event for event in log.events if event.kind == "end" and event.about == "s")
+    assert log.absences["s"][0][0] == early.ticks
+    result = verify(log)
+    assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
+    assert "missing 0" in log.account("s")
+    check = check_log([session.path])
+    assert check.passed, check.findings
+
+
+def test_a_site_may_come_late_where_the_first_one_begins_without_it(tmp_path: Path) -> None:
+    scenario = gliding(5.0, "asymmetric")
+    session = Session(
+        scenario, tmp_path / "run.mcap", ends={}, options={"m1": {"without": (scenario.names[2],)}}
+    )
+    session.recorder()
+    for n, name in enumerate(scenario.names):
+        session.site(name, at_ns=(n // 2) * 3 * S)
+    log = session.run()
+    assert session.ends == dict.fromkeys(scenario.names, 0)
+    late = scenario.names[2]
+    ((first, _),) = log.starts[late]
+    assert log.absences[late] == [(0, first - 1)]
+    assert set(log["m1"].mode[:first]) == {"waiting"}
+    assert {str(log[name].mode[-1]) for name in log.sites} == {"run"}
+    assert verify(log).passed
+    assert check_log([session.path]).passed
+
+
+@pytest.mark.parametrize("dies", ["m1", "s"])
+def test_sites_on_clocks_of_their_own_find_the_grid_again(dies: str, tmp_path: Path) -> None:
+    """The first site, whose grid the others follow, as well as another."""
+    skews = {"m1": (7 * S, 60_000), "s": (-500_000_000, -100_000)}
+    session = Session.whole(gliding(8.0, "asymmetric"), tmp_path, ends={}, skews=skews)
+    session.clocks[dies].dies_ns = 4 * S
+    session.site(dies, at_ns=5 * S)
+    log = session.run()
+    assert session.ends == dict.fromkeys(log.sites, 0)
+    assert {str(log[name].mode[-1]) for name in log.sites} == {"run"}
+    result = verify(log)
+    assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
+    for name in log.sites:
+        dropped = {
+            reason: n for reason, n in log.link_stats(name)[-1].dropped.items() if reason != "stranger"
+        }
+        assert dropped == {}
+    assert "clock fault" not in {event.kind for event in log.events}
+
+
+def test_another_start_waits_while_the_one_before_is_there(tmp_path: Path) -> None:
+    """It answers: that is said at once. Frozen, it does not: its token still keeps its place."""
+    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    refused: list[object] = []
+
+    def second(clock: RelayClock) -> None:
+        try:
+            session.live("m", clock)
+        except SessionError as error:
+            refused.append(str(error))
+
+    session.relay.add("second", second, 2 * S)
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    assert len(refused) == 1
+    assert not log.starts
+    assert len(log["m"]) == 800
+
+
+def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: Path) -> None:
+    session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
+    for name in ("m", "s"):
+        session.site(name, needs_recorder=False)
+    session.clocks["m"].dies_ns = 3 * S
+    session.site("m", at_ns=4 * S, needs_recorder=False)
+    session.recorder(at_ns=7 * S)
+    log = session.run()
+    ((first, _),) = log.starts["m"]
+    assert log.absences["m"] == [(0, first - 1)]  # the memory of the first start went with it
+    assert len(log["s"]) == 1600
+    assert log.missing("m") == log.missing("s") == 0
+    assert check_log([session.path]).passed

@@ -191,7 +191,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boot: the sender's process start.
         kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
             "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand",
-            "mark".
+            "mark"; where sites come and go "left", "coming", "admit", "join", "unheard", "heard".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
@@ -199,8 +199,9 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         epoch_unix_ns: the epoch in Unix time.
         clock: identity of that monotonic clock.
         boots: members of the session and their boots.
-        about: the member that it concerns.
-        ticks: how many ticks; of "clock" the tick from which on it holds.
+        about: the member that it concerns; of "end" whose end it was, "" if it was planned or asked for.
+        ticks: how many ticks; of "clock" the tick from which on it holds; of "coming", "admit" and "join" the
+            first tick of the site that comes.
         command: the change that was taken in, as the record of tick `ticks` names it.
         clocks: per member the identity of its clock.
         epochs: per member the epoch on its own clock.
