@@ -9,6 +9,7 @@ from contextlib import nullcontext
 import numpy as np
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from trilat_net.core.live_hand import HandInForce
@@ -120,9 +121,9 @@ def describe_row(row: Sequence[str]) -> str:
 
 
 def _tabulate(title: str, rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(title=title, title_justify="left")
+    table = Table(title=escape(title), title_justify="left")
     for head in HEADS:
         table.add_column(head, justify="right" if head in ("time", "|e|", "torque", "late") else "left")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table

@@ -1,7 +1,8 @@
 """Reception state of one site at the recorder: messages received, and messages still missing.
 
 Invariant: a message counts only when it is decoded, of this site, of this boot, and has a number that the
-scenario allows; each such message may imply that others exist.
+scenario allows; each such message may imply that others exist. Records and statistics are as many as the
+scenario has ticks; of events a log takes so many bytes, and the first word of an end all the same.
 """
 
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from trilat_net.scenario import Scenario
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
 _MANY = 1 << 40
+EVENT_BYTES, EVENT_BYTES_PER_S = 512 << 10, 4 << 10
+"""Bytes of a site's events that a log takes, and more for each of its seconds: ten events a second."""
 
 
 class SiteMessage(NamedTuple):
@@ -68,6 +71,7 @@ class SiteReception:
         self._rate_hz, self._layout = scenario.sites[name].rate_hz, scenario.layout(name)
         self.period_ns = 1_000_000_000 // self._rate_hz
         self._ticks = scenario.ticks(name)
+        self._event_room = EVENT_BYTES + round(EVENT_BYTES_PER_S * scenario.duration_s)
         self._most = {
             channel: count_messages(channel, self._ticks, self._rate_hz) for channel in SITE_CHANNELS
         } | {topics.EVENT: _MANY}
@@ -95,7 +99,16 @@ class SiteReception:
             raise WireError("stranger", f"{sender}, start {message.content.boot}, on a key of {self.name}")
         if message.number >= self._most[channel]:
             raise WireError("out of range", f"{self.name}/{channel} number {message.number}")
+        if isinstance(message.content, Event):
+            self._take_room(message.content, len(payload))
         return message
+
+    def _take_room(self, event: Event, size: int) -> None:
+        """Refuses the events of a flood, which would make a log of nothing else."""
+        ends = event.kind == "end" and self.made is None and size <= EVENT_BYTES_PER_S
+        if size > self._event_room and not ends:
+            raise WireError("flood of events", f"{self.name} sent more than a log takes of one site")
+        self._event_room -= size
 
     def take(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
         """Counts a published message; False if it is a duplicate."""

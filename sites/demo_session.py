@@ -8,16 +8,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
 from trilat_net.core.jit import is_core_cached
 from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import choose_session_endpoints
+from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
@@ -32,11 +33,15 @@ END_TIMEOUT_NS = 15 * NS_PER_S
 
 @dataclass(slots=True)
 class SessionResult:
-    """How a session ended: what failed, in order, and the number of the signal that ended it, or 0."""
+    """How a session ended: what failed, in order, the number of the signal that ended it, or 0; and a code.
+
+    The exit code is that of a run that failed, or of a disk that took no more.
+    """
 
     log: Path
     problems: list[str] = field(default_factory=list)
     interrupted: int = 0
+    exit_code: int = RunFailed.exit_code
 
 
 class _Child:
@@ -91,7 +96,7 @@ def run_demo(
     """Runs a session of all sites and a recorder; its log is valid whenever the session began."""
     result = SessionResult(folder / "run.mcap")
     session, clock = demo_session_name(scenario), SystemClock()
-    with Interrupt() as interrupt:
+    with Interrupt() as interrupt, ExitStack() as reserved:
         layouts = {arm.counts: name for name, arm in scenario.arms.items()}
         chains = any(arm.chain is not None for arm in scenario.arms.values())
         if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
@@ -99,7 +104,7 @@ def run_demo(
             with interrupt.raising():
                 for name in layouts.values():
                     warm_up(scenario, name)  # once for all children
-        endpoints = choose_session_endpoints(session, scenario.names)
+        endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         sites, recorder = _start(scenario, folder, session, endpoints)
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.external:
@@ -120,6 +125,8 @@ def run_demo(
         result.interrupted = interrupt.number
     for child in [*sites, recorder]:
         problem = child.problem()
+        if child.code() == LogRefused.exit_code:
+            result.exit_code = LogRefused.exit_code
         if problem and not result.interrupted and problem not in result.problems:
             result.problems.append(problem)
     return result

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from trilat_net.core.ticks import NS_PER_S
@@ -69,7 +70,7 @@ class SessionDisplay:
         if self._live:
             self._live.update(self._table(latest), refresh=True)
         elif latest and self._updates % LINE_EVERY == 0:
-            self._console.print(self._line(latest), highlight=False, soft_wrap=True)
+            self._console.print(self._line(latest), highlight=False, markup=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Prints a line above the table."""
@@ -86,7 +87,9 @@ class SessionDisplay:
                 continue
             ages = "  ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
             time, late = f"{stats.t_ns / NS_PER_S:.1f} s", f"{stats.late_max_us} us"
-            table.add_row(name, stats.mode, time, f"{stats.tick}", late, f"{stats.overruns}", ages)
+            table.add_row(
+                name, escape(stats.mode), time, f"{stats.tick}", late, f"{stats.overruns}", escape(ages)
+            )
         return table
 
     def _line(self, latest: dict[str, LinkStats]) -> str:

@@ -38,6 +38,7 @@ def edited(
     data: bytes,
     *,
     record: Callable[[Record], Record | None] = lambda record: record,
+    event: Callable[[bytes], bytes] = lambda payload: payload,
     scenario: Callable[[str], str] = lambda text: text,
     session: Mapping[str, str] | None = None,
     chunk_bytes: int = 1 << 20,
@@ -47,6 +48,7 @@ def edited(
     Args:
         data: the log.
         record: what becomes of each record of a tick; None drops it.
+        event: what becomes of each event's payload.
         scenario: what becomes of the embedded scenario.
         session: entries of the session's metadata that are changed.
         chunk_bytes: chunk size of the new file.
@@ -72,6 +74,8 @@ def edited(
             if changed is None:
                 continue
             payload = msgpack.packb(changed)
+        if channel.topic.endswith("/event"):
+            payload = event(payload)
         if schema.name not in schemas:
             schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
         if channel.topic not in channels:

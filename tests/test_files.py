@@ -1,12 +1,14 @@
 """An export is there as a whole or not at all, and replaces only what one asks it to replace."""
 
 import errno
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.files import refuse_existing, stage_output, write_whole
+from trilat_net.files import make_results_folder, open_regular, refuse_existing, stage_output, write_whole
 from trilat_net.reporting.export import EXPORT_MANIFEST
 
 
@@ -110,3 +112,23 @@ def test_a_link_stays_a_link_and_a_device_is_written_to(tmp_path: Path) -> None:
     assert (tmp_path / "linked").is_symlink()
     assert (tmp_path / "real").read_text() == "1"
     assert not Path("/dev/null").is_file()
+
+
+def test_what_has_no_end_is_no_file(tmp_path: Path) -> None:
+    """A pipe without a writer would be waited for, a device read for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(OSError, match="a pipe or a device"):
+            open_regular(path)
+    with pytest.raises(IsADirectoryError):
+        open_regular(tmp_path)
+    (tmp_path / "file").write_text("text")
+    with open_regular(tmp_path / "file", encoding="utf-8") as stream:
+        assert stream.read() == "text"
+
+
+def test_two_at_once_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda _: make_results_folder(None, "x", force=False), range(24)))
+    assert len(set(made)) == 24

@@ -9,6 +9,7 @@ import errno
 import itertools
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,7 +19,7 @@ from typing import Any
 
 from .errors import LogRefused, UsageError
 
-_DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
@@ -34,6 +35,21 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{extra}]'") from None
 
 
+def open_regular(path: Path, **how: Any) -> Any:
+    """Opens a file for reading, as text if its encoding is given; a pipe or a device may have no end.
+
+    Raises:
+        OSError: it is one of these, or cannot be opened.
+    """
+    mode = "r" if "encoding" in how else "rb"
+    ways = getattr(os, "O_NONBLOCK", 0)  # or a pipe without a writer would be waited for
+    stream = open(path, mode, opener=lambda name, flags: os.open(name, flags | ways), **how)  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
+    return stream
+
+
 def make_folder(folder: Path) -> Path:
     """Makes a folder and its parents, and returns it.
 
@@ -43,6 +59,8 @@ def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        if error.errno in DISK_ERRNOS:
+            raise describe_write_error(folder, error) from None
         raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
     return folder
 
@@ -54,8 +72,7 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
         UsageError: it holds something (and `force` is not set), or it cannot be made.
     """
     if folder is None:
-        numbered = (Path("runs") / f"{name}-{n:03d}" for n in itertools.count(1))
-        folder = next(path for path in numbered if not path.exists())
+        return _make_next_folder(name)
     try:
         occupied = not force and folder.exists() and any(folder.iterdir())
     except OSError as error:
@@ -63,6 +80,20 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
     if occupied:
         raise UsageError(f"{folder}: holds something; choose another folder, or use --force")
     return make_folder(folder)
+
+
+def _make_next_folder(name: str) -> Path:
+    """Makes the next free `runs/NAME-N`, which no other process gets as well."""
+    for n in itertools.count(1):
+        folder = Path("runs") / f"{name}-{n:03d}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise describe_write_error(folder, error) from None
+        return folder
+    raise AssertionError("there are endless numbers")
 
 
 def refuse_existing(
@@ -195,6 +226,6 @@ def sync_folder(folder: Path) -> None:
 def describe_write_error(path: Path, error: OSError, remedy: str = "") -> LogRefused | UsageError:
     """Returns the error of a failed write: `LogRefused`, with a remedy, if the disk refused it."""
     text = f"{path}: cannot be written: {error.strerror or error}"
-    if error.errno in _DISK_ERRNOS:
+    if error.errno in DISK_ERRNOS:
         return LogRefused(f"{text}; {remedy}" if remedy else text)
     return UsageError(text)

@@ -17,6 +17,7 @@ import msgspec
 from trilat_net import process
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, ScenarioError, UsageError
+from trilat_net.files import open_regular
 from trilat_net.log.accounting import number_message
 from trilat_net.log.log_layout import (
     ALL_CHANNELS,
@@ -188,7 +189,7 @@ class SessionReader:
         """
         for path in self._paths:
             try:
-                with path.open("rb") as stream:
+                with open_regular(path) as stream:
                     reader = McapReader(stream, str(path), self._progress, kept=False)
                     yield from self._read_file(path, reader)
             except OSError as error:

@@ -1,12 +1,20 @@
 """Bad input is one line on stderr and exit code 2: what is wrong, where, and what would be right."""
 
+import contextlib
+import errno
+import io
 import json
+import os
+import re
 from pathlib import Path
+from unittest import mock
 
 import pytest
+from rich.table import Table
 
 from tests.chains import six_joints
 from tests.task_arms import planar_task
+from trilat_net.reporting.terminal_output import TextConsole, print_json, print_line
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 
 from .running import trilat
@@ -168,3 +176,67 @@ def test_a_demo_keeps_what_is_in_its_folder(tmp_path: Path) -> None:
     trilat("demo", "two_sites", "--out", tmp_path, cwd=tmp_path).refuses("holds something", "--force")
     trilat("demo", "two_sites", "--out", "precious", cwd=tmp_path).refuses("precious", "Not a directory")
     assert [path.name for path in tmp_path.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize(
+    "command", [*READERS, "log info", "log check", "log recover", "log sign --key k", "sim", "scenario check"]
+)
+def test_a_pipe_is_no_file_and_is_not_waited_for(command: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "k").touch()
+    name = "pipe.toml" if command in ("sim", "scenario check") else "./pipe.toml"
+    trilat(*command.split(), name, cwd=tmp_path).refuses("k:" if "--key" in command else "a pipe or a device")
+
+
+def test_other_files_that_a_command_is_given_are_no_pipes_either(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
+    for given in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
+        options = [word for one in given for word in ("--set", one)]
+        trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses("a pipe or a device")
+
+
+ODD = ("$*", "9" * 5000, "\x1b[31m\u202e[/red]", "nan", "/dev/zero", "0x" + "f" * 5000)
+TAKING = {
+    "set": ["set", "--session", "{}", "link", "m1->s", "--delay", "1ms"],
+    "set link": ["set", "--session", "{}", "link", "m1->s", "--to", "deviation_ms={}"],
+    "set dominance": ["set", "--session", "x/y", "dominance", "s", "m1={}"],
+    "override": ["scenario", "check", "paper", "--set", "control.Kd={}"],
+    "scenario": ["scenario", "check", "{}"],
+    "log": ["log", "check", "{}"],
+    "stop": ["stop", "--session", "{}/"],
+}
+
+
+@pytest.mark.parametrize("words", TAKING.values(), ids=TAKING)
+def test_odd_words_are_refused_in_one_line_without_their_controls(words: list[str], tmp_path: Path) -> None:
+    for odd in ODD:
+        done = trilat(*(word.replace("{}", odd) for word in words), cwd=tmp_path)
+        done.refuses()
+        assert done.err[:-1].isprintable()
+        assert len(done.err) < 4100
+
+
+def test_what_others_wrote_has_no_effect_on_a_terminal() -> None:
+    """Texts, cells, titles and JSON: letters alone, whatever a peer or a file put into them."""
+    said, attack = io.StringIO(), "a\x1b]0;title\x07\x9b31m\u202eb\r\ud800"
+    console = TextConsole(file=said, force_terminal=True, width=200)
+    table = Table(title=attack)
+    table.add_column(attack)
+    table.add_row(attack)
+    for one in (attack, table):
+        console.print(one)
+    with contextlib.redirect_stdout(said):
+        print_line(attack)
+        print_json({"text": attack})
+    shown = re.sub(r"\x1b\[[\d;]*m", "", said.getvalue())  # the console's own colours
+    assert all(letter.isprintable() or letter == "\n" for letter in shown)
+    assert json.loads("{" + said.getvalue().rpartition("{")[2]) == {"text": attack}
+
+
+def test_a_full_disk_has_one_exit_code(tmp_path: Path, short_log: bytes) -> None:
+    (tmp_path / "run.mcap").write_bytes(short_log)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    for command in (["figure", "run.mcap", "positions"], ["report", "run.mcap"]):
+        with mock.patch("matplotlib.figure.Figure.savefig", side_effect=full):
+            trilat(*command, cwd=tmp_path).refuses("No space left", code=5)

@@ -212,6 +212,19 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
         len(opened(stream.getvalue())["m1"])
 
 
+def test_events_that_cannot_be_read_are_left_out_and_the_log_is_read() -> None:
+    """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
+    whole = opened(recorded("paper"))
+    odd = opened(edited(recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload))
+    assert np.array_equal(odd["m1"].q, whole["m1"].q)
+    assert [event.member for event in odd.events] == [e.member for e in whole.events if e.member != "m1"]
+    assert len(odd.timed_events().messages) == len(odd.events)
+    assert not odd.complete
+    assert whole.unreadable == []
+    assert len(odd.unreadable) == 1
+    assert "/m1/event cannot be read" in odd.unreadable[0]
+
+
 def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "none.mcap"):
         with pytest.raises(LogError, match="cannot be read"):

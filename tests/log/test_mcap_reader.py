@@ -145,13 +145,30 @@ def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
 def test_a_file_that_holds_absurdly_much_is_refused_with_the_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
-    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0)
-    bombs = chunk(message * 80_000) * 3
+    bombs = b"".join(chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6))
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"):
         walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 240_000
+
+
+def test_a_channel_that_holds_absurdly_much_ends_there_and_the_others_are_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One odd channel does not make a log unreadable; what is left out of it is said, once."""
+    monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 16 << 20)
+    bomb = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 80_000)
+    data = DATA[: CHUNKS[1].offset] + bomb + bomb + DATA[CHUNKS[1].offset :]
+    reader = McapReader(io.BytesIO(data), "file")
+    read = list(reader.messages())
+    odd = next(iter(reader.channels))
+    others = [item for item in ITEMS if item.topic != odd]
+    assert [item for item in read if item.topic != odd] == others
+    assert len(read) < len(ITEMS) + 160_000
+    (cut,) = reader.damaged
+    assert cut.offset == CHUNKS[1].offset
+    assert odd in cut.problem
 
 
 def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.MonkeyPatch) -> None:

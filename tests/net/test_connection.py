@@ -3,7 +3,8 @@
 import re
 import socket
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from itertools import chain
 
 import pytest
 from hypothesis import given
@@ -15,11 +16,11 @@ from trilat_net.net.clock import ManualClock
 from trilat_net.net.connection import (
     ROUTER_POLL_NS,
     Connection,
-    choose_session_endpoints,
     default_endpoint,
     default_endpoints,
     find_free_endpoints,
     open_bus,
+    reserve_session_endpoints,
     resolve_member_connection,
     resolve_router_connection,
     run_router,
@@ -203,13 +204,25 @@ def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
     """So that `trilat set` and `trilat ping` find it without being told."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
-    assert choose_session_endpoints("endpoints-test", sites) == places
+    with reserve_session_endpoints("endpoints-test", sites) as own:
+        assert own == places
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port(places[1])))
         taken.listen()
-        others = choose_session_endpoints("endpoints-test", sites)
-    assert len(set(others)) == 3
-    assert not set(others) & set(places)
+        with reserve_session_endpoints("endpoints-test", sites) as others:
+            assert len(set(others)) == 3
+            assert not set(others) & set(places)
+
+
+def test_two_sessions_of_one_name_that_begin_at_once_get_ports_of_their_own() -> None:
+    """Each keeps what it chose, and its sites can listen there all the same."""
+    sites = ("a", "b", "c")
+    with ExitStack() as stack:
+        chosen = [stack.enter_context(reserve_session_endpoints("endpoints-test", sites)) for _ in range(3)]
+        places = list(chain.from_iterable(chosen))
+        assert len(set(places)) == 9
+        for place in places:
+            stack.enter_context(closing(ZenohBus([place])))
 
 
 class Played(ManualClock):

@@ -3,6 +3,8 @@
 import json
 import math
 import struct
+import subprocess
+import sys
 from typing import Any
 
 import msgpack
@@ -373,3 +375,14 @@ def test_the_json_schema_knows_units() -> None:
     schema = json_schema(State)
     assert schema["properties"]["q"]["x-unit"] == "rad"
     assert schema["properties"]["tau"]["x-unit"] == "N m"
+
+
+def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
+    """`python -OO` takes these away; a log has its schemas in it, and in its digests."""
+    kinds = (State, LinkStats, Event)
+    program = (
+        "import json\nfrom trilat_net.net.messages import Event, LinkStats, State, json_schema\n"
+        "print(json.dumps([json_schema(kind) for kind in (State, LinkStats, Event)]))"
+    )
+    done = subprocess.run([sys.executable, "-OO", "-c", program], capture_output=True, check=True)
+    assert json.loads(done.stdout) == [json_schema(kind) for kind in kinds]

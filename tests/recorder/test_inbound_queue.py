@@ -30,3 +30,22 @@ def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> N
     tap.take("a", b"again")
     assert [message.payload for message in tap.drain()] == [b"again"]
     assert tap.overflowed == {"a": 3}
+
+
+def test_a_flood_of_one_key_takes_its_share_and_leaves_room_for_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "KEY_BYTES", 5_000)
+    monkeypatch.setattr(module, "CAPACITY_BYTES", 8_000)
+    tap = InboundQueue(ManualClock())
+    for _ in range(100):
+        tap.take("flood", bytes(1_000))
+    tap.take("quiet", b"1")
+    for _ in range(100):
+        tap.take("more", bytes(1_000))
+    waiting = [(message.key, len(message.payload)) for message in tap.drain()]
+    assert sum(size for _, size in waiting) < 10_000  # no more than one message beyond
+    assert ("quiet", 1) in waiting
+    assert tap.overflowed["flood"] + tap.overflowed["more"] == 201 - len(waiting)
+    tap.take("flood", b"again")  # what was drained makes room
+    assert [message.payload for message in tap.drain()] == [b"again"]

@@ -10,6 +10,7 @@ import pytest
 from recorder import inbound_queue as tap_module
 from recorder.record_process import Recorder
 from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
+from recorder.site_reception import EVENT_BYTES
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
@@ -124,6 +125,23 @@ def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.
     assert len(log["m"]) == 20
     assert f"overflowed {TICKS - 20}" in log.account("m")
     assert any(str(TICKS - 20) in line and "the queue was full" in line for line in desk.recording.summary())
+
+
+def test_a_flood_of_events_leaves_a_log_that_can_be_used() -> None:
+    """What packs to nothing in the file must not take the reader's memory, nor the place of an end."""
+    desk = Desk()
+    desk.take("m", topics.STATE, *states("m"))
+    desk.take("m", topics.LINK, statistics("m"))
+    desk.take("m", topics.EVENT, *(happening("m", n, text="x" * 60_000) for n in range(300)))
+    desk.take("m", topics.EVENT, end("m", n=300))
+    desk.whole("s")
+    written = EVENT_BYTES // 60_000
+    assert desk.recording.dropped["flood of events"] >= 299 - written
+    log = desk.log()
+    assert verify(log).identical == 2 * TICKS
+    assert len([event for event in log.events if event.member == "m"]) <= written + 2
+    assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
+    assert "missing" in (desk.recording.problem() or "")
 
 
 def test_stored_is_said_only_when_every_record_is_in() -> None:

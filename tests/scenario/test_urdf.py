@@ -347,6 +347,9 @@ def test_hostile_texts_are_refused_at_once() -> None:
     assert "XML" in refusal("<robot>\ud800</robot>")
     long = refusal(TWO.replace('"upper"', f'"{"u" * 5000}"', 1).replace('"lower"', '"x"'))
     assert len(long) < 400
+    mass = refusal(TWO.replace('mass value="', f'mass value="{"1" * 50_000}x', 1))
+    assert "must be a finite number" in mass  # which took a minute and a half, digit by digit
+    assert len(mass) < 400
     links = "".join(link(f"l{n}") for n in range(2000))
     ring = "".join(joint(f"j{n}", f"l{n}", f"l{(n + 1) % 2000}") for n in range(2000))
     assert "loop" in refusal(f"<robot>{links}{ring}</robot>")

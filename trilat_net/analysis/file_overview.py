@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
+from ..files import open_regular
 from ..log.log_layout import SESSION
 from ..log.log_reader import open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
@@ -46,7 +47,7 @@ class FileInventory:
         before = 0
         for path in paths:
             try:
-                with path.open("rb") as stream:
+                with open_regular(path) as stream:
                     self._read(path, McapReader(stream, str(path), shift_progress(progress, before, total)))
             except OSError as error:
                 raise LogError(f"{path}: cannot be read: {error.strerror}") from None

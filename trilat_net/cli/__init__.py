@@ -1,9 +1,11 @@
 """The `trilat` command: registers all commands and maps errors to exit codes.
 
 Invariant: a command parses, calls one function of the library and prints. It exits 0 on success, 1 on a
-failed run or comparison, 2 on bad input, 128 + n when signal n ended it; an error is one sentence.
+failed run or comparison, 2 on bad input, 5 when a disk takes no more, 128 + n when signal n ended it; an
+error is one sentence.
 """
 
+import errno
 import gc
 import os
 import sys
@@ -12,7 +14,8 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from ..errors import TrilatError
+from ..errors import LogRefused, TrilatError
+from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error
 from . import (
@@ -105,7 +108,8 @@ _SINGLE = {
 }
 _LOG = {
     "info": (log.log_info_command, "run.mcap"),
-    "check": (log.log_check_command, "run.mcap"),
+    "check": (log.log_check_command, "run.mcap", "run.mcap --key lab.pub"),
+    "sign": (log.log_sign_command, "run.mcap --key lab.key"),
     "recover": (log.log_recover_command, "run.mcap.active"),
     "export": (log.log_export_command, "run.mcap --to parquet"),
     "view": (log.log_view_command, "run.mcap"),
@@ -133,13 +137,16 @@ _SET = {
 }
 _KEYS = {
     "new": (keys.keys_new_command, "keys m1 m2 s recorder operator --host 192.0.2.1"),
+    "pair": (keys.keys_pair_command, "lab"),
     "info": (keys.keys_info_command, "keys/m1"),
 }
 _CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
 _CHANGES.callback()(set_command.set_command)
 app.add_typer(_group(_SINGLE))
 app.add_typer(
-    _group(_LOG, "log ", no_args_is_help=True, help="Inspects, checks, recovers, exports or shows a log."),
+    _group(
+        _LOG, "log ", no_args_is_help=True, help="Inspects, checks, signs, recovers, exports, shows a log."
+    ),
     name="log",
 )
 app.add_typer(_group(_STUDIES))
@@ -159,7 +166,7 @@ def main() -> None:
     try:
         app()
     except TrilatError as error:
-        err.print(f"error: {error}", markup=False, soft_wrap=True)
+        print_error(error)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -167,7 +174,8 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:  # a full disk, a folder that vanished
-        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror}")
-        sys.exit(1)
+        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+        bad_name = error.errno == errno.ENAMETOOLONG
+        sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
     finally:
         gc.freeze()  # at exit, Python need not traverse every record

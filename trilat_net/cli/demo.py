@@ -39,7 +39,7 @@ def demo_command(
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not outcome.log.exists():
-        raise typer.Exit(1)
+        raise typer.Exit(outcome.exit_code)
     _, conclusion = terminal.conclude_files([outcome.log], results)
     if outcome.problems or not conclusion.passed:
-        raise typer.Exit(1)
+        raise typer.Exit(outcome.exit_code)

@@ -40,6 +40,20 @@ def keys_new_command(
     terminal.print_line(f"they hold for {days} days; as in: trilat site {made[0].name} --keys {made[0]} ...")
 
 
+def keys_pair_command(
+    name: Annotated[Path, typer.Argument(help="Makes NAME.key and NAME.pub.", metavar="NAME")],
+) -> None:
+    """Makes a pair of Ed25519 keys, with which logs are signed and checked.
+
+    Keep NAME.key to yourself; give NAME.pub to whoever is to check your logs, by a way that they trust.
+    """
+    from ..log.log_signature import create_signing_keys
+
+    private, public = create_signing_keys(name)
+    terminal.print_text(f"{private}: signs, as in: trilat log sign run.mcap --key {private}")
+    terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
+
+
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
 ) -> None:

@@ -90,7 +90,7 @@ def _run_session(
     for problem in outcome.problems:
         terminal.print_error(problem)
     if not outcome.log.exists():
-        raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else 1)
+        raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else outcome.exit_code)
     _, conclusion = terminal.conclude_files([outcome.log], results)
     if outcome.problems or not conclusion.passed:
-        raise typer.Exit(1)
+        raise typer.Exit(outcome.exit_code)

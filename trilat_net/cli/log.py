@@ -1,4 +1,4 @@
-"""`trilat log`: info, check, recover, export, view. None of them executes the log."""
+"""`trilat log`: info, check, sign, recover, export, view. None of them executes the log."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -36,7 +36,14 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
         terminal.warn_if_unfinished(path)
 
 
-def log_check_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
+def log_check_command(
+    files: options.LogsArgument,
+    key: Annotated[
+        Path | None,
+        typer.Option("--key", metavar="PUB", help="Check FILE.sig by this public key, too."),
+    ] = None,
+    as_json: options.JsonOption = False,
+) -> None:
     """Checks that a log is well-formed, complete and consistent; executes nothing.
 
     Exit code 0: sound; 1: not; 2: no such file. Files of other programs: structure only.
@@ -45,6 +52,11 @@ def log_check_command(files: options.LogsArgument, as_json: options.JsonOption =
 
     with terminal.progress_bar(f"checking {files[0]}") as progress:
         found = check_log(files, progress)
+    if key is not None:
+        from ..log.log_signature import check_signatures
+
+        with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
+            found.findings.append(check_signatures(files, key, progress))
     if as_json:
         checks = [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in found.findings]
         facts = {"files": [str(path) for path in files], "kind": "trilat" if found.ours else "mcap"}
@@ -71,6 +83,25 @@ def _print_check(files: list[Path], found: "LogCheckResult") -> None:
         terminal.print_note("this is no log of trilat-net: only its structure was checked")
     for path in files:
         terminal.warn_if_unfinished(path)
+
+
+def log_sign_command(
+    file: options.LogArgument,
+    key: Annotated[
+        Path, typer.Option("--key", metavar="KEY", help="Private key, as trilat keys pair makes one.")
+    ],
+    force: options.ForceOption = False,
+) -> None:
+    """Signs a finished log with Ed25519: writes FILE.sig, and leaves FILE as it is.
+
+    What is signed is its digest chain: all messages and all that describes them. Whoever has the public key
+    checks it with: trilat log check FILE --key PUB
+    """
+    from ..log.log_signature import sign_log
+
+    with terminal.progress_bar(f"reading {file}") as progress:
+        made = sign_log(file, key, force=force, progress=progress)
+    terminal.print_text(f"{made}: signs {file}")
 
 
 def log_recover_command(

@@ -42,7 +42,7 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
             raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
         try:
             table[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
+        except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
             table[key.strip()] = value.strip()
     return table
 
@@ -61,7 +61,8 @@ def set_command(
 
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
-    context.obj = session, options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    name = None if session is None else options.check_session_name(session)
+    context.obj = name, options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
 
 
 def set_link_command(
@@ -107,8 +108,10 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     from ..net.discovery import request_change
     from ..net.requests import ChangeRequest
     from ..scenario import embedded_names_reader
+    from ..scenario.fields import check_finite
 
     session, connection = context.obj
+    check_finite(order, "")  # a message holds no others
     if session is None:
         raise UsageError("the session is missing: trilat set --session ID ...")
     reply = request_change(

@@ -4,9 +4,11 @@
     log["m1"].t_s, log["m1"].q
 
 Invariant: files of every released schema version open; one that is cut off opens up to there, with
-`complete` false. Messages are decoded on access; an invalid one is an error that names the file. Measured
-link delays, for scenarios with `model = "trace"`, leave out what the log does not know: a sample counts
-as lost only if records cover every tick at which it could have come, up to the longest delay of the link.
+`complete` false. Messages are decoded on access; an invalid record is an error that names the file, an
+invalid event or statistic is left out and reported (`unreadable`). Channels of other sessions and members
+are none of the log's. Measured link delays, for scenarios with `model = "trace"`, leave out what the log does
+not know: a sample counts as lost only if records cover every tick at which it could have come, up to the
+longest delay of the link.
 """
 
 import hashlib
@@ -25,6 +27,7 @@ import numpy as np
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import LogError, ScenarioError, WireError
+from ..files import open_regular
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
@@ -69,9 +72,10 @@ class Log:
         scenario_text, scenario_sha256: its text, as it is in the file, and the hash of that.
         events: the events, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
+        unreadable: channels some of whose messages cannot be read, a sentence each.
 
     Raises:
-        LogError: its scenario or an event cannot be read.
+        LogError: its scenario cannot be read.
     """
 
     def __init__(self, contents: LogContents) -> None:
@@ -85,6 +89,7 @@ class Log:
             raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
+        self.unreadable: list[str] = []
         self.events = [event for topic in self._event_topics() for event in self._read_events(topic)]
 
     def __repr__(self) -> str:
@@ -102,21 +107,34 @@ class Log:
         return "/" + topics.key(self.session["session"], member, channel)
 
     def _event_topics(self) -> list[str]:
-        return [topic for topic in sorted(self._contents.channels) if topic.endswith(f"/{topics.EVENT}")]
+        named = {self._topic(member, topics.EVENT) for member in (*self.sites, topics.RECORDER)}
+        return sorted(named & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
         return self._contents.channels.get(topic) or ChannelMessages()
 
-    def _decode(self, topic: str, kind: type[M]) -> Iterator[M]:
-        try:
-            for payload in self._channel(topic).payloads:
-                yield decode(payload, kind, READABLE)
-        except WireError as error:
-            raise LogError(f"{self.source}: a message on {topic} cannot be read: {error}") from None
+    def _decode(self, topic: str, kind: type[M]) -> list[M]:
+        """Returns the messages of a channel; those that cannot be read leave it, and are reported once."""
+        channel, readable, problem = self._channel(topic), ChannelMessages(), ""
+        messages: list[M] = []
+        for payload, *times in zip(channel.payloads, channel.log_ns, channel.publish_ns, strict=True):
+            try:
+                messages.append(decode(payload, kind, READABLE))
+                readable.add(payload, *times)
+            except WireError as error:
+                problem = problem or str(error)
+        if problem:
+            lost = len(channel.payloads) - len(messages)
+            self.unreadable.append(
+                f"{self.source}: {lost} messages on {topic} cannot be read: {problem[:200]}"
+            )
+            self._contents.channels[topic] = readable
+            self._contents.complete = False
+        return messages
 
     def _read_events(self, topic: str) -> list[Event]:
         """Returns a member's events in order: one that came late belongs before those that it precedes."""
-        events = list(self._decode(topic, Event))
+        events = self._decode(topic, Event)
         boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
         return sorted(events, key=lambda event: (boots[event.boot], event.n))
 
@@ -318,7 +336,7 @@ class Log:
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
         """Returns the same with the times at which they came and were sent."""
         topic = self._topic(site, topics.LINK)
-        stats = list(self._decode(topic, LinkStats))
+        stats = self._decode(topic, LinkStats)
         order = sorted(range(len(stats)), key=lambda n: stats[n].tick)
         times = (column[order] for column in self._channel(topic).times())
         return TimedMessages([stats[n] for n in order], *times)
@@ -336,7 +354,7 @@ class Log:
 
     def recorder_stats(self) -> list[RecorderStats]:
         """Returns the recorder's statistics of its own work, in order."""
-        return list(self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats))
+        return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
         """Returns a part of the log as a table: columns with names, units and meanings.
@@ -401,7 +419,7 @@ def open_log(
         for one in (source, *more):
             if isinstance(one, str | Path):
                 with _reading(str(one)):
-                    files.append((stack.enter_context(Path(one).open("rb")), str(one)))
+                    files.append((stack.enter_context(open_regular(Path(one))), str(one)))
             else:
                 files.append((one, "log"))
         sizes = [_measure(stream) for stream, _ in files]

@@ -1,11 +1,13 @@
 """Reader of an MCAP file, chunk by chunk; contents of a trilat-net log by topic.
 
 Invariant: the reader holds one chunk at a time; what it cannot read it skips and reports. Messages of a
-log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped.
+log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped. A channel that would take
+the memory of all ends where its share does, and the others are read.
 """
 
+import math
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
@@ -41,7 +43,8 @@ _READ = frozenset(
 
 KEPT_BYTES = 64 << 20
 KEPT_RATIO = 300
-"""Messages that are kept take at most so much memory, or so many times the file's size.
+CHANNEL_SHARE = 1 / 3
+"""Messages that are kept take at most so much memory, or so many times the file's size; a channel its share.
 
 Arms at rest in virtual time pack best of all that is no bomb: 120 times.
 """
@@ -131,11 +134,14 @@ class McapReader:
         self._topics: dict[int, str] = {}
         self._ours: set[int] = set()
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
+        share = math.inf if self._room is None else CHANNEL_SHARE * self._room
+        self._shares: defaultdict[int, float] = defaultdict(lambda: share)  # what is left, by channel
+        self._cut_short: list[Damage] = []
 
     @property
     def damaged(self) -> list[Damage]:
-        """Parts that could not be read, so far."""
-        return self._scanner.damaged
+        """Parts that could not be read, so far, and channels that were read in part."""
+        return self._scanner.damaged + self._cut_short
 
     @property
     def torn(self) -> Damage | None:
@@ -191,7 +197,7 @@ class McapReader:
         return b""
 
     def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
-        find_topic, ours = self._topics.get, self._ours
+        find_topic, ours, shares = self._topics.get, self._ours, self._shares
         parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
         new = tuple.__new__  # what the class does with its arguments, in half the time
         memory = chained = messages = 0
@@ -204,11 +210,16 @@ class McapReader:
                     raise UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
                 if channel in ours:
-                    memory += _DECODED_BYTES
+                    cost = _DECODED_BYTES
                     if length > _LONG_BYTES:
-                        memory += (length - _LONG_BYTES) * _LONG_RATIO
+                        cost += (length - _LONG_BYTES) * _LONG_RATIO
                 else:
-                    memory += 100 + length
+                    cost = 100 + length
+                if (left := shares[channel]) < cost:
+                    self._cut_channel(channel, frame)
+                    continue
+                shares[channel] = left - cost
+                memory += cost
                 payload = data[begin + head_bytes : end]
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
@@ -236,6 +247,14 @@ class McapReader:
             self.channels.setdefault(topic, info)
             if topic.startswith("/trilat/"):
                 self._ours.add(record.id)
+
+    def _cut_channel(self, channel: int, frame: RecordFrame) -> None:
+        """Reports, once, that the rest of a channel is not read."""
+        if self._shares[channel] >= 0.0:
+            self._shares[channel] = -math.inf
+            topic = self._topics.get(channel, f"channel {channel}")
+            text = f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
+            self._cut_short.append(Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: RecordFrame) -> None:
         """Takes memory for what is kept; raises `LogError` if there is not so much."""

@@ -19,6 +19,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
+from ..files import open_regular
 from ..net import topics
 from .accounting import Coverage, open_session_accounts, parse_counts
 from .digest_chain import CHAIN, RECOVERED, ChainState
@@ -141,7 +142,7 @@ def recover_log(
     if made.exists() and path.exists() and made.samefile(path):
         raise UsageError(f"{made}: is the file itself, which is not touched; choose another name with -o")
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             return _recover(stream, Recovery(path, made), force, progress)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}{describe_unfinished(path)}") from None

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
+from ..files import open_regular
 from ..net import topics
 from ..net.messages import (
     READABLE,
@@ -77,7 +78,7 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
         before = 0
         for path in sorted(paths, key=lambda path: path.name):
             size = path.stat().st_size
-            with path.open("rb") as stream:
+            with open_regular(path) as stream:
                 if files.read(str(path), stream, shift_progress(progress, before, total)):
                     stream.seek(0)
                     session.read(str(path), stream, shift_progress(progress, before + size, total))

@@ -11,8 +11,8 @@ import math
 import re
 import socket
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -40,28 +40,39 @@ def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
     return {site: default_endpoint(session, index) for index, site in enumerate(sites)}
 
 
-def choose_session_endpoints(session: str, sites: Sequence[str]) -> list[str]:
-    """Returns endpoints for the sites of a session: the defaults, or free ones if a port is taken."""
+@contextmanager
+def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
+    """Yields endpoints for the sites of a session: the defaults, or free ones if these are taken.
+
+    Others who choose in this way get other endpoints, from here to the end of the block.
+    """
     default = list(default_endpoints(session, sites).values())
-    try:
-        return _bind_for_a_moment([int(endpoint.rpartition(":")[2]) for endpoint in default])
-    except OSError:
-        return find_free_endpoints(len(sites))
+    ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
+    with ExitStack() as stack:
+        try:
+            _bind_ports(stack, [ports[0] - ports[0] % _BLOCK + _BLOCK - 1], shared=False)
+            chosen = _bind_ports(stack, ports, shared=True)
+        except OSError:
+            chosen = _bind_ports(stack, [0] * len(sites), shared=True)
+        yield chosen
 
 
 def find_free_endpoints(count: int) -> list[str]:
     """Returns loopback endpoints whose ports are free now."""
-    return _bind_for_a_moment([0] * count)
-
-
-def _bind_for_a_moment(ports: Sequence[int]) -> list[str]:
-    """Returns loopback endpoints that were bound just now; port 0 stands for any. Raises OSError."""
     with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in ports]
-        for probe, port in zip(sockets, ports, strict=True):
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(port > 0))
-            probe.bind(("127.0.0.1", port))
-        return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
+        return _bind_ports(stack, [0] * count, shared=False)
+
+
+def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
+    """Binds loopback ports, of which 0 stands for any, until the stack ends; returns their endpoints.
+
+    A shared one can be listened at meanwhile. Raises OSError.
+    """
+    sockets = [stack.enter_context(socket.socket()) for _ in ports]
+    for probe, port in zip(sockets, ports, strict=True):
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(shared))
+        probe.bind(("127.0.0.1", port))
+    return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
 
 
 RETRY_NS = 200_000_000

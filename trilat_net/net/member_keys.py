@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
+from ..files import open_regular
 from .access_rules import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
@@ -32,6 +33,8 @@ HERE = ("localhost", "127.0.0.1", "::1")
 """Names of the own machine, which every certificate holds."""
 _BEFORE = datetime.timedelta(hours=1)
 """Clocks of machines may differ by so much."""
+MOST_KEY_BYTES = 65_536
+"""Of a file of keys; the rest of a longer one is not read."""
 
 
 class MemberKeys(NamedTuple):
@@ -135,6 +138,12 @@ def _write(
         file.write(private)
 
 
+def _read(path: Path) -> bytes:
+    with open_regular(path) as stream:
+        content: bytes = stream.read(MOST_KEY_BYTES)
+    return content
+
+
 def read_member_keys(folder: Path) -> MemberKeys:
     """Returns the keys in a member's folder.
 
@@ -144,12 +153,12 @@ def read_member_keys(folder: Path) -> MemberKeys:
     if (folder / _AUTHORITY_FOLDER).is_dir():
         raise UsageError(f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1")
     try:
-        listed = json.loads((folder / MEMBERS).read_text(encoding="utf-8"))
+        listed = json.loads(_read(folder / MEMBERS))
         member, members = str(listed["member"]), tuple(map(str, listed["members"]))
         authority, certificate = (
-            x509.load_pem_x509_certificate((folder / name).read_bytes()) for name in (AUTHORITY, CERTIFICATE)
+            x509.load_pem_x509_certificate(_read(folder / name)) for name in (AUTHORITY, CERTIFICATE)
         )
-        key = serialization.load_pem_private_key((folder / PRIVATE_KEY).read_bytes(), password=None)
+        key = serialization.load_pem_private_key(_read(folder / PRIVATE_KEY), password=None)
         certificate.verify_directly_issued_by(authority)
     except OSError as error:
         raise UsageError(f"{error.filename}: {error.strerror}: no keys of `trilat keys new`") from None

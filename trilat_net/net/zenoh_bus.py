@@ -17,6 +17,7 @@ import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
 from ..errors import SessionError, UsageError
+from ..files import open_regular
 from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
@@ -213,7 +214,8 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         UsageError: it cannot be read, is no configuration, or contradicts what a session needs.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with open_regular(path, encoding="utf-8-sig") as stream:
+            text = stream.read()
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from ..errors import UsageError
+from ..files import open_regular
 
 LEASE_MS = 5_000
 """A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
@@ -188,7 +189,7 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
             )
         if re.fullmatch(_FILES, key):
             try:
-                Path(str(value)).read_bytes()
+                open_regular(Path(str(value))).close()
             except OSError as error:
                 raise UsageError(f"{source}: {key}: {value} cannot be read: {error.strerror}") from None
     mode = settings.pop("mode", "")

@@ -1,11 +1,13 @@
 """Terminal output that commands share: consoles, lines, tables, progress bar, opening of a log with warnings.
 
-Invariants: text from a file or a peer passes `sanitize`: no control characters, bounded length. Library code
-knows nothing of the bar; it calls a function with (done, total). Imports only Rich at the top, so that
+Invariants: no control characters reach a terminal, whoever wrote a text: `TextConsole` and `print_line`
+escape them; text from a file or a peer passes `sanitize` besides, which bounds its length. Library code knows
+nothing of the bar; it calls a function with (done, total). Imports only Rich at the top, so that
 `trilat --help` stays fast.
 """
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,14 +16,34 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
+from rich.text import Text
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
     from .conclude import Conclusion
     from .text_table import TextTable
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+_CONTROLS = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
+)
+"""What moves a cursor, rings, colours, or turns the direction of writing; no line ends and tabs."""
+
+
+def escape_controls(text: str) -> str:
+    """Returns a text whose control characters are written out, as in U+001B."""
+    return _CONTROLS.sub(lambda found: f"<U+{ord(found[0]):04X}>", text)
+
+
+class TextConsole(Console):
+    """A console on which texts, also those of tables, have no effect but that of their letters."""
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """Returns a text as it is shown; its controls are written out."""
+        return super().render_str(escape_controls(text), **how)
+
+
+out = TextConsole(highlight=False)
+err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
 """Time until a progress bar appears, s."""
@@ -69,18 +91,19 @@ def print_paths(paths: Iterable[Path]) -> None:
 
 def print_json(value: Any) -> None:
     """Prints JSON; NaN is an error."""
-    print_line(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+    print_line(_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
 
 
 def print_line(text: str) -> None:
     """Prints a line at once, for programs that read the output."""
-    sys.stdout.write(text + "\n")
+    sys.stdout.write(escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
 def print_table(table: "TextTable", styles: Mapping[str, str] | None = None) -> None:
     """Prints a table; cells with a text of `styles` in that style."""
-    wide = Console(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
+    wide = TextConsole(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
     (out if out.is_terminal else wide).print(table.rich(styles or {}))
 
 
@@ -148,7 +171,7 @@ def open_with_progress(first: Path, *more: Path) -> "Log":
         log = open_log(first, *more, progress=progress)
     for path in (first, *more):
         warn_if_unfinished(path)
-    for problem in log.damaged[:_MAX_DAMAGED]:
+    for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
         print_note(problem)
     if log.damaged:
         rest = len(log.damaged) - _MAX_DAMAGED
@@ -183,10 +206,11 @@ def warn_if_unfinished(path: Path) -> None:
         LogError: it cannot be read.
     """
     from ..errors import LogError
+    from ..files import open_regular
     from ..log.mcap_records import RecordScanner
 
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             whole = RecordScanner(stream).ends
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None

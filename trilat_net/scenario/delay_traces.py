@@ -21,6 +21,7 @@ from ..core.channel import LOST
 from ..core.delay import MAX_DELAY_US
 from ..core.vectors import Points
 from ..errors import ScenarioError
+from ..files import open_regular
 
 MAX_TRACE_POINTS = 200_000
 """Most points of one trace: 200 s of a log at 1 kHz."""
@@ -37,7 +38,7 @@ _LOG_READER = "trilat_net.log.log_reader", "read_link_delays"
 def _read_csv(path: Path) -> list[TracePoint]:
     rows: list[TracePoint] = []
     first = True
-    with path.open(newline="", encoding="utf-8-sig") as stream:
+    with open_regular(path, newline="", encoding="utf-8-sig") as stream:
         for number, cells in enumerate(csv.reader(stream), start=1):
             if not any(cells) or cells[0].lstrip().startswith("#"):
                 continue

@@ -134,9 +134,14 @@ def reword_problem(problem: str) -> str:
     return problem
 
 
+MOST_LETTERS, MOST_COMPARED = 80, 500
+"""Of a word that is compared with others, and how many these are: the time grows by more than the product."""
+
+
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Returns "; did you mean ...?", or "" if nothing valid is near."""
-    match = difflib.get_close_matches(word, valid, n=1, cutoff=0.5)
+    """Returns "; did you mean ...?", or "" if nothing valid is near, or there is too much to compare."""
+    named = [name for name in valid[:MOST_COMPARED] if len(name) <= MOST_LETTERS]
+    match = difflib.get_close_matches(word, named, n=1, cutoff=0.5) if len(word) <= MOST_LETTERS else []
     return f"; did you mean {match[0]!r}?" if match else ""
 
 

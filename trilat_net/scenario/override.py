@@ -209,7 +209,7 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
             raise ScenarioError(f"an override reads KEY=VALUE, as in control.Kd=5, not {text!r}")
         try:
             parsed: Any = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
+        except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
             parsed = value.strip()
         pairs.append((key.strip(), parsed))
     return pairs

@@ -18,6 +18,7 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
+from ..files import open_regular
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
@@ -154,8 +155,9 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.urdf")
     try:
-        with _find_file(name, folder).open(encoding="utf-8") as stream:
-            return stream.read(MAX_CHARACTERS + 1)
+        with open_regular(_find_file(name, folder), encoding="utf-8") as stream:
+            text: str = stream.read(MAX_CHARACTERS + 1)
+        return text
     except (OSError, ValueError) as error:  # of text that is not UTF-8, and of a name with a null
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None

@@ -4,6 +4,7 @@ Invariant: text from a log or a peer is not trusted: it names no file, and its l
 `MAX_LINKS_BYTES`.
 """
 
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
@@ -14,6 +15,7 @@ from ..core.chain import MAX_JOINTS
 from ..core.delay import MAX_DELAY_US
 from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
 from ..errors import ScenarioError
+from ..files import open_regular
 from .fields import suggest_nearest
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import resolve_scenario
@@ -22,6 +24,9 @@ from .validate import build_scenario
 
 MAX_LINKS_BYTES = 64 << 20
 """Most memory of a site's links in a scenario from a log or a peer."""
+
+MAX_KEY_PARTS = 32
+"""Parts of a key, as in sites.m1.arm; a scenario needs four."""
 
 _FOLDER = resources.files("trilat_net") / "scenarios"
 
@@ -34,7 +39,7 @@ def list_shipped() -> list[str]:
 
 def read_shipped(name: str) -> str:
     """Returns the TOML text of a shipped scenario, of one that is not listed too: its name begins with _."""
-    if name not in list_shipped() and not (_FOLDER / f"{name}.toml").is_file():
+    if name not in list_shipped() and not (len(name) < 80 and (_FOLDER / f"{name}.toml").is_file()):
         raise ScenarioError(
             f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
             f"shipped are {', '.join(list_shipped())}; a file is named by its path, as in ./mine.toml",
@@ -88,7 +93,8 @@ def read_source(source: str | Path) -> tuple[str, Path]:
     if not (isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name):
         return read_shipped(name), Path()
     try:
-        return Path(source).read_text(encoding="utf-8"), Path(source).parent
+        with open_regular(Path(source), encoding="utf-8") as stream:
+            return stream.read(), Path(source).parent
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ScenarioError(f"cannot be read: {reason}", source=name) from None
@@ -122,6 +128,7 @@ def parse_scenario(
         ScenarioError: with the path of the offending key.
     """
     try:
+        _refuse_long_keys(text)
         try:
             tables = tomllib.loads(text)
         except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
@@ -138,6 +145,27 @@ def parse_scenario(
         raise ScenarioError(error.problem, path=error.path, source=source) from None
     except RecursionError:
         raise ScenarioError("is nested too deep", source=source) from None
+
+
+_KEY_PART = re.compile(r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)""")
+
+
+def _refuse_long_keys(text: str) -> None:
+    """Refuses keys of very many parts: the time of a parser grows by more than the square of their number.
+
+    Raises:
+        ScenarioError: with the line of the key.
+    """
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.count(".") < MAX_KEY_PARTS:
+            continue
+        dots, before = 0, ""
+        for found in _KEY_PART.finditer(line):
+            kind = found.lastgroup or ""
+            dots = dots + (kind == "dot") if {kind, before} == {"word", "dot"} else 0
+            before = kind
+            if dots >= MAX_KEY_PARTS:
+                raise ScenarioError(f"line {number}: a key has more than {MAX_KEY_PARTS} parts")
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:

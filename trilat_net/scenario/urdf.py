@@ -25,6 +25,8 @@ from ..errors import ScenarioError
 from .fields import MAX_QUANTITY, suggest_nearest
 
 MAX_CHARACTERS = 1_000_000
+MOST_DIGITS = 100
+"""Letters of a number; the time to match one that is none grows by the square of its length."""
 MAX_OFFSET_M = 100.0
 """Largest coordinate of an origin; beyond it a file is in millimetres, or wrong."""
 CONSISTENCY = 1e-9
@@ -457,7 +459,8 @@ def _read_number(element: Element, key: str, place: str, most: float = MAX_QUANT
 
 
 def _parse_number(word: str, what: str, place: str, most: float) -> float:
-    value = float(word) if _NUMBER.fullmatch(word.strip()) else math.nan
+    number = word.strip() if len(word) <= MOST_DIGITS else ""
+    value = float(number) if _NUMBER.fullmatch(number) else math.nan
     if not math.isfinite(value):
         _refuse(place, f"its <{what}> is {_quote(word)}, must be a finite number")
     if abs(value) > most:

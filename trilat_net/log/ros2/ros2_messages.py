@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from ...core.task_space import PLACE
 from ...core.ticks import Mode, TickRecord
 from ...errors import LogError
+from ...files import open_regular
 from ...net.messages import Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
@@ -216,7 +217,7 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
         LogError: the file cannot be opened.
     """
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     with stream:

@@ -1,0 +1,130 @@
+"""Signatures: what was signed holds, whatever else is changed does not; Ed25519 by another program agrees."""
+
+import base64
+import io
+import json
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_public_key,
+)
+
+from tests.cli.running import trilat
+from tests.log_editing import edited, recorded
+from trilat_net.errors import LogError, UsageError
+from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
+from trilat_net.log.mcap_reader import McapReader
+from trilat_net.log.recover import recover_log
+
+
+@pytest.fixture
+def signed(tmp_path: Path) -> tuple[Path, Path]:
+    """A signed log, and the public key."""
+    path = tmp_path / "run.mcap"
+    path.write_bytes(recorded("paper"))
+    private, public = create_signing_keys(tmp_path / "lab")
+    assert private.stat().st_mode & 0o777 == 0o600
+    assert sign_log(path, private) == tmp_path / "run.mcap.sig"
+    return path, public
+
+
+def problem(path: Path, key: Path) -> str:
+    found = check_signatures([path], key)
+    assert found.passed == (not found.places)
+    return "" if found.passed else found.text
+
+
+def test_what_was_signed_holds_and_the_log_is_not_touched(signed: tuple[Path, Path]) -> None:
+    path, key = signed
+    assert path.read_bytes() == recorded("paper")
+    assert problem(path, key) == ""
+
+
+def test_ed25519_is_that_of_rfc_8032_over_the_digests_in_words(signed: tuple[Path, Path]) -> None:
+    """The file is enough for any other program: the bytes that are signed are made of it alone."""
+    path, key = signed
+    stated = json.loads(path.with_name("run.mcap.sig").read_text())
+    reader = McapReader(io.BytesIO(recorded("paper")), "log")
+    list(reader.messages())
+    assert stated["chain"] == reader.metadata["trilat.chain"]
+    text = json.dumps(stated["chain"], sort_keys=True, separators=(",", ":"))
+    public = load_pem_public_key(key.read_bytes())
+    assert isinstance(public, ed25519.Ed25519PublicKey)
+    public.verify(base64.b64decode(stated["signature"]), f"{stated['format']}\n{text}".encode())
+
+
+@pytest.mark.parametrize("what", ["log", "chain", "signature", "log and chain", "another's", "gone", "text"])
+def test_whatever_is_changed_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) -> None:
+    path, key = signed
+    file = path.with_name("run.mcap.sig")
+    stated = json.loads(file.read_text())
+    other = recorded("paper", {"seed": 2, "duration_s": 0.05})
+    if what == "log":
+        path.write_bytes(edited(recorded("paper"), record=lambda r: {**r, "q": [0.0, 0.0]}))
+    elif what == "chain":
+        file.write_text(json.dumps({**stated, "chain": {**stated["chain"], "messages": "1"}}))
+    elif what == "signature":
+        file.write_text(json.dumps({**stated, "signature": base64.b64encode(bytes(64)).decode()}))
+    elif what == "log and chain":  # a file that was made anew: the chain agrees with it
+        path.write_bytes(other)
+    elif what == "another's":
+        create_signing_keys(tmp_path / "forger")
+        sign_log(path, tmp_path / "forger.key", force=True)
+    elif what == "gone":
+        file.unlink()
+    else:
+        file.write_text("signed, honestly")
+    assert problem(path, key)
+
+
+def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
+    private, key = create_signing_keys(tmp_path / "lab")
+    path = tmp_path / "run.mcap"
+    path.write_bytes(recorded("paper")[:-200])
+    with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
+        sign_log(path, private)
+    made = recover_log(path).output
+    assert problem(made, key) == f"there is no signature {made}.sig"
+    sign_log(made, private)
+    assert problem(made, key) == ""
+
+
+def test_keys_that_are_none_or_open_to_others_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:
+    path, public = signed
+    private = tmp_path / "lab.key"
+    with pytest.raises(UsageError, match=r"exists; choose another name"):
+        sign_log(path, private)
+    locked = ed25519.Ed25519PrivateKey.generate().private_bytes(
+        Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"word")
+    )
+    foreign = rsa.generate_private_key(65537, 2048).private_bytes(
+        Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()
+    )
+    for content in (b"", locked, foreign, public.read_bytes()):
+        (tmp_path / "odd.key").write_bytes(content)
+        with pytest.raises(UsageError, match="no private Ed25519 key"):
+            sign_log(path, tmp_path / "odd.key", force=True)
+    with pytest.raises(UsageError, match="no public Ed25519 key"):
+        check_signatures([path], private)
+    private.chmod(0o644)
+    with pytest.raises(UsageError, match="chmod 600"):
+        sign_log(path, private, force=True)
+    with pytest.raises(UsageError, match="exists"):
+        create_signing_keys(tmp_path / "lab")
+
+
+def test_the_command_says_yes_by_0_and_no_by_1(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(recorded("paper"))
+    trilat("keys", "pair", "lab", cwd=tmp_path).succeeds()
+    trilat("log", "sign", "run.mcap", "--key", "lab.key", cwd=tmp_path).succeeds()
+    assert "signature" in trilat("log", "check", "run.mcap", "--key", "lab.pub", cwd=tmp_path).succeeds()
+    (tmp_path / "run.mcap.sig").unlink()
+    done = trilat("log", "check", "run.mcap", "--key", "lab.pub", "--json", cwd=tmp_path)
+    assert done.code == 1
+    assert [one["check"] for one in json.loads(done.out)["checks"] if not one["passed"]] == ["signature"]

@@ -1,0 +1,178 @@
+"""Signatures of logs: Ed25519 over the digest chain of a file, in a file of its own beside it.
+
+Invariant: a log is read, never written. What is signed is what the chain covers, all messages and all that
+describes them, and not how they are packed; so a signature holds for a copy that was packed anew, and for
+nothing else. Only a file that agrees with its chain is signed.
+"""
+
+import base64
+import json
+import os
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from ..errors import LogError, UsageError
+from ..files import open_regular, refuse_existing, write_whole
+from .digest_chain import CHAIN, ChainState, Integrity
+from .mcap_check import CheckFinding, ProblemList
+from .mcap_reader import McapReader, Progress
+
+SUFFIX = ".sig"
+"""Ending of a signature's file, behind the whole name of the log."""
+_FORMAT = "trilat-net log signature 1"
+_MOST_BYTES = 65_536
+"""Of a key, and of a signature's file."""
+
+
+class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What stands in a signature's file.
+
+    Attributes:
+        format: names this format and its version.
+        chain: the digests that are signed, as the log's chain states them.
+        public_key: of who signed, 32 bytes in base64; whether to trust it is the reader's matter.
+        signature: 64 bytes in base64.
+    """
+
+    format: str
+    chain: dict[str, str]
+    public_key: str
+    signature: str
+
+
+def create_signing_keys(path: Path) -> tuple[Path, Path]:
+    """Makes a pair of keys, PATH.key, which nobody else may read, and PATH.pub; returns their files.
+
+    Raises:
+        UsageError: one of them exists, or cannot be made.
+    """
+    private, public = path.with_name(f"{path.name}.key"), path.with_name(f"{path.name}.pub")
+    for file in (private, public):
+        refuse_existing(file, force=False)
+    key = Ed25519PrivateKey.generate()
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    try:
+        with os.fdopen(os.open(private, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
+            stream.write(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    except OSError as error:
+        raise UsageError(f"{private}: cannot be written: {error.strerror}") from None
+    form = serialization.PublicFormat.SubjectPublicKeyInfo
+    write_whole(public, key.public_key().public_bytes(pem, form), force=False)
+    return private, public
+
+
+def sign_log(path: Path, key_file: Path, *, force: bool = False, progress: Progress | None = None) -> Path:
+    """Signs a finished log; returns the signature's file.
+
+    Raises:
+        LogError: the log cannot be read, has no digest chain, or does not agree with it.
+        UsageError: the key is none, others can read it, or there is a signature already.
+    """
+    key = _load_private_key(key_file)
+    made = path.with_name(path.name + SUFFIX)
+    refuse_existing(made, force=force)
+    integrity, chain = _read_chain(path, progress)
+    if integrity.state is not ChainState.INTACT:
+        advice = {
+            ChainState.OPEN: f"; make it whole first with: trilat log recover {path}",
+            ChainState.ABSENT: f"; trilat log recover {path} makes a copy with one",
+        }
+        raise LogError(f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}")
+    raw = key.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
+    texts = (base64.b64encode(data).decode() for data in (raw, key.sign(_signed_bytes(chain))))
+    content = msgspec.json.format(msgspec.json.encode(LogSignature(_FORMAT, dict(chain), *texts)), indent=1)
+    write_whole(made, content + b"\n", force=force)
+    return made
+
+
+def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress | None = None) -> CheckFinding:
+    """Checks that files are what the owner of a public key signed.
+
+    Raises:
+        LogError: a log cannot be read.
+        UsageError: the key is none.
+    """
+    key, problems = _load_public_key(key_file), ProblemList()
+    for path in paths:
+        if problem := _find_problem(path, key, progress):
+            problems.add(str(path), None, problem)
+    files = "file is" if len(paths) == 1 else f"{len(paths)} files are"
+    return problems.finding("signature", f"the {files} as the owner of {key_file} signed")
+
+
+def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
+    """Returns what is wrong with a log's signature; "" if nothing is."""
+    file = path.with_name(path.name + SUFFIX)
+    try:
+        with open_regular(file) as stream:
+            stated = msgspec.json.decode(stream.read(_MOST_BYTES), type=LogSignature)
+        signature = base64.b64decode(stated.signature, validate=True)
+    except FileNotFoundError:
+        return f"there is no signature {file}"
+    except OSError as error:
+        return f"{file} cannot be read: {error.strerror}"
+    except ValueError as error:  # of msgspec and of base64
+        return f"{file} is no signature of this program: {error}"
+    if stated.format != _FORMAT:
+        return f"{file} is of another version: {stated.format[:40]!r}"
+    try:
+        key.verify(signature, _signed_bytes(stated.chain))
+    except InvalidSignature:
+        return f"{file} was not made by the owner of this key, or was changed"
+    integrity, chain = _read_chain(path, progress)
+    if chain != stated.chain:
+        return f"what was signed is another content ({stated.chain.get('messages', '?')} messages)"
+    return "" if integrity.state is ChainState.INTACT else integrity.text
+
+
+def _signed_bytes(chain: Mapping[str, str]) -> bytes:
+    facts = json.dumps(dict(chain), sort_keys=True, separators=(",", ":"))
+    return f"{_FORMAT}\n{facts}".encode()
+
+
+def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
+    """Returns whether a file agrees with its digest chain, and the digests that it states."""
+    try:
+        with open_regular(path) as stream:
+            reader = McapReader(stream, str(path), progress, kept=False)
+            deque(reader.messages(), maxlen=0)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    integrity = reader.judge_chain()
+    if integrity.state is ChainState.INTACT and not reader.complete:
+        integrity = Integrity(ChainState.OPEN, "the end of the file is missing")
+    return integrity, reader.metadata.get(CHAIN, {})
+
+
+def _load_private_key(path: Path) -> Ed25519PrivateKey:
+    key = _load_key(path, lambda data: serialization.load_pem_private_key(data, password=None))
+    if not isinstance(key, Ed25519PrivateKey):
+        raise UsageError(f"{path}: is no private Ed25519 key; make a pair with: trilat keys pair NAME")
+    if path.stat().st_mode & 0o077:
+        raise UsageError(f"{path}: can be read by others: chmod 600 {path}")
+    return key
+
+
+def _load_public_key(path: Path) -> Ed25519PublicKey:
+    key = _load_key(path, serialization.load_pem_public_key)
+    if not isinstance(key, Ed25519PublicKey):
+        raise UsageError(f"{path}: is no public Ed25519 key; trilat keys pair NAME makes NAME.pub")
+    return key
+
+
+def _load_key(path: Path, load: Any) -> Any:
+    """Returns the key in a PEM file; None if there is none of that kind."""
+    try:
+        with open_regular(path) as stream:
+            return load(stream.read(_MOST_BYTES))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
+        return None
