@@ -239,3 +239,12 @@ def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> Non
     text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
     kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
     assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
+
+
+def test_every_test_that_the_security_page_names_is_there() -> None:
+    named = re.findall(
+        r"`(tests/[\w/]+\.py)::(test_\w+)`", (ROOT / "SECURITY.md").read_text(encoding="utf-8")
+    )
+    assert len(named) > 20
+    for file, name in named:
+        assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), (file, name)

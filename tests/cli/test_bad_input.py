@@ -198,6 +198,9 @@ def test_other_files_that_a_command_is_given_are_no_pipes_either(tmp_path: Path)
 
 ODD = ("$*", "9" * 5000, "\x1b[31m\u202e[/red]", "nan", "/dev/zero", "0x" + "f" * 5000)
 TAKING = {
+    "no name": ["log", "recover", "."],
+    "no name of a recovered log": ["log", "recover", "run.mcap", "-o", "."],
+    "no name of keys": ["keys", "pair", "."],
     "set": ["set", "--session", "{}", "link", "m1->s", "--delay", "1ms"],
     "set link": ["set", "--session", "{}", "link", "m1->s", "--to", "deviation_ms={}"],
     "set dominance": ["set", "--session", "x/y", "dominance", "s", "m1={}"],

@@ -53,6 +53,8 @@ def create_signing_keys(path: Path) -> tuple[Path, Path]:
     Raises:
         UsageError: one of them exists, or cannot be made.
     """
+    if not path.name:
+        raise UsageError(f"{path}: is no name; keys are named as in: trilat keys pair lab")
     private, public = path.with_name(f"{path.name}.key"), path.with_name(f"{path.name}.pub")
     for file in (private, public):
         refuse_existing(file, force=False)
@@ -76,7 +78,7 @@ def sign_log(path: Path, key_file: Path, *, force: bool = False, progress: Progr
         UsageError: the key is none, others can read it, or there is a signature already.
     """
     key = _load_private_key(key_file)
-    made = path.with_name(path.name + SUFFIX)
+    made = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(made, force=force)
     integrity, chain = _read_chain(path, progress)
     if integrity.state is not ChainState.INTACT:
@@ -109,7 +111,7 @@ def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress |
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
     """Returns what is wrong with a log's signature; "" if nothing is."""
-    file = path.with_name(path.name + SUFFIX)
+    file = path.with_name((path.name or "log") + SUFFIX)
     try:
         with open_regular(file) as stream:
             stated = msgspec.json.decode(stream.read(_MOST_BYTES), type=LogSignature)

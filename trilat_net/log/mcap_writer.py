@@ -48,8 +48,8 @@ class Sink(Protocol):
 
 
 def pack_text(text: str) -> bytes:
-    """Returns a text as a record holds it, after its length."""
-    data = text.encode()
+    """Returns a text as a record holds it, after its length; a name of a file may be no text."""
+    data = text.encode(errors="backslashreplace")
     return struct.pack("<I", len(data)) + data
 
 

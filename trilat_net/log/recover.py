@@ -138,7 +138,11 @@ def recover_log(
         UsageError: the output exists, or cannot be made.
         LogRefused: the disk refused; nothing was made.
     """
+    if not path.name:
+        raise LogError(f"{path}: cannot be read: Is a directory")
     made = output or recovered_path(path)
+    if not made.name:
+        raise UsageError(f"{made}: is a directory; name a file with -o")
     if made.exists() and path.exists() and made.samefile(path):
         raise UsageError(f"{made}: is the file itself, which is not touched; choose another name with -o")
     try:

@@ -116,11 +116,11 @@ def secure_connection(connection: Connection, keys: "MemberKeys | None", *, inse
             own settings contradict the keys.
     """
     own, named = connection.own, (*connection.listen, *(connection.connect or ()))
-    if udp := [place for place in _find_addresses(named) if place.startswith("udp/")]:
+    if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
     if keys is not None:
-        plain = [place for place in _find_addresses(named) if not place.startswith(ENCRYPTED)]
-        if plain := [place for place in plain if not _is_loopback(place)]:
+        plain = [place for place in find_endpoint_addresses(named) if not place.startswith(ENCRYPTED)]
+        if plain := [place for place in plain if not is_loopback(place)]:
             raise UsageError(
                 f"{plain[0]}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
             )
@@ -130,8 +130,8 @@ def secure_connection(connection: Connection, keys: "MemberKeys | None", *, inse
             raise UsageError("--zenoh-config: transport/link/tls: comes from --keys; give it in one place")
         return replace(connection, own=merge_settings(keys.settings, own), keyed=True)
     mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
-    for place in _find_addresses(connection.listen):
-        if not (insecure or _is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):
+    for place in find_endpoint_addresses(connection.listen):
+        if not (insecure or is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):
             raise UsageError(
                 f"--listen {place}: anybody on that network could take part: give --keys DIR (make them with "
                 "trilat keys new), or --insecure where you trust everybody on it"
@@ -142,7 +142,7 @@ def secure_connection(connection: Connection, keys: "MemberKeys | None", *, inse
 ENCRYPTED = ("tls/", "quic/")
 
 
-def _find_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
+def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
     """Returns the addresses of endpoints, those of Zenoh's groups of locators too."""
     addresses: list[str] = []
     for one in endpoints:
@@ -151,7 +151,7 @@ def _find_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
     return addresses
 
 
-def _is_loopback(address: str) -> bool:
+def is_loopback(address: str) -> bool:
     """True if nobody on another machine reaches an address."""
     protocol, _, rest = address.partition("/")
     host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")

@@ -79,7 +79,11 @@ def print_error(text: object) -> None:
 
 def print_check(passed: bool, text: object) -> None:
     """Prints the result of a check."""
-    mark = "[green]ok[/green]  " if passed else "[red]FAIL[/red]"
+    print_marked("[green]ok[/green]  " if passed else "[red]FAIL[/red]", text)
+
+
+def print_marked(mark: str, text: object) -> None:
+    """Prints a line behind a mark, which is of Rich's markup."""
     out.print(f"{mark} {escape(sanitize(text, _MAX_LETTERS))}", soft_wrap=True)
 
 

@@ -1,0 +1,258 @@
+"""What stands in the way of a session on this machine: keys, links, clock, rights, room; a finding each.
+
+Invariant: nothing is changed and nothing is sent but what a member sends that connects; a finding says what
+was found, and, unless it is well, what to do. The rights are those that a process of its own got.
+"""
+
+import json
+import os
+import re
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from trilat_net import process
+from trilat_net.core.jit import is_core_cached
+from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection, find_endpoint_addresses, is_loopback, secure_connection
+from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
+
+from .session_ping import PingResult, ping_session
+
+FindingState = Literal["ok", "warn", "fail"]
+ENDS_SOON = timedelta(days=7)
+CONNECT_S = 2.0
+LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
+"""Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
+STEADY_NS, STEP_NS, BOUND_NS = 100_000_000, 1_000_000, 1_000_000
+"""How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
+PINGS = 20
+
+
+class DoctorFinding(NamedTuple):
+    """One finding: what was looked at, how it is, and a sentence."""
+
+    check: str
+    state: FindingState
+    text: str
+
+
+def examine_machine(
+    connection: Connection,
+    keys: Path | None,
+    folder: Path,
+    session: str | None,
+    clock: Clock,
+    *,
+    insecure: bool,
+) -> Iterator[DoctorFinding]:
+    """Yields all findings, one after the other.
+
+    Args:
+        connection: the endpoints of a member, as given.
+        keys: the folder of its keys.
+        folder: where results go.
+        session: a session whose members are asked for their clocks, if any.
+        clock: this machine's.
+        insecure: whether it is known that everybody on the network is trusted.
+    """
+    yield from examine_keys(keys)
+    owned = _read_keys(keys)
+    yield from examine_links(connection, keys, owned, insecure=insecure)
+    yield from examine_clock(clock)
+    if session is not None:
+        safe = secure_connection(connection, owned, insecure=insecure)
+        yield from examine_offsets(safe, clock, session)
+    yield from examine_rights()
+    yield from examine_room(folder)
+
+
+def _read_keys(folder: Path | None) -> MemberKeys | None:
+    try:
+        return None if folder is None else read_member_keys(folder)
+    except UsageError:
+        return None
+
+
+def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
+    """Yields whose keys they are, until when they hold, and whether somebody else can get at them."""
+    if folder is None:
+        yield DoctorFinding("keys", "ok", "none given: without --keys a member listens on this machine alone")
+        return
+    try:
+        owned = read_member_keys(folder)
+    except UsageError as error:
+        yield DoctorFinding("keys", "fail", str(error))
+        return
+    left = owned.ends - datetime.now(UTC)
+    text = f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
+    if left < ENDS_SOON:
+        yield DoctorFinding("keys", "warn", f"{text}: soon; make new ones for all with trilat keys new")
+    else:
+        yield DoctorFinding("keys", "ok", text)
+    if folder.stat().st_mode & 0o077:
+        yield DoctorFinding("keys", "warn", f"others can look into {folder}: chmod 700 {folder}")
+    authority = folder.resolve().parent / "authority" / PRIVATE_KEY
+    if authority.exists():
+        yield DoctorFinding(
+            "keys", "warn", f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+        )
+
+
+def examine_links(
+    connection: Connection, folder: Path | None, owned: MemberKeys | None, *, insecure: bool
+) -> Iterator[DoctorFinding]:
+    """Yields whether endpoints can be listened at and reached, and whether links are encrypted."""
+    try:
+        safe = secure_connection(connection, owned, insecure=insecure)
+    except UsageError as error:
+        yield DoctorFinding("links", "fail", str(error))
+        return
+    for place in find_endpoint_addresses(safe.reach(safe.listen)):
+        yield _examine_listening(place)
+    for place in find_endpoint_addresses(safe.reach(safe.connect or ())):
+        yield _examine_reaching(place, folder if owned else None)
+    if not safe.listen and not safe.connect:
+        yield DoctorFinding("links", "ok", "no endpoints given: --listen and --connect are tried if given")
+
+
+def _examine_listening(place: str) -> DoctorFinding:
+    address = _split_address(place)
+    if address is None:
+        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP")
+    try:
+        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            probe.listen(1)
+    except OSError as error:
+        return DoctorFinding("links", "fail", f"cannot listen at {place}: {error.strerror or error}")
+    if place.startswith("tls/") or is_loopback(place):
+        return DoctorFinding("links", "ok", f"can listen at {place}")
+    return DoctorFinding("links", "warn", f"{place} would listen unencrypted, to anybody who reaches it")
+
+
+def _examine_reaching(place: str, folder: Path | None) -> DoctorFinding:
+    address = _split_address(place)
+    if address is None:
+        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP")
+    try:
+        with socket.create_connection(address, CONNECT_S) as link:
+            if not place.startswith("tls/"):
+                state: FindingState = "ok" if is_loopback(place) else "warn"
+                return DoctorFinding("links", state, f"{place} answers, unencrypted")
+            with _tls_context(folder).wrap_socket(link, server_hostname=address[0]) as safe:
+                proved = (
+                    "with a certificate of the same authority" if folder else "whose authority is unknown"
+                )
+                return DoctorFinding("links", "ok", f"{place} answers over {safe.version()}, {proved}")
+    except ssl.SSLError as error:
+        why = getattr(error, "verify_message", "") or error.reason or str(error)
+        return DoctorFinding("links", "fail", f"{place} answers, but not as a member with these keys: {why}")
+    except OSError as error:
+        return DoctorFinding("links", "fail", f"{place} cannot be reached: {error.strerror or error}")
+
+
+def _tls_context(folder: Path | None) -> ssl.SSLContext:
+    if folder is None:
+        context = ssl.create_default_context()
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        return context
+    context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
+    context.load_cert_chain(folder / CERTIFICATE, folder / PRIVATE_KEY)
+    return context
+
+
+def _split_address(place: str) -> tuple[str, int] | None:
+    """Returns host and port of an endpoint over TCP; None for another."""
+    found = re.fullmatch(r"(?:tcp|tls)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?", place)
+    return (found[1].strip("[]"), int(found[2])) if found and int(found[2]) < 1 << 16 else None
+
+
+def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
+    """Yields whether this machine's clocks are steady."""
+    begun, wall = clock.monotonic_ns(), clock.unix_ns()
+    before, backwards, coarsest_ns = begun, 0, 0
+    while before - begun < STEADY_NS:
+        now = clock.monotonic_ns()
+        backwards += now < before
+        coarsest_ns = max(coarsest_ns, now - before)
+        before = now
+    apart_ns = abs(clock.unix_ns() - wall - (clock.monotonic_ns() - begun))
+    if backwards:
+        yield DoctorFinding("clock", "fail", f"the monotonic clock went back {backwards} times in 0.1 s")
+    elif apart_ns > STEP_NS:
+        text = f"the wall clock stepped by {apart_ns / 1e6:.1f} ms in 0.1 s; that distorts no record"
+        yield DoctorFinding("clock", "warn", text)
+    else:
+        longest = f"largest pause of a loop that never sleeps {coarsest_ns / 1e6:.1f} ms"
+        yield DoctorFinding("clock", "ok", f"steady; {longest}")
+
+
+def examine_offsets(connection: Connection, clock: Clock, session: str) -> Iterator[DoctorFinding]:
+    """Yields how far the clocks of a session's members are ahead, and how well that is known."""
+    try:
+        ping = ping_session(connection, clock, session, PINGS, CONNECT_S, lambda: False)
+    except (RunFailed, SessionError, UsageError) as error:
+        yield DoctorFinding("clock", "fail", str(error))
+        return
+    for reach in ping.reached() if ping else ():
+        yield _describe_offset(reach)
+
+
+def _describe_offset(reach: PingResult) -> DoctorFinding:
+    if reach.shared:
+        return DoctorFinding("clock", "ok", f"{reach.info.member} has the same clock")
+    if reach.estimate is None:
+        return DoctorFinding("clock", "warn", f"{reach.info.member} answered too few pings")
+    estimate = reach.estimate
+    bound_ns = estimate.bound_at(estimate.at_ns, estimate.offset_ns)
+    text = f"{reach.info.member} is {estimate.offset_ns / 1e9:+.6f} s, known to {bound_ns / 1e3:.0f} us"
+    return DoctorFinding("clock", "ok" if bound_ns <= BOUND_NS else "warn", text)
+
+
+_RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
+
+
+def examine_rights() -> Iterator[DoctorFinding]:
+    """Yields which real-time settings a site would get."""
+    done = subprocess.run([sys.executable, "-c", _RIGHTS], capture_output=True, text=True, check=False)
+    if done.returncode:
+        yield DoctorFinding("rights", "warn", "could not be tried")
+        return
+    obtained: dict[str, str] = json.loads(done.stdout)
+    good = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
+    for name, start in good.items():
+        got = obtained[name].startswith(start)
+        help_ = "" if got else "; ticks will be late by milliseconds under load: see compose.realtime.yaml"
+        yield DoctorFinding(
+            "rights", "ok" if got else "warn", f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
+        )
+
+
+def examine_room(folder: Path) -> Iterator[DoctorFinding]:
+    """Yields free disk, processors and their load, and whether the core is compiled."""
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(place).free
+    state: FindingState = "fail" if free < LEAST_BYTES else "warn" if free < FEW_BYTES else "ok"
+    if not os.access(place, os.W_OK):
+        yield DoctorFinding("disk", "fail", f"{place} cannot be written to")
+    yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {place}")
+    cores = process.count_cores()
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    text = f"{cores} processors, of which {load:.1f} are busy"
+    yield DoctorFinding("processors", "warn" if cores < 2 or load >= cores else "ok", text)
+    if is_core_cached():
+        yield DoctorFinding("core", "ok", "compiled")
+    else:
+        yield DoctorFinding(
+            "core", "warn", "not yet compiled: the first session here begins half a minute later"
+        )
