@@ -28,6 +28,7 @@ from .relay import Killed, Relay, RelayClock
 
 SESSION = "t"
 RECORDER_BOOT = 77
+Sink = Callable[[str, bytes], None]
 Stranger = Callable[[Bus, RelayClock], None]
 
 
@@ -137,6 +138,24 @@ class Session:
         """Sends a site a signal at a time."""
         interrupt = self.interrupts[name]
         self.clocks[name].at(at_ns, lambda: setattr(interrupt, "number", number))
+
+    def lose(self, by: str, lost: str, from_ns: int, to_ns: int) -> None:
+        """Loses what is published under a key between two times; `by` is a site that lives then."""
+
+        def begin() -> None:
+            for member in self.network.members:
+                member._sinks = [
+                    (expression, self._filter(sink, lost, to_ns)) for expression, sink in member._sinks
+                ]
+
+        self.clocks[by].at(from_ns, begin)
+
+    def _filter(self, sink: Sink, lost: str, to_ns: int) -> Sink:
+        def take(key: str, payload: bytes) -> None:
+            if key != lost or self.relay.now_ns >= to_ns:
+                sink(key, payload)
+
+        return take
 
     def stranger(self, act: Stranger, at_ns: int = 0) -> None:
         """Adds somebody who does what `act` does."""

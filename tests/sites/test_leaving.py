@@ -180,3 +180,32 @@ def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: 
     assert len(log["s"]) == 1600
     assert log.missing("m") == log.missing("s") == 0
     assert check_log([session.path]).passed
+
+
+def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_path: Path) -> None:
+    """Its peer used it until it held: those ticks cannot be executed. What it held follows from its records."""
+    session = Session.whole(gliding(7.0), tmp_path, ends={})
+    session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
+    session.clocks["m"].dies_ns = 4 * S
+    session.site("m", at_ns=5 * S)
+    log = session.run()
+    used = log["s"].used["m"][log["s"].mode == "hold"]
+    assert not set(used.tolist()) & set(log["m"].tick.tolist())
+    result = verify(log)
+    assert (result.differing, result.gaps) == (0, [])
+    assert 0 < result.unjudged <= 3 + 4
+
+
+def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) -> None:
+    session = Session.whole(gliding(4.0), tmp_path, ends={})
+    session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    told = [(event.kind, event.about, event.t_ns) for event in log.events if "hear" in event.kind]
+    assert [kind for kind, _, _ in told] == ["unheard", "heard"]
+    assert {about for _, about, _ in told} == {"s"}
+    cut_s = 3.0 - log.events[0].epoch_mono_ns / S if log.events[0].epoch_mono_ns else 0.0
+    assert 0.2 <= told[0][2] / S - cut_s <= 0.4
+    assert "hold" in log["s"].mode
+    assert "hold" not in log["m"].mode
+    assert verify(log).passed

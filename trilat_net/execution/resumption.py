@@ -23,6 +23,9 @@ _LOOK_BACK = 100
 
 Change = TypeVar("Change")
 
+APART_MODES = ("hold", "waiting", "fault", "stopped")
+"""Modes of the rule `glide` in which what peers sent does not enter the reference."""
+
 ArrivalEntry = Sequence[int]
 """As in a record's `rx`: index of the peer, tick of its sample, us."""
 
@@ -129,12 +132,18 @@ class RecordedInputs(Generic[Change]):
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
-    def can_resume(self, n: int) -> bool:
-        """True if the two records before record n are consecutive and the samples in use are known."""
+    def can_resume(self, n: int, *, apart: bool = False) -> bool:
+        """True if the two records before record n are consecutive and the samples in use are known.
+
+        Those that are not known do not matter to a site that holds, `apart` from its peers, by a reference of
+        its own.
+        """
         states = self._part.states
         if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
             return False
         in_use = read_output(states[n - 1], self._part.peers).used
+        if apart and states[n - 1].mode in APART_MODES:
+            return True
         return all(used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True))
 
     def resume(self, site: Site, n: int) -> None:
@@ -145,9 +154,13 @@ class RecordedInputs(Generic[Change]):
         waiting: list[Arrival] = []
         for j, used in enumerate(last.used):
             sample = self.samples[j].get(used)
+            if sample is None and used >= 0:  # see `can_resume`
+                unknown = (0.0,) * len(last.q_des)
+                sample = Arrival(j, used, unknown, unknown)
+                self.lacking[j].add(used)
             in_use += [None] if sample is None else take_parts([make_arrival(j, used, sample)], self._links)
             # a sample older than the one in use is never used any more
-            self.lacking[j] = {tick for tick in self.lacking[j] if tick > used}
+            self.lacking[j] = {tick for tick in self.lacking[j] if tick >= used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))
             arrived, missing = self.arrivals([(j, tick, 0) for tick in sorted(certain | self.assumed[j])])
             self.add_lacking(missing)

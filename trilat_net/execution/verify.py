@@ -18,6 +18,7 @@ import msgspec
 
 from .. import process
 from ..core.fingerprint import compute_fingerprint
+from ..core.site_setup import StaleAction
 from ..core.site_step import MAX_RAMPS, Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
@@ -157,6 +158,8 @@ class SiteVerifier:
         self._site, self._channel = Site(setup), setup.channel
         self._starts = {boot: first for first, boot in starts}
         self._absences = {last + 1: first for first, last in absences}
+        reflects = setup.own is not None or any(setup.gains.k_f)
+        self._apart = setup.on_stale.action is StaleAction.GLIDE and not reflects
         self._boot: int | None = None
         self._began = 0  # the place of the first record of this start
         self._scenario, self._log, self._result = scenario, site_log, result
@@ -187,7 +190,7 @@ class SiteVerifier:
             expected = state.tick + 1
             try:
                 resumes = not self._certain and not self._law_failed and n - 2 >= self._began
-                if resumes and self._inputs.can_resume(n):
+                if resumes and self._inputs.can_resume(n, apart=self._apart):
                     for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
                         self._site.order(change, state.t_ns)
                     self._inputs.resume(self._site, n)
