@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trilat_net.analysis.certificate.stability_certificate import StabilityFinding, certify
+from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
@@ -183,7 +185,7 @@ def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: 
 
 
 def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_path: Path) -> None:
-    """Its peer used it until it held: those ticks cannot be executed. What it held follows from its records."""
+    """Its peer used it until it held: those ticks cannot be executed. What it held is in its records."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
     session.clocks["m"].dies_ns = 4 * S
@@ -209,3 +211,22 @@ def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) 
     assert "hold" in log["s"].mode
     assert "hold" not in log["m"].mode
     assert verify(log).passed
+
+
+def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_path: Path) -> None:
+    session = Session.whole(gliding(7.0, "paper"), tmp_path, ends={})
+    session.clocks["m1"].dies_ns = 4 * S
+    session.site("m1", at_ns=5 * S)
+    log = session.run()
+    found = certify(log)
+    premises = {premise.name: premise for premise in found.premises}
+    assert premises["presence"].holds is False
+    (first, last), rate_hz = log.absences["m1"][0], 200
+    assert f"m1 {first / rate_hz:.4g} to {(last + 1) / rate_hz:.4g} s" in premises["presence"].text
+    assert premises["presence"].text.count("all follow from") == 2
+    assert premises["presence"].text.count("delays are constant") == 2
+    assert premises["records"].holds
+    assert found.evidence.functional_share == 1.0
+    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
+    link = next(one for one in summarise_links(log) if (one.peer, one.site) == ("m1", "s"))
+    assert link.loss == 0.0

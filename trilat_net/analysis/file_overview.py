@@ -27,6 +27,10 @@ MOST_LISTED_GAPS = 1000
 """Gaps of a channel that are named."""
 
 
+Absences = Mapping[str, Sequence[tuple[int, int]]]
+"""Per site the ticks that it did not make, as (first, last)."""
+
+
 class FileInventory:
     """Content of a file, or of the files of one log; `progress` gets the bytes read and those in all.
 
@@ -85,12 +89,16 @@ class FileInventory:
             }
         )
 
-    def channels(self, session: str = "", rates_hz: Mapping[str, int] | None = None) -> dict[str, JsonObject]:
+    def channels(
+        self, session: str = "", rates_hz: Mapping[str, int] | None = None, absences: Absences | None = None
+    ) -> dict[str, JsonObject]:
         """Returns the facts of every channel by topic; gaps of those of a session's sites."""
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
-        return {topic: self._channel(topic, session, rates_hz or {}) for topic in names}
+        return {topic: self._channel(topic, session, rates_hz or {}, absences or {}) for topic in names}
 
-    def _channel(self, topic: str, session: str, rates_hz: Mapping[str, int]) -> JsonObject:
+    def _channel(
+        self, topic: str, session: str, rates_hz: Mapping[str, int], absences: Absences
+    ) -> JsonObject:
         about = self._about.get(topic, ChannelInfo(topic, "", "", "", {}))
         log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came.get(topic, _NOTHING))
         first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
@@ -105,11 +113,13 @@ class FileInventory:
             "between_ms": percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6),
             "encoding": about.encoding,
             "schema": about.schema,
-            **_numbers(topic, sequence, session, rates_hz),
+            **_numbers(topic, sequence, session, rates_hz, absences),
         }
 
 
-def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int]) -> JsonObject:
+def _numbers(
+    topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int], absences: Absences
+) -> JsonObject:
     """Returns the gaps of a channel with consecutive numbers; else None for each."""
     where = topics.parse_key(topic.removeprefix("/"))
     of_a_site = where is not None and where.session == session and where.member in rates_hz
@@ -117,12 +127,14 @@ def _numbers(topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int
         return {"missing": None, "gaps": None, "duplicates": None}
     every = ticks_per_stats(rates_hz[where.member]) if where.channel == topics.LINK else 1
     came = sequence.astype(np.int64) // every
-    there = np.unique(came)
+    there, duplicates = np.unique(came), len(came) - len(np.unique(came))
+    for first, last in absences.get(where.member, ()):  # not made: they are not missing
+        there = np.union1d(there, np.arange(-(-first // every), -(-(last + 1) // every)))
     steps = np.diff(there, prepend=-1)
     before = np.flatnonzero(steps > 1)[:MOST_LISTED_GAPS]
     gaps = [[int(there[n] - steps[n] + 1), int(there[n] - 1)] for n in before]
     missing = int(there[-1]) + 1 - len(there) if len(there) else 0
-    return {"missing": missing, "gaps": gaps, "duplicates": len(came) - len(there)}
+    return {"missing": missing, "gaps": gaps, "duplicates": duplicates}
 
 
 def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
@@ -140,7 +152,7 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
     inventory = FileInventory(paths, report(0))
     facts: JsonObject = {"files": inventory.files, "kind": "mcap", "problem": None, "session": None}
     facts |= {"sites": {}, "links": {}}
-    name, rates_hz = "", {}
+    name, rates_hz, absences = "", {}, {}
     if SESSION in inventory.metadata:
         try:
             log = open_log(*paths, progress=report(1))
@@ -154,9 +166,9 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
                     for peer in log[site].peers
                 },
             }
-            name = log.session["session"]
+            name, absences = log.session["session"], log.absences
             rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
         except LogError as error:
             facts["problem"] = str(error)
-    facts["channels"] = inventory.channels(name, rates_hz)
+    facts["channels"] = inventory.channels(name, rates_hz, absences)
     return facts

@@ -163,6 +163,8 @@ def _summarise_link(
     fate = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
     known = mark_judged_samples(log, site, fate.stamp_ns, came.first)
+    for first, last in log.absences.get(peer, ()):
+        known[first : last + 1] = False  # the peer made none of these
     gone = np.ones(len(known), dtype=np.bool_)  # judged samples that could not come into use
     gone[came.first.sample] = False
     gone = (gone | fate.lost) & known

@@ -399,6 +399,8 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
             yield f"{name}: {effect.stands} records stand as they are: too little is known to execute them"
         if effect.assumed:
             yield f"{name}: {effect.assumed} ticks have no record in the log: their arrivals are assumed"
+        if away := again.before.absent_ticks(name):
+            yield f"{name}: {away} of them it did not make: it was away, and is executed as if it were not"
         if effect.lacking:
             yield f"{name}: {effect.lacking} samples that arrived are not in the log: executed without them"
         if not effect.executed:

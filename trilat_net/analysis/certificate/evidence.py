@@ -13,6 +13,7 @@ from ...log.digest_chain import Integrity
 from ...log.integrity import judge_integrity
 from ...log.log_reader import Log
 from .energy_balance import EnergyBalance
+from .premises import find_unjudged_spans, was_away
 
 
 class Evidence(NamedTuple):
@@ -20,7 +21,8 @@ class Evidence(NamedTuple):
 
     Attributes:
         coverage: ticks of every site that have a record, and those of the run.
-        functional_share: share of the periods of V that rest on records; None without V.
+        functional_share: share of the periods of V that rest on records, while no site was away; None
+            without V.
         min_coverage: the least share of either that passes.
         integrity: whether the log is as it was made.
         unmet: sites of an open-loop rerun that met samples which are not in the file.
@@ -63,8 +65,17 @@ class Evidence(NamedTuple):
 
 def collect_evidence(log: Log, balance: EnergyBalance | None, min_coverage: float) -> Evidence:
     """Returns what a certificate of a log rests on, with the energy balance that it found."""
-    share = None if balance is None else float(balance.judged.mean())
+    share = None if balance is None else _share_judged(log, balance)
     unmet = tuple(site for site in log.sites if site not in log.executed_sites)
     there = {site: len(np.unique(log[site].tick)) for site in log.sites}
     coverage = Coverage(there, {site: log.expected_ticks(site) for site in log.sites})
     return Evidence(coverage, share, min_coverage, judge_integrity(log), unmet)
+
+
+def _share_judged(log: Log, balance: EnergyBalance) -> float:
+    """Returns the share of periods of V that rest on records, of those in which no site was away."""
+    asked = np.ones(len(balance.judged), dtype=np.bool_)
+    for from_s, to_s in find_unjudged_spans(balance):
+        if was_away(log, (from_s, to_s)):
+            asked &= (balance.t_s[:-1] < from_s) | (balance.t_s[:-1] >= to_s)
+    return float(balance.judged[asked].mean()) if asked.any() else 0.0

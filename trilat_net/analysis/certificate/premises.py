@@ -17,7 +17,7 @@ from ...scenario import Scenario
 from ..aligned import Bools
 from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
-from ..timeline import find_mode_intervals
+from ..timeline import find_mode_intervals, recorded_end_s
 from .energy_balance import ZERO_ENERGY_J, EnergyBalance, SiteEnergy
 from .energy_terms import SiteConstants, derive_site_constants, explain_missing_functional
 
@@ -27,6 +27,8 @@ MIN_FREE_S = 1.0
 """The least free motion at the end of a run of which the theorem speaks, s; and so many times the largest age
 of a sample in use:"""
 MIN_FREE_AGES = 5.0
+LEAST_ABSENCE_S = 0.1
+"""Sites end within that time of each other; a stretch that is shorter is none."""
 LEAST_SPEED_M_S = 1e-9
 """What rounding may leave of the speed along an axis along which an end effector cannot move."""
 MAX_LISTED_NAMES = 4
@@ -70,7 +72,8 @@ def check_run_premises(log: Log, energies: Mapping[str, SiteEnergy], balance: En
         *_check_axes(energies),
         *_check_singular_poses(energies),
         _check_operators(energies, balance),
-        _check_records(balance),
+        _check_records(log, balance),
+        *_check_presence(log, energies),
     ]
 
 
@@ -268,11 +271,72 @@ def _least_free_motion_s(energies: Mapping[str, SiteEnergy]) -> float:
     return max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s, default=0.0))
 
 
-def _check_records(balance: EnergyBalance) -> Premise:
-    if balance.judged.all():
-        return Premise("records", True, "every period of every site rests on records")
-    lost = [f"{a:.4g} to {b:.4g} s" for a, b in find_unjudged_spans(balance)]
+def _check_records(log: Log, balance: EnergyBalance) -> Premise:
+    spans = [span for span in find_unjudged_spans(balance) if not was_away(log, span)]
+    if not spans:
+        where = "" if balance.judged.all() else " while all sites were there"
+        return Premise("records", True, f"every period of every site rests on records{where}")
+    lost = [f"{a:.4g} to {b:.4g} s" for a, b in spans]
     return Premise("records", None, f"not judged: {_list(lost)}: records are missing there")
+
+
+def find_absent_spans(log: Log) -> list[tuple[str, float, float]]:
+    """Returns when sites were away from the session, in order: name, from, to, s."""
+    end_s = recorded_end_s(log)
+    found = []
+    for site in log.sites:
+        part = log[site]
+        found += [(site, a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())]
+        left_s = (part.last_tick + 1) / part.rate_hz
+        kinds = {event.kind for event in log.events if event.about == site}
+        if left_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
+            found.append((site, left_s, end_s))
+    return sorted(found, key=lambda one: one[1:])
+
+
+def was_away(log: Log, span: tuple[float, float]) -> bool:
+    """True if a site was away in a part of a span, s."""
+    return any(from_s < span[1] and span[0] < to_s for _, from_s, to_s in find_absent_spans(log))
+
+
+def _check_presence(log: Log, energies: Mapping[str, SiteEnergy]) -> list[Premise]:
+    """All sites are there all the time; [] if they are. Else what the stretches are by themselves."""
+    away = find_absent_spans(log)
+    if not away:
+        return []
+    begin_s = max(energy.begin_s for energy in energies.values())
+    edges = [(begin_s, begin_s), *((a, b) for _, a, b in away), (recorded_end_s(log),) * 2]
+    stretches = []
+    after_s = begin_s
+    for from_s, to_s in edges:
+        if from_s - after_s > LEAST_ABSENCE_S:
+            stretches.append(_describe_stretch(energies, after_s, from_s))
+        after_s = max(after_s, to_s)
+    who = _list([f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in away])
+    text = f"away: {who}, of which the theorem says nothing; by themselves: {'; '.join(stretches)}"
+    return [Premise("presence", False, text)]
+
+
+def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
+    """Returns from when on all sites follow in a stretch of time, and if the delays are constant then."""
+    follow_s, varying = from_s, []
+    for energy in energies.values():
+        records = energy.motion.records
+        apart = records.known & ~records.follows & (records.t_s >= from_s) & (records.t_s < to_s)
+        if apart.any():
+            follow_s = max(follow_s, float(records.t_s[np.flatnonzero(apart)[-1]]) + records.h_s)
+    stretch = f"{from_s:.4g} to {to_s:.4g} s"
+    if to_s - follow_s < LEAST_ABSENCE_S:
+        return f"{stretch} not all follow"
+    for site, energy in energies.items():
+        records = energy.motion.records
+        inside = records.known & (records.t_s >= follow_s) & (records.t_s < to_s)
+        for peer, view in energy.motion.peers.items():
+            age_s = (records.t_s - view.stamp_s)[inside & np.isfinite(view.stamp_s)]
+            if peer in energy.followed and len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
+                varying.append(f"{peer}->{site}")
+    delays = f"ages vary ({_list(varying)})" if varying else "delays are constant"
+    return f"{stretch} all follow from {follow_s:.4g} s on, {delays}"
 
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
