@@ -17,6 +17,11 @@ from trilat_net.net.membership import read_events, read_messages
 from trilat_net.net.messages import LinkStats
 from trilat_net.scenario import Scenario
 
+LOUD_EVENTS = frozenset(
+    ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
+)
+"""Kinds of events that a person who watches should read."""
+
 
 class SessionMonitor:
     """The latest statistics of every site of a session, and event texts for the user, not yet taken."""
@@ -34,7 +39,7 @@ class SessionMonitor:
             if stats.site in self._sites:
                 self.latest[stats.site] = stats
         for event in read_events(self._events):
-            if event.kind in ("lost", "diverged", "failed", "refused", "clock fault"):
+            if event.kind in LOUD_EVENTS:
                 self.news.append(event.text)
 
     def take_news(self) -> Sequence[str]:

@@ -91,7 +91,7 @@ function take(frame) {
   $("counts").textContent = `${pages} · loops late by at most ${late} µs · ${missing} records missing${refused}`;
 }
 
-const LOUD = ["lost", "diverged", "failed", "refused", "clock fault"];
+const LOUD = ["lost", "left", "unheard", "diverged", "failed", "refused", "clock fault"];
 function describe({ link, dominance, to, at_s: at }) {
   const shares = () => Object.entries(to).map(([peer, share]) => `${peer} ${share.toFixed(2)}`).join(" + ");
   const what = link ? `${link.replace("->", " → ")}: ${describeLink(to)}` : `${dominance} follows ${shares()}`;

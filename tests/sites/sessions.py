@@ -54,6 +54,8 @@ class Session:
     """When a member left, and when the log was whole ("log")."""
     options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Further options of sites, by name."""
+    told: list[tuple[str, object]] = field(default_factory=list)
+    """What each start of a site came to, in order."""
     ends: dict[str, object] | None = None
     """What each site came to, its exit code or its error; None where an error fails the test."""
 
@@ -79,6 +81,7 @@ class Session:
                 if self.ends is None:
                     raise
                 end = failed
+            self.told.append((name, end))
             if self.ends is not None:
                 self.ends[name] = end
             return end
@@ -109,7 +112,9 @@ class Session:
     def _own(self, name: str, clock: RelayClock) -> Clock:
         return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
 
-    def recorder(self, stopped: Callable[[], bool] = lambda: False, at_ns: int = 0) -> None:
+    def recorder(
+        self, stopped: Callable[[], bool] = lambda: False, at_ns: int = 0, boot: int = RECORDER_BOOT
+    ) -> None:
         """Adds the recorder."""
 
         def run(clock: RelayClock) -> Sequence[str]:
@@ -117,7 +122,7 @@ class Session:
             try:
                 own = self._own("recorder", clock)
                 recorder = Recorder(
-                    *(bus, own, SESSION, RECORDER_BOOT, self.storage or LogStorage(self.path)),
+                    *(bus, own, SESSION, boot, self.storage or LogStorage(self.path)),
                     stopped,
                     self.said.append,
                 )
@@ -149,6 +154,13 @@ class Session:
                 ]
 
         self.clocks[by].at(from_ns, begin)
+
+    def lose_token(self, name: str) -> None:
+        """Lets the liveliness token of a site disappear, which lives on."""
+        for member in self.network.members:
+            for token in [one for one in member._tokens if f"/{name}/alive/" in one]:
+                member._tokens.remove(token)
+                member._notify(token, False)
 
     def _filter(self, sink: Sink, lost: str, to_ns: int) -> Sink:
         def take(key: str, payload: bytes) -> None:

@@ -11,7 +11,8 @@ from trilat_net.analysis.link_summary import summarise_links
 from trilat_net.errors import PeerLeft, SessionError
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
-from trilat_net.log.log_reader import Log
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -230,3 +231,57 @@ def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_pa
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     link = next(one for one in summarise_links(log) if (one.peer, one.site) == ("m1", "s"))
     assert link.loss == 0.0
+
+
+def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(tmp_path: Path) -> None:
+    session = Session.whole(gliding(7.0), tmp_path, ends={})
+    session.clocks["m"].dies_ns = 3 * S
+    session.site("m", at_ns=4 * S)
+    session.clocks["m"].dies_ns = 4 * S + 300_000_000  # it is admitted, and has said `coming` alone
+    session.site("m", at_ns=5 * S)
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    admitted = [event for event in log.events if event.kind == "admit"]
+    assert len({event.boots["m"] for event in admitted}) == 2
+    assert [last + 1 for _, last in log.absences["m"]] == [log.starts["m"][-1][0]]
+    assert verify(log).passed
+    assert check_log([session.path]).passed
+
+
+def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: Path) -> None:
+    """Its token went, as that of a process that is stopped for longer than its lease does."""
+    session = Session.whole(gliding(8.0), tmp_path, ends={})
+    session.clocks["m"].stall(3 * S, 3 * S)
+    session.clocks["s"].at(3 * S + 500_000_000, lambda: session.lose_token("m"))
+    session.site("m", at_ns=4 * S)
+    log = session.run()
+    assert len(log.starts["m"]) == 1
+    frozen, _, again = (end for _, end in session.told)
+    assert "another start of m has taken its place" in str(frozen)
+    assert again == 0
+    assert log["m"].mode[-1] == "run"
+    assert verify(log).differing == 0
+
+
+def test_recorders_that_follow_each_other_agree_on_what_was_not_made(tmp_path: Path) -> None:
+    """The first one is gone before a site comes back, the second begins while it is away."""
+    stops_ns = 3 * S + 500_000_000
+    session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
+    session.recorder(lambda: session.relay.now_ns >= stops_ns)
+    for name in ("m", "s"):
+        session.site(name)
+    session.clocks["m"].dies_ns = 3 * S
+    session.site("m", at_ns=5 * S)
+    session.storage = LogStorage(session.path, carry_on=True)
+    session.recorder(at_ns=4 * S, boot=78)
+    session.play()
+    parts = sorted(tmp_path.glob("run*.mcap"))
+    log = open_log(*parts)
+    ((first, _),) = log.starts["m"]
+    (absence,) = log.absences["m"]
+    assert absence[1] == first - 1
+    assert 0 < absence[0] < first - 200
+    assert log.missing("m") == log.missing("s") == 0
+    assert "missing 0" in log.account("m")
+    assert verify(log).passed
+    assert check_log(parts).passed

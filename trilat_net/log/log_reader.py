@@ -236,15 +236,19 @@ class Log:
 
         They begin after those of which there are records, or that the start before stated at its end.
         """
-        return {site: list(self._find_absences(site, starts)) for site, starts in self.starts.items()}
+        return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
-    def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
         ends = [event.ticks - 1 for event in self.events if event.kind == "end" and event.member == site]
         made = np.array([*self[site].tick.tolist(), *ends], dtype=np.int64)
+        found: list[tuple[int, int]] = []
         for first, _ in starts:
-            before = int(made[made < first].max(initial=-1)) + 1
-            if before < first:
-                yield before, first - 1
+            begin = int(made[made < first].max(initial=-1)) + 1
+            if found and begin == found[-1][0]:  # the start in between made no tick
+                found.pop()
+            if begin < first:
+                found.append((begin, first - 1))
+        return found
 
     def absent_ticks(self, site: str) -> int:
         """Returns how many ticks that is for a site."""

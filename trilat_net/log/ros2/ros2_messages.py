@@ -67,6 +67,8 @@ _LEVELS = {
     "diverged": RosLogLevel.ERROR,
     "failed": RosLogLevel.ERROR,
     "lost": RosLogLevel.WARN,
+    "left": RosLogLevel.WARN,
+    "unheard": RosLogLevel.WARN,
     "refused": RosLogLevel.WARN,
     "clock fault": RosLogLevel.WARN,
 }
