@@ -41,5 +41,7 @@ ENV PATH=/opt/trilat/bin:$PATH \
     HOME=/tmp \
     XDG_CACHE_HOME=/tmp/cache \
     COLUMNS=120
+# A new volume takes over the rights of its folder: whoever makes the keys may write there.
+RUN install -d -m 1777 /keys/recorder /keys/m1 /keys/m2 /keys/s
 USER 10001:10001
 ENTRYPOINT ["python", "-I", "/opt/trilat/entry.py", "trilat"]

@@ -19,6 +19,7 @@ from . import (
     replay,
     stalls,
     tick,
+    tls,
     virtual,
     writer,
 )
@@ -40,6 +41,7 @@ LONG = {
     "reading": reading.run,
     "replay": replay.run,
     "stalls": stalls.run,
+    "tls": tls.run,
     "endurance": endurance.run,
     "live": live.run,
     "page": page.run,

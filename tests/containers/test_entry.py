@@ -2,9 +2,12 @@
 
 import os
 import runpy
-from collections.abc import Sequence
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -138,3 +141,71 @@ def test_it_becomes_the_command(tmp_path: Path, mark: Path, monkeypatch: pytest.
     entry.main(["trilat", "sim", "-o", "x.mcap"])
     assert became == [["trilat", "record", "--session", "x"], ["trilat", "sim", "-o", "x.mcap"]]
     assert results.is_dir()
+
+
+PROGRAM = """#!/usr/bin/env python3
+import json, os, sys
+folder, members = sys.argv[3], [word for word in sys.argv[4:] if word != "--host"]
+for name in {*members, "authority"}:
+    os.makedirs(os.path.join(folder, name), 0o700)
+    for file in ("members.json", "private.key"):
+        with open(os.path.join(folder, name, file), "w") as sink:
+            sink.write(f"{name} by {os.getuid()}")
+"""
+"""Stands for `trilat keys new DIR MEMBER...`."""
+
+
+@pytest.fixture
+def volumes() -> Iterator[Path]:
+    """The members' volumes, where any user may look: that of the program, too."""
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        place.chmod(0o755)
+        for folder in ("keys/recorder", "keys/m1", "keys/s", "scratch"):
+            (place / folder).mkdir(parents=True)
+            (place / folder).chmod(0o1777)
+        (place / "program").write_text(PROGRAM)
+        (place / "program").chmod(0o755)
+        yield place / "keys"
+
+
+def hand_out(volumes: Path, user: Any) -> None:
+    entry.hand_out_keys(volumes, str(volumes.with_name("program")), user, volumes.with_name("scratch"))
+
+
+@needs_root
+def test_every_member_gets_its_own_keys_and_the_authority_is_gone(volumes: Path) -> None:
+    hand_out(volumes, SOMEBODY)
+    for name, whose in (("recorder", SOMEBODY), ("m1", Owner(entry.SITES, entry.SITES))):
+        for file in ("members.json", "private.key"):
+            assert owner(volumes / name / file) == whose
+            assert (volumes / name / file).stat().st_mode & 0o777 == 0o600
+            assert (volumes / name / file).read_text() == f"{name} by {SOMEBODY.user}"  # not by root
+    assert list(volumes.with_name("scratch").iterdir()) == []
+    assert entry.are_fresh(volumes / "s")
+
+
+@needs_root
+def test_keys_that_hold_are_kept_and_old_ones_made_anew(volumes: Path) -> None:
+    def made_by(user: int) -> set[str]:
+        hand_out(volumes, Owner(user, user))
+        return {(volumes / name / "private.key").read_text().split()[-1] for name in ("recorder", "m1", "s")}
+
+    assert made_by(4321) == {"4321"}
+    assert made_by(4322) == {"4321"}
+    os.utime(volumes / "s" / entry.MARK, (0, 0))
+    assert not entry.are_fresh(volumes / "s")
+    assert made_by(4323) == {"4323"}
+
+
+def test_a_site_waits_for_its_keys_and_says_so_if_there_are_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter(range(0, 1000, 10))
+    waits = SimpleNamespace(monotonic=lambda: next(clock), time=time.time, sleep=lambda _: None)
+    monkeypatch.setitem(entry.await_keys.__globals__, "time", waits)
+    with pytest.raises(SystemExit):
+        entry.await_keys(tmp_path)
+    assert "no keys in" in capsys.readouterr().err
+    (tmp_path / entry.MARK).touch()
+    entry.await_keys(tmp_path)
