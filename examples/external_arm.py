@@ -3,17 +3,18 @@
 It stands in for an arm of any scenario: a tenth heavier than the scenario's and with friction, which no model
 of the session knows, and somebody leans on its first joint. Three terminals:
 
-    trilat site m --scenario two_sites --set sites.s.plant=external --set sites.s.arm.known=false
-    trilat site s --scenario two_sites --set sites.s.plant=external --set sites.s.arm.known=false
+    trilat site m --scenario examples/external_arm.toml
+    trilat site s --scenario examples/external_arm.toml
     python examples/external_arm.py s --connect tcp/127.0.0.1:PORT    # the place that site s names
 
-`--scenario seven_joints` makes it an arm of seven joints; `--sensor` sends the torque that it measures. A
-fourth one with `trilat record --session two_sites` makes a log, which `trilat verify` executes again.
+`--scenario` takes another one, as of arms of seven joints; `--sensor` sends the torque that it measures. A
+fourth one with `trilat record --session external_arm` makes a log, which `trilat verify` executes again.
 """
 
 import argparse
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from trilat_net.net.arm_port import ArmPort
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.arms import build_arm
 
+SCENARIO = Path(__file__).with_suffix(".toml")
 PERIOD_S = 0.001
 HEAVIER = 1.1
 VISCOUS, COULOMB = 0.1, 0.2  # N m s/rad and N m per kg m^2 of a joint's inertia at the start
@@ -71,7 +73,7 @@ def main() -> None:
     """Drives the robot until the site's run is over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("site", help="whose arm this is")
-    parser.add_argument("--scenario", default="two_sites", help="of the session, for the arm's joints")
+    parser.add_argument("--scenario", default=SCENARIO, help="of the session, for the arm's joints")
     parser.add_argument("--session", help="its name, if it is not the scenario's")
     parser.add_argument("--connect", required=True, help="where that site listens")
     parser.add_argument("--sensor", action="store_true", help="send the torque that the joints measure")

@@ -145,6 +145,8 @@ class GapRepair:
             account.give_up(past.first)
         useful = False
         for number, payload in enumerate(past.payloads, past.first):
+            if not payload:  # the site never made it, and a record says so
+                continue
             try:
                 message = self._reception.read(channel, payload)
                 if message.number != number:

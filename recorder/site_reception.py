@@ -8,13 +8,14 @@ scenario has ticks; of events a log takes so many bytes, and the first word of a
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account, count_messages, number_message
+from trilat_net.log.accounting import Account, count_messages, number_message, skipped_numbers
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.run_changes import count_skipped_ticks
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
 _MANY = 1 << 40
@@ -137,7 +138,11 @@ class SiteReception:
         self.accounts[channel].expect(min(made, self._most[channel]))
 
     def _imply(self, content: State | LinkStats | Event) -> None:
-        """Counts the messages that must exist because this one does."""
+        """Counts the messages that must exist because this one does, and those that never did."""
+        if isinstance(content, State) and (skipped := count_skipped_ticks(content.cmd)):
+            for channel in (topics.STATE, topics.LINK):
+                left_out = skipped_numbers(channel, content.tick, skipped, self._rate_hz)
+                self.accounts[channel].begin_anew(*left_out)
         if isinstance(content, LinkStats):
             self.expect(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "join":

@@ -7,10 +7,10 @@ jumps; the record has the ramp that holds.
 """
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS
-from trilat_net.core.ticks import CoreChange, first_tick_at, tick_ns
+from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net.bus import QueryInbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest
@@ -23,6 +23,8 @@ from trilat_net.scenario import (
     scheduled_link_tables,
     to_core_change,
 )
+from trilat_net.scenario.run_changes import make_site_order
+from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100
 MIN_RAMP_S = 0.5
@@ -31,16 +33,22 @@ MARKS_WAITING = 16
 """Marks between two events of a site, which are a tenth of a second apart."""
 
 
+_NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
+"""Orders that have no effect in other modes."""
+
+
 class ChangeServer:
-    """The change requests to one site.
+    """The change requests to one site, whose mode after the last tick `mode` returns.
 
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
         marks: moments that somebody marked and that no event names yet: ticks, and texts.
     """
 
-    def __init__(self, scenario: Scenario, site: str, queries: QueryInbox) -> None:
-        self._scenario, self._site, self._queries = scenario, site, queries
+    def __init__(
+        self, scenario: Scenario, site: str, queries: QueryInbox, mode: Callable[[], Mode] = lambda: Mode.RUN
+    ) -> None:
+        self._scenario, self._site, self._queries, self._mode = scenario, site, queries, mode
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
         self._links = initial_link_tables(scenario)
@@ -67,6 +75,10 @@ class ChangeServer:
                     reply = self._stop(k, request.stop_s)
                 elif request.mark:
                     reply = self._mark(k, request.mark)
+                elif request.order:
+                    changes.append(self._order(k, request.order))
+                    text = f"{self._site}: {request.order} at tick {k}"
+                    reply = ChangeReply(member=self._site, accepted=True, text=text, tick=k)
                 else:
                     changes.append(self._resolve(request, first))
                     text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
@@ -83,6 +95,15 @@ class ChangeServer:
         self.marks.append((k, text))
         text = f"{self._site} marks tick {k}"
         return ChangeReply(member=self._site, accepted=True, text=text, tick=k)
+
+    def _order(self, k: int, order: SiteOrder) -> CoreChange:
+        """Returns an order to the site; refuses one that would have no effect."""
+        mode, needed = self._mode(), _NEEDED_MODES.get(order)
+        if needed is not None and mode is not needed:
+            doing = mode.name.lower()
+            raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {needed.name.lower()}")
+        change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
+        return to_core_change(self._scenario, change)
 
     def _stop(self, k: int, stop_s: float) -> ChangeReply:
         asked = first_tick_at(round(stop_s * 1e9), self._rate_hz)

@@ -22,6 +22,7 @@ from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.validate import check_outside_arms
 
 from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
@@ -93,7 +94,12 @@ yields returns true once the session is to end."""
 def run_demo(
     scenario: Scenario, folder: Path, display: SessionDisplay, attend: SessionAttendant | None = None
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder; its log is valid whenever the session began."""
+    """Runs a session of all sites and a recorder; its log is valid whenever the session began.
+
+    Raises:
+        ScenarioError: an arm outside of the program lacks limits.
+    """
+    check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
     session, clock = demo_session_name(scenario), SystemClock()
     with Interrupt() as interrupt, ExitStack() as reserved:

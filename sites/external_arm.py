@@ -1,24 +1,30 @@
 """Measurements of an external arm (`plant = "external"`), as its site receives them.
 
 Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The newest
-measurement counts; a site does not begin without one, and stops when none arrive any more.
+measurement counts; a site does not begin without one, holds when none arrive for a moment, and is in fault
+when none arrive any more. One that the arm cannot have made since the last is dropped, and is none.
 """
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import PlantState
-from trilat_net.errors import RunFailed, SessionError, WireError
+from trilat_net.core.ticks import Mode, PlantState
+from trilat_net.errors import SessionError, WireError
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
 from trilat_net.net.requests import ArmMeasurement
 from trilat_net.net.wire import decode
+from trilat_net.scenario.scenario_types import SiteOrder
 
 MEASUREMENTS_KEPT = 64
 """Capacity of the inbox: older measurements are useless."""
-SILENCE_LIMIT_NS = 500_000_000
-"""A longer silence ends the run."""
+HELD_SILENCE_NS = 30_000_000
+"""After a longer silence the site holds."""
+SILENCE_LIMIT_NS = 200_000_000
+"""After a longer one it is in fault."""
+STEP_MARGIN_RAD = 0.02
+"""An angle may be so much farther from the last one than the arm's limit of speed lets it go."""
 START_POSE_TOLERANCE_RAD = 0.01
 """A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000
@@ -40,6 +46,9 @@ class ExternalArm:
         self.newest: PlantState | None = None
         self.taken = 0
         self._site, self._layout, self._ring, self._dropped = site.name, site.layout, ring, dropped
+        self._speed_limits = site.speed_limits
+        self._taken_ns = 0
+        self._told = ""
         self._clock, self._place = clock, place
         self._boot = self._n = -1
         self._bound = self._counting = False
@@ -97,12 +106,16 @@ class ExternalArm:
         self._silent_ns = 0 if self.taken > before else self._silent_ns + passed_ns
         self._polled_ns = now_ns
 
-    @property
-    def failure(self) -> RunFailed | None:
-        """The error of an arm that has been silent for too long, else None."""
-        if self._silent_ns <= SILENCE_LIMIT_NS:
-            return None
-        return RunFailed(f"the arm of {self._site} was silent for {SILENCE_LIMIT_NS * 1e-9:g} s")
+    def take_order(self, mode: Mode) -> SiteOrder:
+        """Returns what its arm's silence asks of the site, which is in some mode; "": nothing new."""
+        told, self._told = self._told, ""
+        if self._silent_ns > SILENCE_LIMIT_NS:
+            self._told = "arm_lost"
+            return "" if told == "arm_lost" and mode is Mode.FAULT else "arm_lost"
+        if self._silent_ns > HELD_SILENCE_NS:
+            self._told = "arm_silent"
+            return "" if told else "arm_silent"
+        return "arm_back" if told == "arm_silent" else ""
 
     def _take(self, payload: bytes) -> None:
         try:
@@ -110,7 +123,8 @@ class ExternalArm:
         except WireError as error:
             self._dropped[error.reason] += 1
             return
-        if message.site != self._site or (self._bound and message.boot != self._boot):
+        lost = self._silent_ns > SILENCE_LIMIT_NS  # its program may have been started anew
+        if message.site != self._site or (self._bound and not lost and message.boot != self._boot):
             self._dropped["stranger"] += 1
             return
         if message.boot != self._boot:
@@ -118,9 +132,21 @@ class ExternalArm:
         if message.n <= self._n:
             self._dropped["old measurement"] += 1
             return
+        now_ns = self._clock.monotonic_ns()
+        if self._bound and not self._is_plausible(message.q, (now_ns - self._taken_ns) * 1e-9):
+            self._dropped["implausible measurement"] += 1
+            return
+        self._taken_ns = now_ns
         if self._counting and message.n > self._n + 1:
             self._dropped["missing measurement"] += message.n - self._n - 1
         self._counting = self._bound
         self._n = message.n
         self.newest = PlantState(message.q, message.qd, message.tau_x)
         self.taken += 1
+
+    def _is_plausible(self, q: Sequence[float], passed_s: float) -> bool:
+        """True if the arm can have gone to `q` in a time from where it was measured last."""
+        if self.newest is None:
+            return True
+        way = [limit * passed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
+        return all(abs(a - b) <= most for a, b, most in zip(q, self.newest.q, way, strict=True))

@@ -9,7 +9,7 @@ from array import array
 from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
-from trilat_net.net.loop_stats import STATS_PER_SECOND, ticks_per_stats
+from trilat_net.net.loop_stats import STATS_PER_SECOND, find_skipped_stats, ticks_per_stats
 from trilat_net.net.pinging import answer_backfill
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 
@@ -59,6 +59,11 @@ class ChannelBuffer:
         while self._starts[self.oldest % self._capacity] < self._head - self._size:
             self.oldest += 1
 
+    def skip(self, count: int) -> None:
+        """Adds numbers of messages that are never made: an empty one stands for each."""
+        for _ in range(count):
+            self.keep(b"")
+
     def chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns the number of the first message and the messages of one answer, of those that are kept."""
         first = max(first, self.oldest)
@@ -85,7 +90,7 @@ class RetransmitBuffer:
         queries: QueryInbox,
         layout: Layout = Layout(),  # noqa: B008
     ) -> None:
-        self._site, self._boot, self._queries = site, boot, queries
+        self._site, self._boot, self._queries, self._rate_hz = site, boot, queries, rate_hz
         records, statistics = min(KEPT_S * rate_hz, RECORDS_KEPT), KEPT_S * STATS_PER_SECOND
         record_bytes = RECORD_BYTES + FLOAT_BYTES * (layout.floats - Layout().floats)
         self.channels = {
@@ -98,6 +103,12 @@ class RetransmitBuffer:
         """Lets tick be the first one of the site."""
         self.channels[topics.STATE].begin_at(tick)
         self.channels[topics.LINK].begin_at(-(-tick // ticks_per_stats(rate_hz)))
+
+    def skip(self, first: int, next_tick: int) -> None:
+        """Adds the numbers of what a site never publishes that makes no ticks from one on, up to another."""
+        self.channels[topics.STATE].skip(next_tick - first)
+        before, after = find_skipped_stats(first, next_tick, self._rate_hz)
+        self.channels[topics.LINK].skip(after - before)
 
     def answer_query(self) -> bool:
         """Answers the oldest query; False without one."""

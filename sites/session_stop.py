@@ -1,15 +1,41 @@
-"""Ends a session in order: every site at the same time since the epoch."""
+"""Orders to the sites of a session: to stop and to go on; and its end, at the same time since the epoch."""
+
+from collections.abc import Sequence
 
 from trilat_net.errors import SessionError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.discovery import REPLY_TIMEOUT_S, find_members, send_change
 from trilat_net.net.messages import Info
-from trilat_net.net.requests import ChangeRequest
+from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.scenario import Scenario, parse_embedded
 
 AHEAD_S = 0.5
 """From the newest tick that is known to the end: sites say ten times a second where they are."""
+
+
+def order_sites(
+    bus: Bus, clock: Clock, session: str, sites: Sequence[str], order: OrderName
+) -> list[ChangeReply]:
+    """Gives some sites of a session an order, "stop", "enable" or "reset"; () stands for all of them.
+
+    Raises:
+        SessionError: the session has not begun or has no such site, or a site does not answer.
+    """
+    scenario, found = _meet_sites(bus, clock, session)
+    for name in sites:
+        if name not in scenario.names:
+            raise SessionError(
+                f"session {session!r} has no site {name!r}; its sites are {', '.join(scenario.names)}"
+            )
+    asked = list(sites or scenario.names)
+    for name in asked:
+        if name not in found or not found[name].running:
+            raise SessionError(
+                f"session {session!r}: {name} {'has not begun' if name in found else 'did not answer'}"
+            )
+    request = ChangeRequest(order=order)
+    return [send_change(bus, clock, session, name, request) for name in asked]
 
 
 def stop_session(bus: Bus, clock: Clock, session: str) -> list[str]:

@@ -1,7 +1,8 @@
 """The real-time loop of a site on an absolute tick grid, and the inbox of its peers' samples.
 
 Invariant (L1): tick k lies at epoch + k periods of the leader's grid. Lateness is telemetry and enters no
-formula; a late loop runs its missed ticks back to back and counts them. No arriving payload can raise out
+formula; a late loop runs its missed ticks back to back and counts them, or at an arm outside makes none of
+them, since no plant can be caught up with: the numbers of its ticks jump. No arriving payload can raise out
 of the loop: it is a peer's sample, or it is counted by reason and dropped. Samples are decoded as they
 arrive, before their tick, and carry the instants of their arrival, not of their draining.
 """
@@ -165,6 +166,17 @@ class LoopIO(Protocol):
         """Runs after a block, and again after the next tick if it returns true, in a quarter of a period."""
 
 
+def _find_newest_tick(timing: SiteTiming, k: int, now_ns: int) -> int:
+    """Returns the last tick from k on whose deadline is not in the future."""
+    first, after = k, k + 2
+    while timing.schedule.deadline(after) <= now_ns:
+        first, after = after, 2 * after - k
+    while after - first > 1:
+        middle = (first + after) // 2
+        first, after = (middle, after) if timing.schedule.deadline(middle) <= now_ns else (first, middle)
+    return first
+
+
 def run_loop(
     site: Site,
     boot: int,
@@ -176,16 +188,22 @@ def run_loop(
     states: StateBlock,
     io: LoopIO,
     first: int = 0,
+    *,
+    catches_up: bool = True,
 ) -> TickRecord | None:
     """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
-    quarter_ns = NS_PER_S // (4 * site.rate_hz)
-    busy_us, mode, last, asked = 0, Mode.RUN, None, False
-    deadline_ns = timing.schedule.deadline(first)
-    for k in range(first, ticks):
+    quarter_ns, deadline_ns = NS_PER_S // (4 * site.rate_hz), timing.schedule.deadline(first)
+    busy_us, mode, last, asked, k = 0, Mode.RUN, None, False, first
+    while k < ticks:
         clock.sleep_until(deadline_ns)
         if io.should_stop():
             break
         woke_ns = clock.monotonic_ns()
+        skipped = 0
+        if not catches_up and k > first and woke_ns >= timing.schedule.deadline(k + 1):
+            skipped = min(_find_newest_tick(timing, k, woke_ns), ticks - 1) - k
+            k += skipped
+            deadline_ns = timing.schedule.deadline(k)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
         arrivals = inbox.drain(k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns)
         output = io.step(k, arrivals)
@@ -195,8 +213,8 @@ def run_loop(
         sent_ns, echo = timing.sent(k, clock.monotonic_ns()), timing.echo()
         io.publish_sample(encode_sample(site.name, boot, output, sent_ns, echo))
         block_due = states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
-        stats.tick(late_us, busy_us)
-        stats_due = stats.due(k)
+        stats.tick(late_us, busy_us, skipped)
+        stats_due = stats.due(k, skipped)
         if block_due or stats_due:  # statistics say that these records exist
             states.flush()
         if stats_due:
@@ -207,7 +225,8 @@ def run_loop(
         if output.cmd or output.mode is not mode:
             mode = output.mode
             io.report(output)
-        deadline_ns = timing.schedule.deadline(k + 1)
+        k += 1
+        deadline_ns = timing.schedule.deadline(k)
         if (block_due or asked) and deadline_ns - clock.monotonic_ns() > quarter_ns:
             asked = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000

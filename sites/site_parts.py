@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, PlantState, TickInput, TickRecord
+from trilat_net.core.ticks import Arrival, CoreChange, PlantState, TickInput, TickRecord, tick_ns
 from trilat_net.errors import LawFailed
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -21,9 +21,11 @@ from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, OffsetLimit
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, to_core_change
 from trilat_net.scenario.imported_law import ImportedLaw
 from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.run_changes import make_site_order
+from trilat_net.scenario.scenario_types import SiteOrder
 
 from .change_server import ChangeServer
 from .external_arm import MEASUREMENTS_KEPT, ExternalArm
@@ -118,7 +120,9 @@ class SiteParts:
         self.states = StateBlock(self.site, self.boot, self._states_publisher(), turn, single=single)
         self.publish_link = self._keeping_publisher(topics.LINK)
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
-        self.changes = ChangeServer(scenario, name, bus.questions(topics.key(session, name, topics.SET)))
+        self._next_tick = -1
+        questions = bus.questions(topics.key(session, name, topics.SET))
+        self.changes = ChangeServer(scenario, name, questions, lambda: self.site.mode)
         warm_up(scenario, name, clock)
 
     def _states_publisher(self) -> Callable[[list[bytes]], None]:
@@ -142,6 +146,23 @@ class SiteParts:
             publish(payload)
 
         return keep_and_publish
+
+    def take_changes(self, k: int) -> list[CoreChange]:
+        """Returns what the site takes in at tick k: requests, and what it finds out about its own arm."""
+        changes = list(self.changes.take(k))
+        if self.arm is None:
+            return changes
+        skipped = k - self._next_tick if self._next_tick >= 0 else 0  # it may join a running session
+        self._next_tick = k + 1
+        if skipped:
+            self.buffer.skip(k - skipped, k)
+        orders: list[tuple[SiteOrder, int]] = [("overrun", skipped), (self.arm.take_order(self.site.mode), 0)]
+        for order, ticks in orders:
+            if ticks or (order and order != "overrun"):
+                t_ns = tick_ns(k, self.site.rate_hz)
+                change = make_site_order(self.scenario, self.name, order, t_ns, ticks)
+                changes.append(to_core_change(self.scenario, change))
+        return changes
 
 
 WARM_UP_TICKS = 200

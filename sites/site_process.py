@@ -8,6 +8,7 @@ seconds (`shutdown`).
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
+from trilat_net.core.site_setup import StaleAction
 from trilat_net.core.ticks import NS_PER_S, Arrival, Mode, TickInput, TickRecord, describe_mode, tick_ns
 from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
@@ -20,6 +21,8 @@ from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
 from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_law import ImportedLaw
+from trilat_net.scenario.run_changes import count_skipped_ticks
+from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
 from .shutdown import LeavingSite
@@ -42,12 +45,14 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
     Raises:
         SessionError: the session could not begin.
         UsageError: an endpoint cannot be used.
-        ScenarioError: its user law cannot be made, or is not the one that the scenario names.
+        ScenarioError: its user law cannot be made, or is not the one that the scenario names; or an arm
+            outside of the program lacks limits.
         RunFailed: the run diverged, its user law failed, or its arm fell silent.
     """
     law = scenario.sites[name].control
     if isinstance(law, ImportedLaw):
         law.check_unchanged(name)
+    check_outside_arms(scenario)
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
         named, timeout_s = (lambda text: say(f"{name}: {text}")), options.join_timeout_s
@@ -125,7 +130,7 @@ class RunningSite:
         self._parts, self._publisher, self._epoch = parts, publisher, epoch
         self._failure: RunFailed | None = None
         self._given_up = False
-        self._mode = Mode.RUN
+        self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
         self._status_s = 0
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
@@ -169,7 +174,10 @@ class RunningSite:
         with parts.watchdog or nullcontext():
             ticks = parts.scenario.ticks(parts.name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
-            output = run_loop(parts.site, parts.boot, *timed, parts.states, self, self._epoch.first)
+            last = (parts.states, self, self._epoch.first)
+            output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
+        if output is not None:
+            self._tell_skipped(output.tick, output.t_ns)
         return LeavingSite(parts, self._publisher, output, self._failure)
 
     def _publish_setup(self) -> None:
@@ -203,7 +211,6 @@ class RunningSite:
         parts = self._parts
         if parts.arm is not None:
             parts.arm.poll()
-            self._failure = self._failure or parts.arm.failure
         ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
         return bool(ended) or parts.interrupt.requested() or self._given_up
 
@@ -213,7 +220,7 @@ class RunningSite:
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.take(k)
         try:
-            self._output = self._step(TickInput(k, arrivals, parts.changes.take(k), measured, hand))
+            self._output = self._step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
         except LawFailed as failed:
             self._failure = failed
             return None
@@ -232,9 +239,17 @@ class RunningSite:
             at_ns = tick_ns(tick, self._parts.site.rate_hz)
             self._publisher.publish("mark", text, t_ns=at_ns, ticks=tick)
         self._parts.changes.marks.clear()
+        self._tell_skipped(k, t_ns)
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))
+
+    def _tell_skipped(self, k: int, t_ns: int) -> None:
+        """Publishes which ticks up to tick k were not made."""
+        if self._skipped:
+            ticks, self._skipped = " ".join(self._skipped), []
+            text = f"{self._parts.name} did not make ticks {ticks}"
+            self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
 
     def _watch_members(self, t_ns: int) -> None:
         """Takes in who has come, and gives up where somebody has been away for too long."""
@@ -267,9 +282,13 @@ class RunningSite:
     def report(self, output: TickRecord) -> None:
         """See `LoopIO`."""
         name, at = self._parts.name, {"t_ns": output.t_ns, "ticks": output.tick}
+        if skipped := count_skipped_ticks(output.cmd):  # told together, in `attend`
+            self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
         for change in output.cmd:
-            self._publisher.publish("change", f"{name} takes in {change}", command=change, **at)
-            self._parts.say(f"takes in {change}")
+            if not count_skipped_ticks([change]):
+                self._publisher.publish("change", f"{name} takes in {change}", command=change, **at)
+                self._parts.say(f"takes in {change}")
         if output.mode is not self._mode:
             self._mode = output.mode
-            self._publisher.publish("mode", describe_mode(name, output), **at)
+            glides = self._parts.setup.on_stale.action is StaleAction.GLIDE
+            self._publisher.publish("mode", describe_mode(name, output, glides=glides), **at)

@@ -19,7 +19,7 @@ from trilat_net.analysis import arm_rows, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
-from trilat_net.core import delay, link, live_hand, ticks, user_law
+from trilat_net.core import delay, link, live_hand, session_life, ticks, user_law
 from trilat_net.execution import difference
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
@@ -61,8 +61,11 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "and 2 s more", 2, shutdown.LEAVE_TIMEOUT_NS / 1e9),
     ("design.md", "It holds from 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
-    ("design.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
-    ("external-arm.md", "silent for 0.5 s", 0.5, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("design.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("external-arm.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("external-arm.md", "silent for 0.03 s", 0.03, external_arm.HELD_SILENCE_NS / 1e9),
+    ("external-arm.md", "more than 20 ticks", 20, session_life.HELD_OVERRUN_TICKS),
+    ("external-arm.md", "more than 200", 200, session_life.FAULT_OVERRUN_TICKS),
     ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
     ("external-arm.md", "older than 0.1 s", 0.1, site_port.FRESH_NS / 1e9),
     ("live-hands.md", "silent for 200 ms lets go", 200.0, live_hand.SILENCE_NS / 1e6),

@@ -19,7 +19,7 @@ export const siteColour = (index) => css(`--site-${index % 6}`);
 const FADE = 15;
 const SLOW_MS = 45;
 const SLOW_FRAMES = 40;
-const MODES = { hold: "HOLDS: peer stale", brake: "BRAKED: peer stale", return: "RETURNS", waiting: "WAITS FOR PEERS", diverged: "DIVERGED" };
+const MODES = { hold: "HOLDS: peer stale", brake: "BRAKED: peer stale", return: "RETURNS", waiting: "WAITS FOR PEERS", fault: "FAULT", stopped: "STOPPED", diverged: "DIVERGED" };
 const element = (parent, tag, name = "") => {
   const made = document.createElement(tag);
   if (name) made.className = name;

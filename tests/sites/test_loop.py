@@ -56,11 +56,12 @@ class Alone:
         self.stopped: Callable[[], bool] = lambda: False
         self._clock, self._ticks = clock, scenario.ticks("m")
 
-    def run(self) -> object:
+    def run(self, *, catches_up: bool = True) -> object:
         inbox = PeerInbox((), (), (), (), (), self.stats.dropped, ())
         timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
         states = StateBlock(self.site, 1, self.publish_states, 0, single=True)
-        return run_loop(self.site, 1, self._ticks, self._clock, inbox, timing, self.stats, states, self)
+        timed = (self._clock, inbox, timing, self.stats, states, self)
+        return run_loop(self.site, 1, self._ticks, *timed, catches_up=catches_up)
 
     def should_stop(self) -> bool:
         return self.stopped()
@@ -252,3 +253,18 @@ def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
     told = re.search(r"session 't' is running; (m|s) is at tick (\d+)", refused[0])
     assert told, refused
     assert 200 < int(told[2]) < 1000
+
+
+@pytest.mark.parametrize("late_ms", [0.9, 1.0, 7.5, 300.0, 1000.0, 3000.0])
+def test_a_loop_that_cannot_catch_up_leaves_out_the_ticks_that_it_missed(late_ms: float) -> None:
+    """Late by n periods at tick 500, the next tick is 500 + n, or the last one of the run."""
+    clock = LateClock({500: int(late_ms * 1e6)})
+    alone = Alone(clock)
+    alone.run(catches_up=False)
+    missed = min(int(late_ms), 2000 - 1 - 500)
+    made = [state.tick for state in alone.states]
+    assert made == [*range(500), *range(500 + missed, 2000)]
+    assert [state.t_ns for state in alone.states] == [tick * 1_000_000 for tick in made]
+    assert alone.stats.overruns == missed + (late_ms == 3000.0)  # it woke when the run was over
+    numbers = [stats.tick // 100 for stats in alone.links]
+    assert numbers == [n for n in range(20) if n < 5 or n >= (500 + missed) // 100]

@@ -19,11 +19,16 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
+from ..scenario import Scenario
+from ..scenario.scenario_types import Limits
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _TASK_COLUMNS = ("x", "xd", "wrench")
 _NONE: Array = np.zeros((0, 0))
+_NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
+STOPPED_MODES = ("fault", "stopped")
+"""Modes in which the torque is not that of the law."""
 
 
 class AlignedRecords(NamedTuple):
@@ -34,7 +39,8 @@ class AlignedRecords(NamedTuple):
         rate_hz: its tick rate, Hz.
         first: the tick of row 0.
         known: True if there is a record of that tick.
-        follows: True if the site followed its peers then: no hold, no brake, no return.
+        follows: True if the site followed its peers then: no hold, no brake, no return, and no reference
+            as fast as it may move.
         q, qd: joint angles, shape (K, n), rad, and velocities, rad/s.
         q_des, qd_des: the same of the reference.
         tau: control torque, shape (K, n), N m.
@@ -45,6 +51,7 @@ class AlignedRecords(NamedTuple):
         wrench: what tau_x amounts to there, likewise.
         axes: see `SiteLog`.
         hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
+        stopped: True in one of the `STOPPED_MODES`; empty: never.
     """
 
     site: str
@@ -65,6 +72,7 @@ class AlignedRecords(NamedTuple):
     wrench: Array = _NONE
     axes: tuple[float, ...] = ()
     hand: Array = _NONE
+    stopped: Bools = _NO_ROWS
 
     @property
     def shared(self) -> Array:
@@ -136,7 +144,9 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
         first = np.unique(log[site].tick, return_index=True)[1]
         rows[site] = first[log[site].mode[first] != "diverged"]
     if not common:
-        return {site: _fill_tick_grid(log[site], kept) for site, kept in rows.items() if len(kept)}
+        return {
+            site: _fill_tick_grid(log.scenario, log[site], kept) for site, kept in rows.items() if len(kept)
+        }
     if min(map(len, rows.values())) < 2:
         return {}
     begin_s = max(log[site].tick[kept[0]] / log[site].rate_hz for site, kept in rows.items())
@@ -144,11 +154,17 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     if end_s <= begin_s:
         return {}
     last = {site: int(np.floor(end_s * log[site].rate_hz + 1e-6)) for site in rows}
-    found = {site: _fill_tick_grid(log[site], kept, last[site]) for site, kept in rows.items()}
+    found = {site: _fill_tick_grid(log.scenario, log[site], kept, last[site]) for site, kept in rows.items()}
     return found if min(len(records.known) for records in found.values()) > 1 else {}
 
 
-def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
+def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
+    """Returns the rows in which no coordinate of a reference is as fast as it may be; of one row, if so."""
+    limit = np.inf if limits.qd_des_limit_rad_s is None else limits.qd_des_limit_rad_s
+    return np.asarray((np.abs(qd_des) < limit).all(axis=-1))
+
+
+def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
     """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
     names = (*RECORD_COLUMNS, *(_TASK_COLUMNS if part.layout.task else ()))
     names += ("hand",) if part.layout.hand else ()
@@ -160,6 +176,8 @@ def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Align
     before = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[before] == grid
     follows: Bools = (part.mode[rows] == "run")[before]
+    stopped: Bools = np.isin(part.mode[rows], STOPPED_MODES)[before]
+    follows &= find_unlimited(scenario.sites[part.name].limits, part.qd_des[rows])[before]
     columns = {name: getattr(part, name)[rows] for name in names}
     for name, values in columns.items():
         columns[name] = (
@@ -169,7 +187,15 @@ def _fill_tick_grid(part: SiteLog, rows: Ints, last: int | None = None) -> Align
         )
     used = {peer: part.used[peer][rows][before] for peer in part.peers}
     return AlignedRecords(
-        part.name, part.rate_hz, first, known, follows, used=used, axes=part.axes, **columns
+        part.name,
+        part.rate_hz,
+        first,
+        known,
+        follows,
+        used=used,
+        axes=part.axes,
+        stopped=stopped if stopped.any() else _NO_ROWS,
+        **columns,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..net.messages import TASK_VECTORS, State
 from ..scenario import Scenario
-from .aligned import RECORD_COLUMNS, AlignedRecords
+from .aligned import RECORD_COLUMNS, STOPPED_MODES, AlignedRecords, find_unlimited
 
 KEPT_S = 12.0
 """Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
@@ -38,7 +38,8 @@ class RecordWindow:
         self._floats = np.zeros((2 * self._kept, ends[-1]))
         self._used = np.full((2 * self._kept, len(self.peers)), -1, dtype=np.int64)
         self._known = np.zeros(2 * self._kept, dtype=np.bool_)
-        self._follows = np.zeros(2 * self._kept, dtype=np.bool_)
+        self._follows, self._stopped = np.zeros((2, 2 * self._kept), dtype=np.bool_)
+        self._limits = scenario.sites[site].limits
         self.first, self.newest = 0, -1
 
     def take(self, record: State) -> bool:
@@ -53,14 +54,18 @@ class RecordWindow:
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
-        self._known[row], self._follows[row] = True, record.mode == "run"
+        self._known[row], self._stopped[row] = True, record.mode in STOPPED_MODES
+        free = self._limits.qd_des_limit_rad_s is None or find_unlimited(
+            self._limits, np.array(record.qd_des)
+        )
+        self._follows[row] = record.mode == "run" and free
         self.newest = max(self.newest, record.tick)
         return True
 
     def _move(self, first: int) -> None:
         """Forgets the records before a tick."""
         left = max(0, self.newest + 1 - first)
-        for column in (self._floats, self._used, self._known, self._follows):
+        for column in (self._floats, self._used, self._known, self._follows, self._stopped):
             column[:left] = column[first - self.first :][:left].copy()
         self._known[left:] = False
         self.first = first
@@ -73,19 +78,20 @@ class RecordWindow:
         """Returns the records of ticks in the window, both ends included; a missing one is interpolated."""
         part = slice(first - self.first, last + 1 - self.first)
         known, floats, used = self._known[part].copy(), self._floats[part], self._used[part]
-        follows = self._follows[part].copy()
+        follows, stopped = self._follows[part].copy(), self._stopped[part].copy()
         if not known.all() and known.any():
             floats, there = floats.copy(), np.flatnonzero(known)
             for column in floats.T:
                 column[:] = np.interp(np.arange(len(known)), there, column[there])
             before = there[np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)]
-            used, follows = used[before], follows[before]
+            used, follows, stopped = used[before], follows[before], stopped[before]
         columns: dict[str, Any] = {name: floats[:, where] for name, where in self._columns.items()}
         return AlignedRecords(
             *(self.site, self.rate_hz, first, known, follows),
             **columns,
             used={peer: used[:, n] for n, peer in enumerate(self.peers)},
             axes=self._axes,
+            stopped=stopped,
         )
 
 

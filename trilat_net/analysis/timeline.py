@@ -22,7 +22,7 @@ FOLLOWING_MODES = ("run", "diverged")
 
 
 class AppliedChange(NamedTuple):
-    """A change of a link or of a site's dominance factors, and the site that carried it out.
+    """A change of a link or of a site's dominance factors, or an order, and the site that carried it out.
 
     `taken_at_tick` is the tick whose record names it; None for a change of the scenario.
     """
@@ -33,12 +33,16 @@ class AppliedChange(NamedTuple):
 
     @property
     def about(self) -> str:
-        """Its subject: a link "j->i", or the shares of a site."""
-        return self.change.link or f"shares of {self.change.dominance}"
+        """Its subject: a link "j->i", the shares of a site, or a site."""
+        return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
         """The value after it."""
+        if self.change.order:
+            return self.change.order.replace("_", " ") + f", {self.change.ticks} ticks" * bool(
+                self.change.ticks
+            )
         if self.change.link:
             return self.change.after.describe()
         shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.shares.items() if share)

@@ -36,8 +36,11 @@ def scenario_check_command(
 ) -> None:
     """Checks a scenario, and prints its consequences."""
     from ..scenario.describe import describe_scenario
+    from ..scenario.validate import check_outside_arms
 
-    for line in describe_scenario(options.load_chosen_scenario(file, overrides, None, None)):
+    scenario = options.load_chosen_scenario(file, overrides, None, None)
+    check_outside_arms(scenario)
+    for line in describe_scenario(scenario):
         terminal.print_text(line)
 
 

@@ -1,40 +1,117 @@
-"""`trilat stop`: ends a session in order."""
+"""`trilat stop`, `enable`, `reset`: stops arms while their session goes on, and lets them follow again."""
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import RunFailed, UsageError
 from ..reporting import terminal_output as terminal
 from . import options
 
+if TYPE_CHECKING:
+    from ..net.bus import Bus
+    from ..net.clock import Clock
+    from ..net.connection import Connection
+    from ..net.requests import OrderName
 
-def stop_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to end.")],
-    connect: options.ConnectOption = None,
-    router: options.RouterOption = None,
-    zenoh_config: options.ZenohConfigOption = None,
-    keys: options.KeysOption = None,
-) -> None:
-    """Ends a running session in order: all sites at one time, and every recorder with all records.
+SessionOption = Annotated[str, typer.Option("--session", metavar="ID", help="The session.")]
+SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
 
-    Without endpoints it asks the first site, at its loopback port, for the others.
-    """
-    from sites.session_stop import stop_session
 
+def _with_session(session: str, connection: "Connection", act: "Callable[[Bus, Clock, str], None]") -> None:
+    """Connects to a session and acts on it."""
     from ..net.clock import SystemClock
     from ..net.discovery import REPLY_TIMEOUT_S, connect_to_session
     from ..scenario import embedded_names_reader
 
     name, clock = options.check_session_name(session), SystemClock()
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    reader = embedded_names_reader(name)
     with connect_to_session(
-        connection,
-        clock,
-        name,
-        embedded_names_reader(name),
-        stopped=lambda: False,
-        timeout_s=REPLY_TIMEOUT_S,
+        connection, clock, name, reader, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
     ) as bus:
         assert bus is not None  # nothing stops it
+        act(bus, clock, name)
+
+
+def _order(session: str, connection: "Connection", sites: list[str] | None, order: "OrderName") -> None:
+    """Gives sites an order and prints their answers.
+
+    Raises:
+        RunFailed: a site refused it.
+    """
+    from sites.session_stop import order_sites
+
+    def act(bus: "Bus", clock: "Clock", name: str) -> None:
+        replies = order_sites(bus, clock, name, sites or (), order)
+        for reply in replies:
+            terminal.print_text(reply.text)
+        if refused := [reply.member for reply in replies if not reply.accepted]:
+            raise RunFailed(f"{', '.join(refused)} did not {order}")
+
+    _with_session(session, connection, act)
+
+
+def stop_command(
+    session: SessionOption,
+    sites: SitesArgument = None,
+    end: Annotated[
+        bool, typer.Option("--end", help="End the session in order, with every recorder's records.")
+    ] = False,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+) -> None:
+    """Stops arms at once, while the session goes on: their torque goes over to damping and gravity in 100 ms.
+
+    They stay so until `trilat enable`. With --end all sites end their run at one time instead. Without
+    endpoints it asks the first site, at its loopback port, for the others.
+    """
+    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    if not end:
+        _order(session, connection, sites, "stop")
+        return
+    if sites:
+        raise UsageError("--end ends the whole session: name no site")
+    from sites.session_stop import stop_session
+
+    def act(bus: "Bus", clock: "Clock", name: str) -> None:
         for text in stop_session(bus, clock, name):
             terminal.print_text(text)
+
+    _with_session(session, connection, act)
+
+
+def enable_command(
+    session: SessionOption,
+    sites: SitesArgument = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+) -> None:
+    """Lets arms that were stopped follow again: they wait for their peers and align with them."""
+    _order(
+        session,
+        options.resolve_connection(None, connect, router, zenoh_config, [], None, keys),
+        sites,
+        "enable",
+    )
+
+
+def reset_command(
+    session: SessionOption,
+    sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="The sites in fault.")],
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+) -> None:
+    """Ends the fault of sites, unless its reason is still there: they wait for their peers and align."""
+    _order(
+        session,
+        options.resolve_connection(None, connect, router, zenoh_config, [], None, keys),
+        sites,
+        "reset",
+    )

@@ -74,7 +74,7 @@ def update_torque(s: Row, chain: RowArray) -> None:
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain, s.theta_hat, s.v, s.a, s.tau)
     else:
-        _put_gravity(s, chain, s.known, s.tau)
+        put_gravity(s, chain, s.known, s.tau)
     if s.task:
         add_task_torque(s, s.Kd, s.ed, -1.0, s.tau)
         if s.law != _ADAPTIVE:
@@ -98,7 +98,7 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 
 @leaf
-def _put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
+def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
     """Writes G of these parameters, N m, shape (n,), for the pose in which the joints are placed."""
     propagate_motion(chain, s.gravity, s.zeros, s.zeros, s.zeros)
     inverse_dynamics(chain, theta, s.zeros, s.zeros, torque)
@@ -108,7 +108,7 @@ def _put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
     """Writes G(q), N m, shape (n,)."""
     place_joints(chain, q)
-    _put_gravity(s, chain, s.theta, torque)
+    put_gravity(s, chain, s.theta, torque)
 
 
 @leaf
@@ -117,7 +117,7 @@ def update_model(s: Row, chain: RowArray) -> None:
 
     The bias is C qd + G with friction, less the torque of the stops. The joints are placed.
     """
-    _put_gravity(s, chain, s.known, s.G)
+    put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
         put_model(chain, s.known, s.gravity, s.q, s.qd, s.M, s.bias)
 

@@ -12,14 +12,16 @@ from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
-from .session_life import update_session_life
+from .safeguards import blend_torque, is_torque_finite, limit_reference, limit_torque_rate
+from .session_life import latch, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
 from .task_space import POSE, update_orientation_reference
-from .ticks import Mode, tick_ns
+from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
-_DIVERGED = int(Mode.DIVERGED)
+_DIVERGED, _FAULT, _STOPPED = int(Mode.DIVERGED), int(Mode.FAULT), int(Mode.STOPPED)
+_NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
@@ -53,9 +55,16 @@ def _advance_estimate(s: Row, chain: RowArray | None, gain_s: float, Yr: Vector)
 
 
 @leaf
+def _adapts(s: Row) -> bool:
+    """True in a mode in which estimates follow their law."""
+    stopped: bool = s.mode == _DIVERGED or s.mode == _FAULT or s.mode == _STOPPED
+    return not stopped
+
+
+@leaf
 def _update_estimate(k: int, s: Row, chain: RowArray | None) -> None:
     """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
-    if s.scheme == _DIGITAL or k == s.first or s.mode == _DIVERGED or s.law != _ADAPTIVE:
+    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
         return
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -72,6 +81,29 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
         two_link_stages.update_torque(s)
     else:
         chain_stages.update_torque(s, chain)
+
+
+@leaf
+def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
+    """Writes the torque of gravity as far as the law knows it, or has learnt it."""
+    learns = s.law == _ADAPTIVE or (s.law == _OWN and s.theta_known == 0)
+    theta = s.theta_hat if learns else s.known
+    if chain is None:
+        two_link_stages.put_gravity(s, theta, torque)
+    else:
+        chain_stages.put_gravity(s, chain, theta, torque)
+
+
+@leaf
+def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
+    """Ends stage 6: the torque of a site in FAULT or STOPPED, and none that changes faster than it may."""
+    if s.on_stale == _GLIDE:
+        if s.mode != _FAULT and s.mode != _DIVERGED and not is_torque_finite(s):
+            latch(tick_ns(k - 1, s.rate_hz), s, _FAULT, _NOT_FINITE)
+        if s.mode == _FAULT or s.mode == _STOPPED:
+            _put_known_gravity(s, chain, s.u)
+            blend_torque(t_ns, s)
+    limit_torque_rate(s)
 
 
 @leaf
@@ -143,7 +175,7 @@ def _advance(
             s.u[i] = torque + s.held[i]
         if not _advance_arm(t_ns * 1e-9, h_s, s, chain, actors, table):
             s.mode = _DIVERGED
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE:
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and _adapts(s):
         _advance_estimate(s, chain, h_s, s.Yr)
     for i in range(s.tau.shape[0]):
         s.tau_before[i] = s.tau[i]
@@ -208,6 +240,7 @@ def reference_stages(
         update_session_life(t_ns, tick_ns(k - 1, s.rate_hz), s, links)
     else:
         update_stale_mode(t_ns, s, links)
+    limit_reference(k, s)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
     _update_external_torque(t_ns * 1e-9, s, chain, actors, table)
@@ -216,8 +249,11 @@ def reference_stages(
 @leaf
 def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
     """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate, the external torque."""
-    accept_stage(k, count, arrays, buffers)
     rate_hz = arrays.site[0].rate_hz
+    for missed in range(k - arrays.site[0].skipped, k):  # ticks that the site did not make
+        for j in range(arrays.links.shape[0]):
+            recall_sample(missed, rate_hz, link_arrays(arrays, j))
+    accept_stage(k, count, arrays, buffers)
     for j in range(arrays.links.shape[0]):  # 2 recall
         recall_sample(k, rate_hz, link_arrays(arrays, j))
     a = arrays
@@ -234,10 +270,11 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Stages 7 and 8 of a tick, with the torque in place: the record, and the step to the next tick."""
+    """Stages 7 and 8 of a tick, with the law's torque in place: the record, and the step to the next tick."""
     s: Row = site[0]
+    _guard_torque(k, t_ns, s, chain)
     for i in range(s.joints):
-        if not abs(s.qd[i]) <= s.qd_limit[i]:
+        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
             s.mode = _DIVERGED
     _write_record(s, record)  # 7 emit
     if s.mode != _DIVERGED:  # 8 advance

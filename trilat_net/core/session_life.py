@@ -1,40 +1,44 @@
 """The life of a site under the rule `glide`: it waits, aligns, follows, and holds while a peer is silent.
 
     WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD -> RETURN -> RUN
+    any -> FAULT (a limit, a number that is not finite, its arm lost)  -- RESET  -> WAITING
+    any -> STOPPED (an order)                                          -- ENABLE -> WAITING
 
 Invariant: the reference and its derivative never jump, and the second is the derivative of the first. Held,
 the rate of the reference falls to zero over the time after which a peer counts as silent, and the reference
 is its integral; while the site aligns, the way from the peers' reference falls to zero with its rate, no
 faster than `align_speed` beyond what it had. A peer that holds or aligns itself is followed like any other.
+FAULT and STOPPED are latched: the torque goes over from the last one to damping and gravity (`safeguards`),
+the reference is the own pose, estimates stay as they are. No message of a peer leads there or back.
 """
 
-from enum import IntEnum
+from math import isfinite
 
 from .jit import leaf
-from .ticks import Mode, tick_ns
+from .ticks import LifeOrder, LifeReason, Mode, tick_ns
 from .vectors import Row, RowArray, put
-
-
-class LifeReason(IntEnum):
-    """Why a site last changed its mode."""
-
-    START = 0
-    PEERS_HERE = 1
-    ALIGNED = 2
-    PEER_SILENT = 3
-    PEERS_BACK = 4
-    ALIGN_LIMIT = 5
-
 
 MIN_ALIGN_NS = 250_000_000
 """The least time of an alignment."""
+HELD_OVERRUN_TICKS = 20
+"""A site at an arm outside that missed more ticks than these holds."""
+FAULT_OVERRUN_TICKS = 200
+"""One that missed more than these is in FAULT."""
 
 _RUN, _DIVERGED, _HOLD = int(Mode.RUN), int(Mode.DIVERGED), int(Mode.HOLD)
 _ALIGN, _WAITING = int(Mode.RETURN), int(Mode.WAITING)
+_FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
 _START = int(LifeReason.START)
 _PEERS_HERE, _ALIGNED = int(LifeReason.PEERS_HERE), int(LifeReason.ALIGNED)
 _PEER_SILENT, _PEERS_BACK = int(LifeReason.PEER_SILENT), int(LifeReason.PEERS_BACK)
-_ALIGN_LIMIT = int(LifeReason.ALIGN_LIMIT)
+_ALIGN_LIMIT, _OVERRUN = int(LifeReason.ALIGN_LIMIT), int(LifeReason.OVERRUN)
+_LIMIT_Q, _LIMIT_QD = int(LifeReason.LIMIT_Q), int(LifeReason.LIMIT_QD)
+_NOT_FINITE, _STOP = int(LifeReason.NOT_FINITE), int(LifeReason.STOP)
+_ENABLE, _RESET = int(LifeReason.ENABLE), int(LifeReason.RESET)
+_ARM_SILENT, _ARM_BACK = int(LifeReason.ARM_SILENT), int(LifeReason.ARM_BACK)
+_TO_STOP, _TO_ENABLE, _TO_RESET = int(LifeOrder.STOP), int(LifeOrder.ENABLE), int(LifeOrder.RESET)
+_HEAR_SILENCE, _LOSE_ARM = int(LifeOrder.ARM_SILENT), int(LifeOrder.ARM_LOST)
+_HEAR_ARM = int(LifeOrder.ARM_BACK)
 
 
 @leaf
@@ -86,17 +90,87 @@ def _begin_aligning(t_ns: int, site: Row, reason: int) -> None:
 
 
 @leaf
+def _wait(t_ns: int, site: Row, reason: int) -> None:
+    """Begins to wait for the peers, at the own pose and at rest."""
+    for i in range(site.q_held.shape[0]):
+        site.q_held[i] = site.x[i] if site.task else site.q[i]
+        site.qd_held[i] = 0.0
+    _enter(t_ns, _WAITING, reason, site)
+
+
+@leaf
+def _hold(before_ns: int, site: Row, reason: int) -> None:
+    """Begins to hold the reference that was in force at the tick before."""
+    put(site.q_held, site.q_followed)
+    put(site.qd_held, site.qd_followed)
+    _enter(before_ns, _HOLD, reason, site)
+
+
+@leaf
+def latch(before_ns: int, site: Row, mode: int, reason: int) -> None:
+    """Enters FAULT or STOPPED, from the torque that was applied at the tick before, `before_ns`."""
+    put(site.tau_held, site.tau_before)
+    for p in range(site.theta_hat.shape[0]):
+        if not isfinite(site.theta_hat[p]):
+            site.theta_hat[p] = 0.0
+    _enter(before_ns, mode, reason, site)
+
+
+@leaf
+def _find_fault(site: Row) -> int:
+    """Returns the reason for a fault that the arm's motion gives, or -1."""
+    for i in range(site.joints):
+        q, qd = site.q[i], site.qd[i]
+        if not (isfinite(q) and isfinite(qd)):
+            return _NOT_FINITE
+        if not site.q_min[i] <= q <= site.q_max[i]:
+            return _LIMIT_Q
+        if not abs(qd) <= site.qd_limit[i]:
+            return _LIMIT_QD
+    return -1
+
+
+@leaf
+def _obey(t_ns: int, before_ns: int, site: Row) -> None:
+    """Carries out what is ordered, and what the ticks that were not made ask for."""
+    order, skipped, mode = site.order, site.skipped, site.mode
+    site.order = site.skipped = 0
+    moves = mode in (_RUN, _ALIGN)
+    if order == _TO_RESET and mode == _FAULT:
+        _wait(t_ns, site, _RESET)
+    elif order == _TO_ENABLE and mode == _STOPPED:
+        _wait(t_ns, site, _ENABLE)
+    elif order == _TO_STOP and mode != _FAULT and mode != _STOPPED:
+        latch(before_ns, site, _STOPPED, _STOP)
+    elif mode in (_FAULT, _STOPPED):
+        return
+    elif order == _LOSE_ARM or skipped > FAULT_OVERRUN_TICKS:
+        latch(before_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
+    elif order == _HEAR_SILENCE and moves:
+        _hold(before_ns, site, _ARM_SILENT)
+    elif order == _HEAR_SILENCE:
+        site.reason = _ARM_SILENT
+    elif order == _HEAR_ARM and site.reason == _ARM_SILENT:
+        site.reason = _ARM_BACK
+    elif skipped > HELD_OVERRUN_TICKS and moves:
+        _hold(before_ns, site, _OVERRUN)
+
+
+@leaf
 def _update_mode(t_ns: int, before_ns: int, site: Row, links: RowArray) -> None:
-    """Changes the mode where the peers ask for it."""
+    """Changes the mode where limits or the peers ask for it."""
+    fault = _find_fault(site)
+    if fault >= 0 and site.mode != _FAULT:
+        latch(before_ns, site, _FAULT, fault)
+    if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
+        return
     heard = _all_heard(t_ns, site.stale_ns, links)
     if heard and site.mode == _WAITING:
         _begin_aligning(t_ns, site, _PEERS_HERE)
-    elif heard and site.mode == _HOLD:
+    elif heard and site.mode == _HOLD and site.return_from_ns != before_ns:
         _begin_aligning(t_ns, site, _PEERS_BACK)
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
-        put(site.q_held, site.q_followed)
-        put(site.qd_held, site.qd_followed)
-        _enter(before_ns, _HOLD, _PEER_SILENT, site)
+        _hold(before_ns, site, _PEER_SILENT)
     elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
         _enter(t_ns, _RUN, _ALIGNED, site)
 
@@ -110,12 +184,16 @@ def update_session_life(t_ns: int, before_ns: int, site: Row, links: RowArray) -
     if site.mode == _DIVERGED:
         return
     if t_ns == tick_ns(site.first, site.rate_hz):  # from its own pose, at rest
-        for i in range(site.q_held.shape[0]):
-            site.q_held[i] = site.x[i] if site.task else site.q[i]
-            site.qd_held[i] = 0.0
-        _enter(t_ns, _WAITING, _START, site)
+        _wait(t_ns, site, _START)
+    if site.order != 0 or site.skipped != 0:
+        _obey(t_ns, before_ns, site)
     _update_mode(t_ns, before_ns, site, links)
     if site.mode == _RUN:
+        return
+    if site.mode == _FAULT or site.mode == _STOPPED:
+        for i in range(site.q_held.shape[0]):
+            site.q_des[i] = site.x[i] if site.task else site.q[i]
+            site.qd_des[i] = 0.0
         return
     if site.mode != _ALIGN:
         for i in range(site.q_held.shape[0]):

@@ -24,7 +24,7 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 
 _SETTINGS = (
     *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
-    *("theta_known", "needs_model", "remembered", "asked"),
+    *("theta_known", "needs_model", "remembered", "asked", "order", "skipped"),
 )
 _COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
@@ -32,6 +32,7 @@ _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
     *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
+    *("q_min", "q_max", "tau_rate", "tau_held", "damping"),
 )
 _PER_COORDINATE = (
     *(
@@ -48,6 +49,7 @@ _PER_COORDINATE = (
         "felt",
         "e",
         "ed",
+        "qd_des_limit",
     ),
 )
 _PER_PARAMETER = ("theta", "known", "Gamma", "low", "high", "theta_hat", "Yr", "Yr_before")
@@ -318,6 +320,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
     vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
+    vectors |= {**setup.limits._asdict(), "damping": setup.damping}
     vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
     if gains.law is Law.OWN and setup.theta_known:
         vectors["known"] = setup.theta

@@ -76,6 +76,22 @@ class StaleRule(NamedTuple):
     align_limit: float = math.inf
 
 
+class MotionLimits(NamedTuple):
+    """How far an arm may go, and how fast its reference and its torque may change; one number, or one each.
+
+    Attributes:
+        q_min: least joint angles, rad.
+        q_max: largest joint angles, rad.
+        qd_des_limit: largest speed of the reference, rad/s; in task space m/s.
+        tau_rate: largest rate of the control torque, N m/s.
+    """
+
+    q_min: Vector = (-math.inf,)
+    q_max: Vector = (math.inf,)
+    qd_des_limit: Vector = (math.inf,)
+    tau_rate: Vector = (math.inf,)
+
+
 class LinkSetup(NamedTuple):
     """One peer as a site sees it.
 
@@ -155,6 +171,10 @@ class Layout(NamedTuple):
         return {
             name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
         }
+
+    def life_memory(self, peers: int) -> int:
+        """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`."""
+        return 2 * (self.shared + 1) + peers + self.joints
 
     @property
     def floats(self) -> int:
@@ -264,6 +284,8 @@ class SiteSetup(NamedTuple):
         theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
         channel: what the site's law sends to its peers.
+        limits: further limits.
+        damping: of a site that is stopped, per joint, N m s/rad.
     """
 
     name: str
@@ -286,6 +308,8 @@ class SiteSetup(NamedTuple):
     theta_known: bool = True
     chain: ChainSetup | None = None
     channel: LawChannel = LawChannel()
+    limits: MotionLimits = MotionLimits()
+    damping: Vector = (0.0,)
 
     @property
     def layout(self) -> Layout:

@@ -23,7 +23,17 @@ from .kernel import accept_stage, act_stages, find_release, resume_stages, sense
 from .live_hand import HandInForce, free_hand
 from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup, StaleAction
-from .ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, LinkCounts, Mode, TickInput, TickRecord
+from .ticks import (
+    MAX_ARRIVALS,
+    NS_PER_S,
+    Arrival,
+    CoreChange,
+    LifeOrder,
+    LinkCounts,
+    Mode,
+    TickInput,
+    TickRecord,
+)
 from .vectors import Row
 
 _MODES = {int(mode): mode for mode in Mode}
@@ -96,6 +106,10 @@ class Site:
         Raises:
             ValueError: the site has taken `MAX_CHANGES` of a link, or `MAX_RAMPS` wait to begin.
         """
+        if command.order is LifeOrder.OVERRUN:
+            self._site[0]["skipped"] = command.skipped
+        elif command.order is not None:
+            self._site[0]["order"] = max(self._site[0]["order"], command.order)
         if command.model is not None:
             if self._links[command.peer].models >= self._arrays.models.shape[1]:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
@@ -172,6 +186,17 @@ class Site:
         return record._replace(ch=self._sent.tolist(), hand=hand) if self._sends or hand else record
 
     @property
+    def speed_limits(self) -> list[float]:
+        """Largest speed of each joint, rad/s."""
+        limits: list[float] = self._site[0]["qd_limit"].tolist()
+        return limits
+
+    @property
+    def mode(self) -> Mode:
+        """Its mode at the last tick."""
+        return _MODES[self._mode.item()]
+
+    @property
     def q(self) -> list[float]:
         """Joint angles at the next tick, rad."""
         angles: list[float] = self._site[0]["q"][: self.layout.joints].tolist()
@@ -205,7 +230,8 @@ class Site:
         held = [*s.q_held.tolist(), float(s.return_from_ns)]
         if not self._glides:
             return held
-        return [*held, *s.qd_held.tolist(), float(s.reason), *self._links["used_ns"].astype(float).tolist()]
+        heard = self._links["used_ns"].astype(float).tolist()
+        return [*held, *s.qd_held.tolist(), float(s.reason), *heard, *s.tau_held.tolist()]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""
@@ -248,7 +274,10 @@ class Site:
         if self._glides and rest:
             s.qd_held, s.reason = rest[:held], int(rest[held])
             rest = rest[held + 1 :]
-            self._links["used_ns"], rest = rest[: len(self.peers)], rest[len(self.peers) :]
+            peers, joints = len(self.peers), self.layout.joints
+            self._links["used_ns"], s.tau_held = rest[:peers], rest[peers : peers + joints]
+            rest = rest[peers + joints :]
+            s.order = s.skipped = 0
         self._sent[:] = last.ch or 0.0
         self._take_hand(last.hand)
         if self._law is not None:

@@ -42,7 +42,8 @@ class Mode(IntEnum):
     RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
     the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN. Under
     the rule `glide` a site is WAITING for its peers before it goes to them, see `session_life`. DIVERGED,
-    past a limit, is final.
+    past a limit, is final. Under `glide` a limit leads to FAULT and an order to STOPPED in its place: the
+    torque goes over to damping and gravity, and only another order leads back to WAITING.
     """
 
     RUN = 1
@@ -51,6 +52,46 @@ class Mode(IntEnum):
     BRAKE = 4
     RETURN = 5
     WAITING = 6
+    FAULT = 7
+    STOPPED = 8
+
+
+class LifeReason(IntEnum):
+    """Why a site under the rule `glide` last changed its mode, see `session_life`."""
+
+    START = 0
+    PEERS_HERE = 1
+    ALIGNED = 2
+    PEER_SILENT = 3
+    PEERS_BACK = 4
+    ALIGN_LIMIT = 5
+    LIMIT_Q = 6
+    LIMIT_QD = 7
+    NOT_FINITE = 8
+    STOP = 9
+    ENABLE = 10
+    RESET = 11
+    OVERRUN = 12
+    ARM_SILENT = 13
+    ARM_BACK = 14
+
+
+class LifeOrder(IntEnum):
+    """What a site under the rule `glide` is ordered to do, see `session_life`.
+
+    STOP leads to STOPPED, from where ENABLE leads back; RESET leads back from FAULT. The others come from the
+    site itself, at an arm outside of the program: ARM_SILENT and ARM_LOST say that no measurement came for a
+    time, ARM_BACK that one came again, OVERRUN that it did not make some ticks. Of several in one tick, the
+    one of the highest number counts, and OVERRUN besides.
+    """
+
+    ENABLE = 1
+    RESET = 2
+    ARM_BACK = 3
+    ARM_SILENT = 4
+    STOP = 5
+    ARM_LOST = 6
+    OVERRUN = 7
 
 
 class Arrival(NamedTuple):
@@ -97,12 +138,16 @@ class CoreChange(NamedTuple):
         peer: the link that it changes, by its peer's index; -1 for a change of the dominance factors.
         model: the link's model from then on.
         ramp: the change of the dominance factors.
+        order: what the site is to do.
+        skipped: with OVERRUN, the ticks before this one that the site did not make.
     """
 
     text: str
     peer: int = -1
     model: LinkModel | None = None
     ramp: DominanceRamp | None = None
+    order: LifeOrder | None = None
+    skipped: int = 0
 
 
 class PlantState(NamedTuple):
@@ -214,16 +259,40 @@ class LinkCounts(NamedTuple):
     copies: int
 
 
-def describe_mode(site: str, output: TickRecord) -> str:
-    """Returns the text of the event that a site changes its mode."""
+_REASONS = {
+    LifeReason.PEER_SILENT: "a peer is silent",
+    LifeReason.ALIGN_LIMIT: "its peers are farther away than align_limit_rad",
+    LifeReason.LIMIT_Q: "a joint is beyond q_min_rad or q_max_rad",
+    LifeReason.LIMIT_QD: "a joint is faster than qd_limit_rad_s",
+    LifeReason.NOT_FINITE: "a number is no longer finite",
+    LifeReason.STOP: "it was ordered to",
+    LifeReason.ENABLE: "it was enabled",
+    LifeReason.RESET: "its fault was reset",
+    LifeReason.OVERRUN: "it missed ticks",
+    LifeReason.ARM_SILENT: "its arm is silent",
+}
+
+
+def find_life_reason(output: TickRecord) -> LifeReason:
+    """Returns why a site under the rule `glide` last changed its mode, as its record remembers it."""
+    return LifeReason(int(output.mem[2 * len(output.q_des) + 1]))
+
+
+def describe_mode(site: str, output: TickRecord, *, glides: bool = False) -> str:
+    """Returns the text of the event that a site changes its mode; one that `glides` says why."""
     doing = {
         Mode.RUN: "follows its peers",
-        Mode.HOLD: "holds its reference: a peer is stale",
+        Mode.HOLD: "holds its reference",
         Mode.BRAKE: "holds its pose: a peer is stale",
         Mode.RETURN: "returns to its peers",
         Mode.WAITING: "waits for its peers",
+        Mode.FAULT: "is in FAULT",
+        Mode.STOPPED: "is STOPPED",
     }
-    return f"{site} {doing[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
+    why = _REASONS.get(find_life_reason(output), "") if glides else "a peer is stale"
+    if output.mode in (Mode.RUN, Mode.RETURN) or (output.mode is Mode.BRAKE and not glides):
+        why = ""
+    return f"{site} {doing[output.mode]}{': ' * bool(why)}{why} from t = {output.t_ns * 1e-9:.3f} s"
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:

@@ -61,11 +61,11 @@ def update_torque(s: Row) -> None:
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
     """Writes G(q), N m, of this tick."""
-    _put_gravity(s, s.theta, torque)
+    put_gravity(s, s.theta, torque)
 
 
 @leaf
-def _put_gravity(s: Row, theta: Array, torque: Array) -> None:
+def put_gravity(s: Row, theta: Array, torque: Array) -> None:
     """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
     outer = s.Y[1, 4] * theta[4]
     put_pair(torque, (s.Y[0, 3] * theta[3] + outer, outer))
@@ -74,7 +74,7 @@ def _put_gravity(s: Row, theta: Array, torque: Array) -> None:
 @leaf
 def update_model(s: Row) -> None:
     """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd + G."""
-    _put_gravity(s, s.known, s.G)
+    put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
         q, qd = pair(s.q), pair(s.qd)
         M = inertia(s.known, q)

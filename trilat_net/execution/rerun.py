@@ -216,8 +216,7 @@ class Rerun:
         channels, entries = {}, []
         for name in log.sites:
             boot = log[name].states[0].boot if len(log[name]) else 0
-            rate_hz = request.scenario.sites[name].rate_hz
-            own = channels[name] = SiteChannels(session, name, boot, log[name].peers, rate_hz)
+            own = channels[name] = SiteChannels(request.scenario, session, name, boot)
             if name in request.recorded:
                 entries.append(_copy_recorded(log, name, own))
             else:
@@ -415,7 +414,8 @@ def _describe_later_changes(again: Rerun) -> Iterator[str]:
         for commands in again.before.commands(name).values():
             for command in commands:
                 peer = again.before[name].peers[command.peer]
-                during.append(name if command.peer < 0 else f"{peer}->{name}")
+                if command.order is None:
+                    during.append(name if command.peer < 0 else f"{peer}->{name}")
     for owner in dict.fromkeys(during):
         prefix = f"links.{owner}." if "->" in owner else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys):

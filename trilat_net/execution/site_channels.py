@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..core.ticks import Arrival, Mode, TickRecord, describe_divergence, describe_mode
-from ..log.accounting import Account, number_message
+from ..log.accounting import Account, number_message, skipped_numbers
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
 from ..log.log_writer import LogWriter
 from ..net import topics
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.wire import encode, encode_state
+from ..scenario import Scenario
+from ..scenario.run_changes import count_skipped_ticks
 from .resumption import read_output
 
 
@@ -34,8 +36,9 @@ class SiteEntry(NamedTuple):
 class SiteChannels:
     """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts."""
 
-    def __init__(self, session: str, site: str, boot: int, peers: tuple[str, ...], rate_hz: int) -> None:
-        self.peers = peers
+    def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
+        self.peers, rate_hz = scenario.peers(site), scenario.sites[site].rate_hz
+        self._glides = scenario.sites[site].on_stale.action == "glide"
         self._site, self._boot, self._rate_hz = site, boot, rate_hz
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
@@ -47,13 +50,24 @@ class SiteChannels:
     def follow(self, output: TickRecord, stats: LinkStats | None) -> Sequence[SiteEntry]:
         """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
         self.ticks, self._t_ns = output.tick + 1, output.t_ns
+        self._excuse_skipped(output.tick, output.cmd)
         entries = [] if stats is None else [self.stats(stats)]
         if output.mode is not self._mode:
             self._mode = output.mode
             diverged = output.mode is Mode.DIVERGED
-            text = (describe_divergence if diverged else describe_mode)(self._site, output)
+            text = (
+                describe_divergence(self._site, output)
+                if diverged
+                else describe_mode(self._site, output, glides=self._glides)
+            )
             entries.append(self.new_event("diverged" if diverged else "mode", text, output.t_ns))
         return entries
+
+    def _excuse_skipped(self, tick: int, cmd: Sequence[str]) -> None:
+        """Counts nothing as missing of the ticks that the site did not make before one."""
+        if skipped := count_skipped_ticks(cmd):
+            for channel in (topics.STATE, topics.LINK):
+                self.accounts[channel].begin_anew(*skipped_numbers(channel, tick, skipped, self._rate_hz))
 
     def end(self, t_ns: int | None = None) -> SiteEntry:
         """Returns the entry of the event that ends the site's run, by default at its last tick."""
@@ -71,6 +85,7 @@ class SiteChannels:
 
     def record(self, state: State, payload: bytes) -> SiteEntry:
         """Returns the entry of a record of the source log."""
+        self._excuse_skipped(state.tick, state.cmd)
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
         if state.v != VERSION:
             arrivals = [Arrival(peer, tick, (), (), us) for peer, tick, us in state.rx]

@@ -31,6 +31,7 @@ from ..log.site_log import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, parse_core_change
 from ..scenario.imported_law import ImportedLaw
+from ..scenario.run_changes import count_skipped_ticks
 from .difference import (
     RecordDifference,
     describe_law_failure,
@@ -184,7 +185,7 @@ class SiteVerifier:
                 continue
             if self._boot is None or (state.boot != self._boot and state.boot in self._starts):
                 expected = self._begin_start(n, expected)
-            if state.tick != expected:
+            if state.tick != expected + count_skipped_ticks(state.cmd):
                 result.gaps.append((name, expected, state.tick - 1))
                 self._certain = False
             expected = state.tick + 1

@@ -25,6 +25,7 @@ from ..net.loop_stats import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.imported_law import ImportedLaw
+from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
 from .resumption import take_parts
 from .site_channels import SiteChannels, describe_accounts
@@ -63,6 +64,16 @@ def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
             Site(scenario.setup(name))
 
 
+def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
+    """Returns the tick that follows, by each first one of those that a site did not make."""
+    return {
+        tick - change.skipped: tick
+        for tick, changes in commands.items()
+        for change in changes
+        if change.skipped
+    }
+
+
 def execute_virtual(
     scenario: Scenario,
     network: Network | None = None,
@@ -88,6 +99,7 @@ def execute_virtual(
     ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
     # (t_ns, order, k) of each site's next tick
     pending = [(0, index, 0) for index in range(len(sites)) if ticks[index]]
+    skips = [find_skips(commands.get(name, {})) for name in scenario.names]
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
         place = 0
@@ -103,8 +115,9 @@ def execute_virtual(
         yield SiteTick(site, arrivals, output)
         if output.mode is Mode.DIVERGED:
             last_ns = t_ns
-        if k + 1 < ticks[index]:
-            bisect.insort(pending, ((k + 1) * NS_PER_S // site.rate_hz, index, k + 1))
+        after = skips[index].get(k + 1, k + 1)
+        if after < ticks[index]:
+            bisect.insort(pending, (after * NS_PER_S // site.rate_hz, index, after))
 
 
 def virtual_boot(scenario: Scenario, site: str) -> int:
@@ -117,7 +130,7 @@ class _VirtualChannels(SiteChannels):
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = virtual_boot(scenario, site.name)
-        super().__init__(scenario.name, site.name, boot, site.peers, site.rate_hz)
+        super().__init__(scenario, scenario.name, site.name, boot)
         self._writer = writer
         self._stats = LoopStats(site, boot, [scenario.sites[p].rate_hz for p in site.peers])
 
@@ -125,7 +138,8 @@ class _VirtualChannels(SiteChannels):
         payload = encode_state(self._site, self._boot, self.peers, output, arrivals, 0, 0)
         self.accounts[topics.STATE].take(output.tick)
         self._writer.add(self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output)
-        stats = self._stats.take(output) if self._stats.due(output.tick) else None
+        due = self._stats.due(output.tick, count_skipped_ticks(output.cmd))
+        stats = self._stats.take(output) if due else None
         for entry in self.follow(output, stats):
             self.write(entry, self._writer)
 
@@ -139,12 +153,13 @@ def write_virtual_log(
     *,
     as_named: bool = True,
     hands: HandTracks = {},  # noqa: B006
+    commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
     """Runs a scenario in virtual time and writes its log, which is finished however the run ends.
 
     The stream stays open. Once `stopped` is True the run ends, and the file is finished with what there is.
-    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network` and `hands`
-    are as for `execute_virtual`, `as_named` as for `check_virtual`.
+    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network`, `hands` and
+    `commands` are as for `execute_virtual`, `as_named` as for `check_virtual`.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.
@@ -161,7 +176,7 @@ def write_virtual_log(
     t_ns = 0
     try:
         with process.pause_gc():
-            for site, arrivals, output in execute_virtual(scenario, network, hands=hands):
+            for site, arrivals, output in execute_virtual(scenario, network, commands=commands, hands=hands):
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
                 members[site.name].tick(arrivals, output)

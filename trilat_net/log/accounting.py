@@ -95,7 +95,8 @@ class Account:
         duplicate: messages that came though their number was there.
         reordered: messages that came after one with a higher number.
         refilled: messages from the sender's memory, after they had been missing.
-        unmade: numbers that no message has: the sender ended before them and began anew behind them.
+        unmade: numbers that no message has: the sender left them out, or ended before them and began anew
+            behind them.
         last: largest number that is known to exist, -1 before the first.
         silence_ns: the longest time between two that came, ns; 0 if they are not stamped.
     """
@@ -221,6 +222,14 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     return -(-ticks // ticks_per_stats(rate_hz)) if channel == topics.LINK else ticks
 
 
+def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
+    """Returns what a site does not publish that makes no ticks for so many before one, see `begin_anew`.
+
+    That is the number of the message with that tick, or that stands for it, and that of the first not made.
+    """
+    return number_message(channel, tick, rate_hz), count_messages(channel, tick - skipped, rate_hz)
+
+
 def parse_counts(account: str) -> dict[str, int]:
     """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
@@ -265,6 +274,8 @@ def _percent(share: float) -> str:
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
+OVERRUN = "overrun"
+"""The kind of the events that say which ticks a site did not make."""
 MAX_STARTS = 64
 """Starts of a member whose events are counted apart."""
 EVENTS_NUMBERED_SINCE = 3
@@ -338,6 +349,19 @@ class SessionAccounts:
                 self._ends[event.member] = event.ticks
             elif event.kind == "join":
                 self.begin_anew(event.member, event.ticks, self._ends.pop(event.member, 0))
+            elif event.kind == OVERRUN:
+                self._leave_out(event)
+
+    def _leave_out(self, event: Event) -> None:
+        """Takes ticks that a site says it did not make, as "first-last first-last", for not made."""
+        rate_hz = self._rates_hz[event.member]
+        for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
+            for channel in (topics.STATE, topics.LINK):
+                topic, tick = self._topic(event.member, channel), int(last) + 1
+                if topic in self._accounts and int(first) < tick <= event.ticks:
+                    base = self._bases.get(topic, 0)
+                    numbers = skipped_numbers(channel, tick, tick - int(first), rate_hz)
+                    self._accounts[topic].begin_anew(*(number - base for number in numbers))
 
     def _count(self, topic: str, number: int, account: Account | None = None) -> None:
         base = self._bases.setdefault(topic, number if self._continued else 0)

@@ -251,8 +251,9 @@ class Log:
         return found
 
     def absent_ticks(self, site: str) -> int:
-        """Returns how many ticks that is for a site."""
-        return sum(last - first + 1 for first, last in self.absences.get(site, ()))
+        """Returns how many ticks that is for a site, and how many it left out as its records say."""
+        between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
+        return between + self[site].skipped
 
     def expected_ticks(self, site: str) -> int:
         """Returns how many ticks of a site belong to the run.

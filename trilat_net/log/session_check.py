@@ -30,7 +30,8 @@ from ..net.messages import (
 )
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
-from .accounting import Account, count_messages, number_message, parse_counts
+from ..scenario.run_changes import count_skipped_ticks
+from .accounting import Account, count_messages, number_message, parse_counts, skipped_numbers
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -124,6 +125,7 @@ class ChannelCheck:
         first, last: number and publish time of the messages with the lowest and the highest number.
         ends: by boot how many ticks the member made, of those that have stated it.
         joins: by boot the first tick, of those that joined the running session.
+        skips: by boot the stretches of ticks that its records leave out: the tick after each, how many.
     """
 
     def __init__(
@@ -142,6 +144,7 @@ class ChannelCheck:
         self.last: tuple[int, int] | None = None
         self.ends: dict[int, int] = {}
         self.joins: dict[int, int] = {}
+        self.skips: dict[int, list[tuple[int, int]]] = defaultdict(list)
         self._epoch_ns, self._version, self._problems = epoch_ns, version, problems
         self._in_file: dict[int, Account] = self.accounts
         self._file, self._log_ns = "", 0
@@ -176,6 +179,12 @@ class ChannelCheck:
                 account.expect(count_messages(self.kind, min(stated, most), self.rate_hz))
             if 0 < first <= most:
                 account.begin_anew(count_messages(self.kind, first, self.rate_hz))
+
+    def leave_out(self, records: "ChannelCheck") -> None:
+        """Counts nothing as missing of ticks of which the member's records say that it did not make them."""
+        for boot, skips in records.skips.items():
+            for tick, skipped in skips:
+                self.accounts[boot].begin_anew(*skipped_numbers(self.kind, tick, skipped, self.rate_hz))
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
         """Begins with another file, and checks how it describes the channel."""
@@ -213,6 +222,8 @@ class ChannelCheck:
             self._add("schema", offset, text)
         if identity.member != self.member:
             self._add("schema", offset, f"a message says that it is of {identity.member[:40]!r}")
+        if isinstance(message, State) and (skipped := count_skipped_ticks(message.cmd)):
+            self.skips[message.boot].append((message.tick, skipped))
         if identity.number >= 0:  # events have numbers from version 3 on
             self._check_number(stored, identity, offset)
         self._check_times(stored, identity, offset)
@@ -394,11 +405,16 @@ class SessionCheck:
             if self._problems["chain"].wrong:
                 yield self._problems["chain"].finding("chain", "")
             return
-        told = {check.member: check for check in self.channels.values() if check.kind == topics.EVENT}
+        told, records = (
+            {check.member: check for check in self.channels.values() if check.kind == kind}
+            for kind in (topics.EVENT, topics.STATE)
+        )
         for check in self.channels.values():  # what a member published in the ticks that it stated
             if check.kind in (topics.STATE, topics.LINK) and check.member in told:
                 most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
                 check.expect(told[check.member], most)
+                if check.member in records:
+                    check.leave_out(records[check.member])
         yield self._check_sequence()
         yield self._check_accounts()
         yield self._problems["chain"].finding("chain", self._chain_text)

@@ -19,6 +19,7 @@ from ..core.vectors import Array
 from ..errors import LogError, WireError
 from ..net.messages import READABLE, State
 from ..net.wire import decode
+from ..scenario.run_changes import count_skipped_ticks
 from . import record_columns
 from .record_columns import Ints
 
@@ -259,9 +260,14 @@ class SiteLog:
         """How many ticks before the last record have none."""
         return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0
 
+    @property
+    def skipped(self) -> int:
+        """How many ticks the site did not make, as its records say."""
+        return sum(count_skipped_ticks(texts) for texts in self._changes.values())
+
     mode = _RecordField(
         record_columns.decode_strings,
-        'Mode, shape (K,): "run", "hold", "brake", "return", "waiting" or "diverged".',
+        'Mode, shape (K,): "run", "hold", "brake", "return", "waiting", "fault", "stopped" or "diverged".',
     )
     q = _RecordVector("Joint angles, shape (K, n), rad.")
     qd = _RecordVector("Joint velocities, shape (K, n), rad/s.")

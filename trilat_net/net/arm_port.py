@@ -23,6 +23,9 @@ from .site_port import SitePort
 from .wire import encode
 from .zenoh_bus import ZenohBus
 
+BRAKE_NS = 100_000_000
+"""Time of a fault after which the brakes are to hold the arm."""
+
 
 class ArmPort(SitePort):
     """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one."""
@@ -74,7 +77,11 @@ class ArmPort(SitePort):
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, N m per joint; None if the arm must brake.
 
-        It must before the first tick, after the run, and while no record newer than `FRESH_NS` has arrived.
+        It must before the first tick, after the run, while no record newer than `FRESH_NS` has arrived, and
+        `BRAKE_NS` after a fault began, when its torque has come down to damping and gravity.
         """
         record, fresh = self.record, self.fresh
-        return tuple(record.tau) if fresh and record is not None else None
+        if not fresh or record is None:
+            return None
+        since_ns = record.mem[len(record.q_des)] if record.mode == "fault" else record.t_ns
+        return tuple(record.tau) if record.t_ns - since_ns < BRAKE_NS else None

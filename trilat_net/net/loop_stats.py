@@ -17,11 +17,20 @@ def ticks_per_stats(rate_hz: int) -> int:
     return max(1, rate_hz // STATS_PER_SECOND)
 
 
+def find_skipped_stats(first: int, next_tick: int, rate_hz: int) -> tuple[int, int]:
+    """Returns which statistics a site does not publish that makes no ticks from one on, up to another.
+
+    As the number of the first of them and of the next that it does publish.
+    """
+    every = ticks_per_stats(rate_hz)
+    return min(-(-first // every), next_tick // every), next_tick // every
+
+
 class LoopStats:
     """Counters of a loop, since the last statistics and since the start; `rates` are those of the peers, Hz.
 
     Attributes:
-        overruns: ticks whose work began after the next one was due.
+        overruns: ticks whose work began after the next one was due, or that were not made.
     """
 
     def __init__(self, site: Site, boot: int, rates: list[int]) -> None:
@@ -32,17 +41,18 @@ class LoopStats:
         self.dropped: Counter[str] = Counter()
         self.overruns = 0
 
-    def tick(self, late_us: int, busy_us: int) -> None:
-        """Counts one tick: its lateness, and the computing time of the one before."""
+    def tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+        """Counts one tick: its lateness, the computing time of the one before, and how many were not made."""
+        self.overruns += skipped
         if late_us > self._late_max_us:
             self._late_max_us = late_us
         if busy_us > self._busy_max_us:
             self._busy_max_us = busy_us
         self.overruns += late_us >= self._period_us
 
-    def due(self, k: int) -> bool:
-        """True at the ticks after which statistics are published."""
-        return k % self._every == 0
+    def due(self, k: int, skipped: int = 0) -> bool:
+        """True at the ticks after which statistics are published; one stands for the skipped ones before."""
+        return k % self._every <= skipped
 
     def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
         """Returns the statistics as of a record's tick, with the timing fields that were measured if any.

@@ -48,7 +48,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boot: the sender's process start, random.
         tick: its tick.
         t_ns: nominal time, ns since the session's epoch.
-        mode: "run", "hold", "brake", "return", "waiting" or "diverged", see `core.tick.Mode`.
+        mode: "run", "hold", "brake", "return", "waiting", "fault", "stopped" or "diverged", see
+            `core.tick.Mode`.
         q: joint angles.
         qd: joint velocities.
         q_des: reference, Eq. (6).

@@ -34,11 +34,16 @@ class Pong(Request, frozen=True, kw_only=True):
     left_ns: Instant
 
 
+OrderName = Literal["", "stop", "enable", "reset"]
+"""What a site may be ordered from outside; "" is no order."""
+
+
 class ChangeRequest(Request, frozen=True, kw_only=True):
     """A change requested from a site, as in a scenario's timeline, from the earliest possible tick on.
 
     It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`; or `stop_s`, the
-    time since the epoch, s, before which the site's last tick lies; or `mark`, a text for the log.
+    time since the epoch, s, before which the site's last tick lies; or `mark`, a text for the log; or an
+    `order`, which the site carries out in its next tick.
     """
 
     link: str = ""
@@ -47,6 +52,7 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
     ramp_s: float = 0.0
     stop_s: Annotated[float, Meta(ge=0.0, le=1e6)] | None = None
     mark: Annotated[str, Meta(max_length=80)] = ""
+    order: OrderName = ""
 
 
 class ChangeReply(Request, frozen=True, kw_only=True):

@@ -1,7 +1,7 @@
 """A site as a program beside it sees it: its newest record, and whether its run is over.
 
-Invariant: a record of another start of the site than the first one met is passed over; what cannot be read
-is a stranger's, and changes nothing.
+Invariant: a record of another start of the site than the first one met is passed over, and so is one that is
+older than the newest or too far ahead; what cannot be read is a stranger's, and changes nothing.
 """
 
 from collections import deque
@@ -17,6 +17,10 @@ from .wire import decode, split_states
 
 FRESH_NS = 100_000_000
 """Age at which a record is no longer the present: the site is late, or gone."""
+
+
+AHEAD_NS = 1_000_000_000
+"""A record may be so much later than the one before than the time that has passed since."""
 
 
 class SitePort:
@@ -57,6 +61,14 @@ class SitePort:
         self._read_messages()
         return self._gone
 
+    def _follows_last(self, record: State, came_ns: int) -> bool:
+        """True if a record is later than the newest one, of the same start, and no later than it can be."""
+        last = self._record
+        if last is None:
+            return True
+        newer = record.boot == last.boot and record.tick > last.tick and record.t_ns > last.t_ns
+        return newer and record.t_ns - last.t_ns <= came_ns - self._came_ns + AHEAD_NS
+
     def _read_messages(self) -> None:
         while (message := self._records.poll()) is not None:
             try:
@@ -64,7 +76,7 @@ class SitePort:
                 record = decode(payload, State)
             except WireError:
                 continue  # a stranger's
-            if self._record is None or record.boot == self._record.boot:
+            if self._follows_last(record, message[1]):
                 self._record, self._came_ns = record, message[1]
         for event in read_events(self._events):
             if event.kind == "end" and self._record is not None and event.boot == self._record.boot:

@@ -58,7 +58,13 @@ def format_change_lines(log: Log) -> list[str]:
 def format_mode_lines(log: Log) -> list[str]:
     """Returns a line per site that held, braked or returned."""
     lines = []
-    doing = {"hold": "held", "brake": "braked", "return": "returned", "waiting": "waited"}
+    doing = {
+        "hold": "held",
+        "brake": "braked",
+        "return": "returned",
+        "waiting": "waited",
+        "fault": "in fault",
+    }
     for site in log.sites:
         if found := find_mode_intervals(log[site]):
             words = [f"{doing.get(s.mode, s.mode)} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]]

@@ -42,7 +42,7 @@ from .fields import (
 from .imported_law import LAW_PATH_PATTERN, hash_law_source, read_law_sends
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
-from .scenario_types import SITE_GROUPS, Change, Limits, SiteSpec
+from .scenario_types import SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -356,9 +356,11 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
         if found := find_count_problem(table, kind, counts):
             raise ScenarioError(found.problem, path=f"{place}.{found.key}")
     for key, value in site["limits"].items():
-        if isinstance(value, list) and len(value) != counts.joints:
-            problem = f"has {len(value)} numbers, and the arm has {counts.joints} joints"
-            raise ScenarioError(problem, path=f"{path}.limits.{key}")
+        wanted, owner = counts.joints, f"the arm has {counts.joints} joints"
+        if key == "qd_des_limit_rad_s":
+            wanted, owner = counts.shared, f"sites share {counts.shared} coordinates"
+        if isinstance(value, list) and len(value) != wanted:
+            raise ScenarioError(f"has {len(value)} numbers, and {owner}", path=f"{path}.limits.{key}")
 
 
 def _draw_site(site: TomlTable, path: str, draws: Draws) -> None:
@@ -456,7 +458,7 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
     before_s = 0.0
     for n, entry in enumerate(written):
         path = f"timeline[{n}]"
-        change = dict(check_keys(entry, field_names(Change), path))
+        change = dict(check_keys(entry, TIMELINE_KEYS, path))
         at_s = change.get("at_s")
         if not is_number(at_s):
             raise ScenarioError("must be a time in s", path=f"{path}.at_s")

@@ -4,14 +4,16 @@ Invariant: a change is completed upon the state before it, and its text in a rec
 every reader derives the same `CoreChange` from it.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import msgspec
 
-from ..core.ticks import NS_PER_S, CoreChange
+from ..core.ticks import NS_PER_S, CoreChange, LifeOrder
 from ..errors import ScenarioError
 from .resolve import resolve_dominance_row, resolve_target
-from .scenario_types import Change, Scenario
+from .scenario_types import Change, Scenario, SiteOrder
 from .validate import check_change
 
 LinkTables = dict[str, dict[str, Any]]
@@ -46,13 +48,40 @@ def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, A
 
 def find_owner(change: Change) -> str:
     """Returns the site that carries a change out; a link belongs to its receiver."""
-    return change.dominance or change.link.partition("->")[2]
+    return change.site or change.dominance or change.link.partition("->")[2]
+
+
+def make_site_order(scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0) -> Change:
+    """Returns an order to a site, which it carries out at a tick at `from_ns`, ns since the epoch.
+
+    Raises:
+        ScenarioError: the site does not know such orders.
+    """
+    action = scenario.sites[site].on_stale.action
+    if action != "glide":
+        raise ScenarioError(
+            f"{site} has on_stale.action = {action!r}; one that can stop, and go on without a jump, has "
+            "'glide'. The whole session ends with trilat stop --end"
+        )
+    return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
+
+
+def count_skipped_ticks(texts: Sequence[str]) -> int:
+    """Returns how many ticks before its own a record says that its site did not make, by its changes."""
+    skipped = 0
+    for text in texts:
+        if "overrun" in text:
+            with suppress(msgspec.MsgspecError):
+                skipped += msgspec.json.decode(text, type=Change).ticks
+    return skipped
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
     """Returns a change as its owner takes it in."""
     text = msgspec.json.encode(change).decode()
     site = find_owner(change)
+    if change.order:
+        return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
     if change.dominance:
         return CoreChange(text, ramp=scenario.ramp(site, change.shares, change.start_ns, change.ramp_s))
     peer = scenario.peers(site).index(change.link.partition("->")[0])
@@ -69,12 +98,16 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         change = msgspec.json.decode(text, type=Change)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise ScenarioError(f"the record names a command that is none: {error}", path=text[:80]) from None
-    if change.link not in ("", *scenario.links) or change.dominance not in ("", *scenario.names):
+    sites = ("", *scenario.names)
+    if change.link not in ("", *scenario.links) or change.dominance not in sites or change.site not in sites:
         raise ScenarioError(
             "the record names a command for a link or site that does not exist", path=text[:80]
         )
-    if find_owner(change) != site or bool(change.link) == bool(change.dominance):
+    named = [bool(name) for name in (change.link, change.dominance, change.site)]
+    if find_owner(change) != site or sum(named) != 1 or bool(change.site) != bool(change.order):
         raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
+    if change.order:
+        make_site_order(scenario, site, change.order, change.start_ns)
     check_change(change, "cmd")
     if change.dominance:
         resolve_dominance_row(change.to, list(scenario.names), change.dominance, "cmd.to")

@@ -6,6 +6,7 @@ complete in itself.
 """
 
 import hashlib
+import math
 import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -20,7 +21,15 @@ from ..core import dominance
 from ..core.chain import MAX_JOINTS
 from ..core.law_channel import LawChannel
 from ..core.philox import link_key
-from ..core.site_setup import Layout, LinkSetup, Scheme, SiteSetup, StaleAction, StaleRule
+from ..core.site_setup import (
+    Layout,
+    LinkSetup,
+    MotionLimits,
+    Scheme,
+    SiteSetup,
+    StaleAction,
+    StaleRule,
+)
 from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
@@ -29,7 +38,7 @@ from .arms import Arm, ArmModel, Task, build_arm
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
-from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz
+from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from .imported_law import PluggedLaw
 from .laws import ControlLaw
 from .operators import Environment, Operator, find_live_hand
@@ -79,11 +88,30 @@ class Limits(Frozen, frozen=True):
     Attributes:
         tau_limit_nm: largest control torque of a joint, N m; more is cut off. One number, or one per joint;
             left out, a chain has the efforts that its file states.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so too.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so too. Under the
+            rule "glide" the site is in fault in its place, and the run goes on.
+        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s.
+        qd_des_limit_rad_s: largest speed of the reference, rad/s; in task space m/s.
+        q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is in fault.
+        q_max_rad: largest angle, likewise.
     """
 
     tau_limit_nm: Positive | PositiveJoints = 200.0
     qd_limit_rad_s: SpeedLimit | SpeedLimits = 100.0
+    tau_rate_limit_nm_s: Positive | PositiveJoints | None = None
+    qd_des_limit_rad_s: SpeedLimit | SpeedLimits | None = None
+    q_min_rad: Real | Joints | None = None
+    q_max_rad: Real | Joints | None = None
+
+    @property
+    def motion(self) -> MotionLimits:
+        """Those that the core has besides the first two."""
+        return MotionLimits(
+            q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
+            q_max=math.inf if self.q_max_rad is None else self.q_max_rad,
+            qd_des_limit=math.inf if self.qd_des_limit_rad_s is None else self.qd_des_limit_rad_s,
+            tau_rate=math.inf if self.tau_rate_limit_nm_s is None else self.tau_rate_limit_nm_s,
+        )
 
 
 class SiteSpec(Frozen, frozen=True):
@@ -122,8 +150,14 @@ SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale"
 """Tables that a scenario may have for all sites, and each site for itself."""
 
 
+SiteOrder = Literal["", "stop", "enable", "reset", "overrun", "arm_silent", "arm_lost", "arm_back"]
+"""What a site may be ordered, from outside (the first three) or by itself."""
+TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
+"""Keys of a change that a scenario may have."""
+
+
 class Change(Frozen, frozen=True, omit_defaults=True):
-    """One change. Exactly one of `link` and `dominance` is given.
+    """One change. Exactly one of `link`, `dominance` and `site` is given; the last is of records alone.
 
     Attributes:
         at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then on.
@@ -131,6 +165,9 @@ class Change(Frozen, frozen=True, omit_defaults=True):
         dominance: the site whose dominance factors it changes.
         to: the whole link from then on, or all factors of the row.
         ramp_s: duration of the linear change of the factors, s.
+        site: the site that is given an order.
+        order: that order, see `core.ticks.LifeOrder`.
+        ticks: of "overrun", how many ticks the site did not make.
     """
 
     at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
@@ -138,6 +175,9 @@ class Change(Frozen, frozen=True, omit_defaults=True):
     dominance: str = ""
     to: dict[str, Any] = msgspec.field(default_factory=dict)
     ramp_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+    site: str = ""
+    order: SiteOrder = ""
+    ticks: Annotated[int, Meta(ge=0, lt=2**40)] = 0
 
     @property
     def start_ns(self) -> int:
@@ -172,6 +212,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     "environment": ((), []),
     "plant": ("simulated",),
     "sends": ({},),
+    **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad"), (None,)),
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
@@ -186,6 +227,10 @@ def _drop_unused(arm: dict[str, Any]) -> None:
     for key, value in list(arm.items()):
         if key in unused or (key not in planar and value == defaults[key]):
             del arm[key]
+
+
+STOPPING_S = 0.1
+"""Time in which a joint's speed falls to a third, of a site that is stopped and whose law damps nothing."""
 
 
 class Scenario(Frozen, frozen=True, dict=True):
@@ -264,9 +309,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         sites = tables["sites"].values()
         for site in sites:
             _drop_unused(site["arm"])
-        for table in (tables, *sites, *(site["control"] for site in sites)):
+        for table in (tables, *sites, *(site[group] for site in sites for group in ("control", "limits"))):
             for key, absent in _ABSENT.items():
-                if table.get(key) in absent:
+                if key in table and table[key] in absent:
                     del table[key]
         urdf = tables.pop("urdf", None)
         numbers = _NUMBERS.sub(
@@ -359,7 +404,21 @@ class Scenario(Frozen, frozen=True, dict=True):
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
+            limits=spec.limits.motion,
+            damping=self._stopping_damping(site) if spec.on_stale.action == "glide" else (0.0,),
         )
+
+    def _stopping_damping(self, site: str) -> Array:
+        """Returns the damping of a site that is stopped, shape (n,), N m s/rad: that of its law.
+
+        Where the law has none of its own it brings each joint by itself to rest in `STOPPING_S`.
+        """
+        spec, arm = self.sites[site], self.arms[site]
+        control = spec.control
+        gains = control.linear_gains(arm.theta) if isinstance(control, PluggedLaw) else None
+        gains = gains or control.gains(arm.theta)
+        own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
+        return np.where(own > 0.0, own, arm.joint_inertias(spec.q0_rad) / STOPPING_S)
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
         name = f"{peer}->{site}"

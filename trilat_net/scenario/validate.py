@@ -59,6 +59,38 @@ def refuse_external_arms(scenario: Scenario, given: Collection[str] = ()) -> Non
             )
 
 
+OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
+"""Limits that an arm outside of the program must have besides the usual ones."""
+
+
+def check_outside_arms(scenario: Scenario) -> None:
+    """Refuses arms outside of the program without limits, or whose sites would not hold and stop in order.
+
+    Logs of earlier versions may lack these, so that this is asked before a session, not of every scenario.
+
+    Raises:
+        ScenarioError: with the path of the first key that is missing.
+    """
+    for name in scenario.external:
+        site = scenario.sites[name]
+        for key in OUTSIDE_LIMITS:
+            if getattr(site.limits, key) is None:
+                raise ScenarioError(
+                    "is missing: an arm outside of the program needs limits of its position "
+                    "(q_min_rad, q_max_rad), its reference (qd_des_limit_rad_s) and the rate of its torque "
+                    "(tau_rate_limit_nm_s), besides tau_limit_nm and qd_limit_rad_s",
+                    path=f"sites.{name}.limits.{key}",
+                    source=scenario.name,
+                )
+        if site.on_stale.action != "glide":
+            raise ScenarioError(
+                f"is {site.on_stale.action!r}, and an arm outside of the program needs 'glide': only so does "
+                "its site wait, hold and stop without a jump (docs/links.md)",
+                path=f"sites.{name}.on_stale.action",
+                source=scenario.name,
+            )
+
+
 def refuse_live_only(scenario: Scenario) -> None:
     """Refuses what a live session alone has: arms outside of the program, and delays of a real network.
 
@@ -153,6 +185,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
     _check_joint_space(scenario)
     _check_start_poses(scenario)
+    for name in scenario.names:
+        _check_limits(scenario, name)
     _check_task_poses(scenario)
     _check_energy_laws(scenario)
     for name, site in scenario.sites.items():
@@ -270,6 +304,32 @@ def _check_start_poses(scenario: Scenario) -> None:
                     f"from {joint.lower:g} to {joint.upper:g} {unit}: start within, or set stops = false",
                     path=path,
                 )
+
+
+def _check_limits(scenario: Scenario, name: str) -> None:
+    """Refuses limits that leave no room, that nothing keeps, or that a start pose breaks."""
+    site, path = scenario.sites[name], f"sites.{name}.limits"
+    low, high = site.limits.motion.q_min, site.limits.motion.q_max
+    stated = next((key for key in ("q_min_rad", "q_max_rad") if getattr(site.limits, key) is not None), "")
+    if stated and site.on_stale.action != "glide":
+        raise ScenarioError(
+            f"is kept under on_stale.action = 'glide' alone, and here that is {site.on_stale.action!r}",
+            path=f"{path}.{stated}",
+        )
+    if site.limits.qd_des_limit_rad_s is not None and site.task.space == "pose":
+        raise ScenarioError(
+            "goes along differences of coordinates, and orientations have none: leave it out",
+            path=f"{path}.qd_des_limit_rad_s",
+        )
+    if not np.all(np.less(low, high)):
+        raise ScenarioError("must be above q_min_rad everywhere", path=f"{path}.q_max_rad")
+    start = np.array(site.q0_rad)
+    if np.any((start < low) | (start > high)):
+        joint = int(np.argmax((start < low) | (start > high)))
+        raise ScenarioError(
+            f"is {start[joint]:g} rad, beyond q_min_rad or q_max_rad: start within",
+            path=f"sites.{name}.q0_rad[{joint}]",
+        )
 
 
 def _check_task_poses(scenario: Scenario) -> None:

@@ -46,6 +46,7 @@ class SiteConstants(NamedTuple):
             () in joint space.
         rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of that, rad/s.
         friction: share of the joints' friction that the law compensates.
+        tau_rate: largest rate of the torque of a joint, N m/s, shape () or (n,).
     """
 
     arm: ArmRows
@@ -61,6 +62,7 @@ class SiteConstants(NamedTuple):
     rho: Array | float = 0.0
     width: Array | float = 1.0
     friction: Array | float = 1.0
+    tau_rate: Array | float = np.inf
 
     @property
     def theta(self) -> Array:
@@ -104,6 +106,7 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
         axes=() if task is None else task.axes,
         tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
         outside=spec.plant == "external",
+        tau_rate=np.asarray(spec.limits.motion.tau_rate, dtype=np.float64),
     )
 
 
@@ -198,6 +201,38 @@ class SiteMotion:
         model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
         found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
         return found - (1.0 - c.friction) * c.arm.friction(v)
+
+    @property
+    def stopped(self) -> Bools:
+        """True if the torque is that of a site that is stopped, shape (K,)."""
+        at = self.records
+        return at.stopped if at.stopped.size else np.zeros(len(at.known), dtype=np.bool_)
+
+    @cached_property
+    def nearest_torques(self) -> tuple[Array, Array]:
+        """The least and the largest torque that a row may have, by its limit and its rate, (K, n), N m."""
+        at, c = self.records, self.constants
+        low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
+        high = -low
+        if np.any(np.isfinite(c.tau_rate)):
+            before = np.vstack(
+                [np.zeros(at.tau.shape[1]), at.tau[:-1]]
+            )  # before the first tick there is none
+            most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
+            most[0] = most[0] if at.first == 0 else np.inf
+            low, high = np.maximum(low, before - most), np.minimum(high, before + most)
+        return low, high
+
+    @cached_property
+    def cut(self) -> Bools:
+        """True for each torque at its limit, or as far from the one before as it may be, shape (K, n)."""
+        low, high = self.nearest_torques
+        near = (
+            RATE_TOLERANCE * self.constants.tau_limit if np.any(np.isfinite(self.constants.tau_rate)) else 0.0
+        )
+        tau = self.records.tau
+        found: Bools = (tau <= low + near) | (tau >= high - near)
+        return found & ~self.stopped[:, np.newaxis]
 
     @cached_property
     def ends(self) -> PeriodEnds:
@@ -416,9 +451,9 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work of what the limit cut off: int r' (tau - tau of Eq. (13))."""
-    at, c = site.records, site.constants
-    cut = np.flatnonzero((np.abs(at.tau) >= c.tau_limit).any(axis=1))
+    """Returns the work of what limits, or a stop, kept from the arm: int r' (tau - tau of Eq. (13))."""
+    at = site.records
+    cut = np.flatnonzero(site.cut.any(axis=1) | site.stopped)
     power = np.zeros(len(at.known))
     if len(cut):
         power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
@@ -461,18 +496,18 @@ def singular_pose_work(site: SiteMotion) -> Increment:
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Returns by how much recorded torques differ from Eq. (13) within its limit, shape (K,), N m.
+    """Returns by how much recorded torques differ from Eq. (13) within its limits, shape (K,), N m.
 
-    The largest of all joints; 0 where there is no record.
+    The largest of all joints; 0 where there is no record, or where the site is stopped.
     """
-    at, c = site.records, site.constants
+    at = site.records
     law = site.law_torque(np.arange(len(at.known)))
-    error: Array = np.abs(at.tau - np.clip(law, -c.tau_limit, c.tau_limit)).max(axis=1)
-    return np.where(at.known, error, 0.0)
+    error: Array = np.abs(at.tau - np.clip(law, *site.nearest_torques)).max(axis=1)
+    return np.where(at.known & ~site.stopped, error, 0.0)
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed and wrong.
+    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or stopped.
 
     The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the truth; a
     parameter that is not adapted leaves r' Y (theta_hat - theta) without its counterpart.
@@ -480,7 +515,7 @@ def estimate_work(site: SiteMotion) -> Increment:
     at, c = site.records, site.constants
     off = at.theta_hat - c.theta
     at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts
-    wrong = (off != 0.0) & ~c.adapts
+    wrong = (off != 0.0) & (~c.adapts | site.stopped[:, np.newaxis])
     if not (at_edge.any() or wrong.any()):
         return _nothing(site)
     held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr  # what the box kept the estimate from
@@ -490,6 +525,8 @@ def estimate_work(site: SiteMotion) -> Increment:
     return _trapezoid(site, power[:-1], power[1:], amount)
 
 
+RATE_TOLERANCE = 1e-12
+"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
 JUMP_TOLERANCE = 1e-12
 """A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
 

@@ -194,13 +194,15 @@ def _add_parts(energy: Array) -> Array:
 
 def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     part = log[name]
-    mem = np.array([row[part.layout.shared + 1 :] for row in part.mem[:count]]).reshape(count, -1)
+    glides = log.scenario.sites[name].on_stale.action == "glide"
+    own = part.layout.life_memory(len(part.peers)) if glides else part.layout.shared + 1
+    mem = np.array([row[own:] for row in part.mem[:count]]).reshape(count, -1)
     memory, first = {}, 0
     for attribute in getattr(law, "remembers", ()):
         length = np.size(getattr(law, attribute))
         memory[attribute] = mem[:, first : first + length]
         first += length
-    own = {key: values[:count] for key, values in part.sent.items()}
+    sent = {key: values[:count] for key, values in part.sent.items()}
     peers = []
     for peer in part.peers:
         tick = part.used[peer][:count]
@@ -211,9 +213,9 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
             for key, values in heard.items()
             if "[" not in key
         }
-        alone = {key.partition("[")[0]: values for key, values in own.items() if key.endswith(f"[{peer}]")}
+        alone = {key.partition("[")[0]: values for key, values in sent.items() if key.endswith(f"[{peer}]")}
         peers.append(PeerRecords(tick, received, alone))
-    to_all = {key: values for key, values in own.items() if "[" not in key}
+    to_all = {key: values for key, values in sent.items() if "[" not in key}
     motion = (part.q[:count], part.qd[:count], part.tau[:count], part.tau_x[:count])
     return LawRecords(1.0 / part.rate_hz, *motion, to_all, memory, peers)
 

@@ -14,7 +14,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
-from ..aligned import Bools
+from ..aligned import STOPPED_MODES, Bools, find_unlimited
 from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
 from ..timeline import find_mode_intervals, recorded_end_s
@@ -154,7 +154,13 @@ def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
 def _check_following(log: Log) -> Premise:
     found = {site: find_mode_intervals(log[site]) for site in log.sites}
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
-    text = f"hold, brake or return: {_list(away)}" if away else "every site follows its peers all the time"
+    stops = any(one.mode in STOPPED_MODES for intervals in found.values() for one in intervals)
+    for site in log.sites:
+        held = ~find_unlimited(log.scenario.sites[site].limits, log[site].qd_des)
+        if held.any():
+            away.append(f"{site} with a reference as fast as it may be at {np.count_nonzero(held)} ticks")
+    words = "hold, brake, return or stop" if stops else "hold, brake or return"
+    text = f"{words}: {_list(away)}" if away else "every site follows its peers all the time"
     return Premise("following", not away, text)
 
 
@@ -162,7 +168,7 @@ def _check_torque_limits(scenario: Scenario, energies: Mapping[str, SiteEnergy])
     """No torque is cut off; of a chain the joints are named at which one is."""
     ticks = []
     for site, energy in energies.items():
-        at_limit = np.abs(energy.motion.records.tau) >= energy.motion.constants.tau_limit
+        at_limit = energy.motion.cut
         if at_limit.any():
             which = _name_joints(scenario, site, at_limit)
             ticks.append(f"{site}{which} at {np.count_nonzero(at_limit.any(axis=1))} ticks")

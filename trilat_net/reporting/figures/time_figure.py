@@ -28,7 +28,14 @@ SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
 _AWAY, _BACK = 0.22, 0.09
 _LETTERS_PER_IN = 120.0
 """Of 1 pt type, on the average."""
-_MODE_VERBS = {"hold": "holds", "brake": "brakes", "return": "returns (lighter)", "waiting": "waits"}
+_MODE_VERBS = {
+    "hold": "holds",
+    "brake": "brakes",
+    "return": "returns (lighter)",
+    "waiting": "waits",
+    "fault": "is in fault",
+    "stopped": "is stopped",
+}
 _CHANGE: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
 _NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),

@@ -1,0 +1,222 @@
+"""Limits, faults, stops: what no law, peer or order can make an arm do."""
+
+import functools
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.core.test_session_life import TEXT
+from trilat_net.core.safeguards import BLEND_S
+from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.errors import ScenarioError
+from trilat_net.execution import virtual
+from trilat_net.execution.rerun import rerun
+from trilat_net.execution.resumption import read_output
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario, to_core_change
+from trilat_net.scenario.run_changes import make_site_order
+
+RATE_NM_S = 500.0
+LIMITS = {"tau_rate_limit_nm_s": RATE_NM_S, "qd_des_limit_rad_s": 6.0, "q_min_rad": -4.0, "q_max_rad": 4.0}
+KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "limit": 4.0}
+
+
+def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
+    """The scenario of the rule, with limits of all sites or of one."""
+    overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
+    return parse_scenario(text.format(**{**KEYS, **keys}), "", overrides)
+
+
+def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
+    """A virtual run in which sites are given orders at ticks."""
+
+    def change(site: str, tick: int, order: str) -> CoreChange:
+        t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
+        made = make_site_order(scenario, site, order, t_ns, ticks)
+        return to_core_change(scenario, made)
+
+    commands = {
+        site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
+        for site, of_site in orders.items()
+    }
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream, commands=commands)
+    stream.seek(0)
+    return open_log(stream)
+
+
+def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
+    """The modes of a site, each with its reason, as they followed each other."""
+    found: list[tuple[str, LifeReason]] = []
+    for state in log[site].states:
+        reason = find_life_reason(read_output(state, log[site].peers))
+        if not found or found[-1] != (state.mode, reason):
+            found.append((state.mode, reason))
+    return found
+
+
+@functools.cache
+def stopped_log() -> Log:
+    """The slave is stopped at 2 s, while it moves, and enabled at 3.5 s."""
+    return ordered(guarded(), {"s": {2000: "stop", 3500: "enable"}})
+
+
+def test_a_stop_takes_the_torque_over_to_damping_and_gravity_in_a_tenth_of_a_second() -> None:
+    log = stopped_log()
+    part, theta = log["s"], log.scenario.arms["s"].theta
+    modes = part.mode
+    assert modes[1999] == "run"
+    assert set(modes[2000:3500]) == {"stopped"}
+    q, qd = part.q[2000:3500], part.qd[2000:3500]
+    outer = theta[4] * np.cos(q[:, 0] + q[:, 1])
+    gravity = 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
+    share = np.minimum((np.arange(1500) + 1.0) * 1e-3 / BLEND_S, 1.0)[:, None]
+    wanted = (1.0 - share) * part.tau[1999] + share * (gravity - 12.0 * qd)
+    assert np.abs(part.tau[2000:3500] - wanted).max() <= 1e-9
+    assert np.abs(part.qd[2000]).max() > 0.05
+    assert np.abs(part.qd[3499]).max() <= 0.01
+    assert (part.q_des[2100:3500] == q[100:]).all()  # the own pose, once the limit of speed lets it
+    assert modes[3500] == "return"  # its peers are there
+    assert modes[-1] == "run"
+
+
+def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
+    log = stopped_log()
+    assert verify(log).identical == 12_000
+    assert compare_with_virtual(log).fed.identical == 12_000
+    again = rerun(log, ["s"])
+    assert again.sites["s"].identical == 6000
+
+
+def test_estimates_of_a_site_that_is_stopped_stay_as_they_are() -> None:
+    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
+    text = text.replace('law = "pd_d"', 'law = "adaptive"')
+    log = ordered(guarded(text=text), {"s": {2000: "stop", 3000: "enable"}})
+    theta_hat = log["s"].theta_hat
+    assert np.ptp(theta_hat[1999:3000], axis=0).max() == 0.0
+    assert np.ptp(theta_hat[3000:], axis=0).max() > 0.0
+    assert verify(log).identical == 12_000
+    assert log["s"].mode[-1] == "run"
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [
+        ({"q_max_rad": [0.5, 1.2]}, LifeReason.LIMIT_Q),
+        ({"q_min_rad": [-0.2, -4.0]}, LifeReason.LIMIT_Q),
+        ({"qd_limit_rad_s": 0.4}, LifeReason.LIMIT_QD),
+    ],
+)
+def test_a_passed_limit_is_a_fault_until_it_is_reset(limits: dict[str, object], reason: LifeReason) -> None:
+    scenario = guarded(limits, where="sites.s.")
+    log = ordered(scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}})
+    found = reasons(log, "s")
+    assert ("fault", reason) in found
+    at = list(log["s"].mode).index("fault")
+    assert set(log["s"].mode[at:5000]) == {"fault"}  # no other order ends it
+    assert "diverged" not in set(log["m"].mode)
+    assert any("s is in FAULT: a joint is" in event.text for event in log.events)
+    assert verify(log).differing == 0
+    assert len(log["s"]) == 6000
+
+
+def largest_step(log: Log, site: str, first: int = 0) -> float:
+    """The largest change of the torque of a joint from tick to tick; before tick 0 there is none."""
+    tau = np.vstack([np.zeros(2), log[site].tau])
+    return float(np.abs(np.diff(tau, axis=0))[first:].max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) -> None:
+    """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""
+    random = np.random.default_rng(seed)
+    cuts = np.sort(random.uniform(1.0, 6.0, 4)).round(3).reshape(2, 2).tolist()
+    text = TEXT.replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]").replace("[0.1, 0.4]", "[-0.1, 1.9]")
+    scenario = guarded(text=text, duration_s=14.0, outages_s=cuts)
+    orders: dict[str, dict[int, str]] = {"m": {}, "s": {}}
+    for site in orders:
+        for start in random.integers(500, 7000, 2).tolist():
+            orders[site] |= {start: "stop", start + int(random.integers(100, 900)): "enable"}
+        orders[site] |= {7900: "reset", 8000: "enable"}
+    log = ordered(scenario, orders)
+    for site in orders:
+        assert largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
+        assert log[site].mode[-1] == "run"
+    assert np.abs(log["m"].q[-1] - log["s"].q[-1]).max() <= 0.05
+    assert verify(log).identical == 28_000
+
+
+def test_without_a_limit_a_reference_that_jumps_makes_the_torque_jump_and_with_one_it_does_not() -> None:
+    """A peer 3 rad away that is used at once: of today's rule, with and without its limits."""
+    text = TEXT.replace('action = "glide"', 'action = "use"').replace(
+        "q0_rad = [0.1, 0.4]", "q0_rad = [2.6, 0.4]"
+    )
+    text = text.replace("align_speed_rad_s = {speed}\nalign_limit_rad = {limit}\n", "")
+    keys = {key: LIMITS[key] for key in ("tau_rate_limit_nm_s", "qd_des_limit_rad_s")}
+    free, held = (trilat_net.simulate(guarded(limits, text, duration_s=1.0)) for limits in ({}, keys))
+    assert largest_step(free, "s") > 50.0
+    assert largest_step(held, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
+    steps = np.abs(np.diff(held["s"].q_des, axis=0))
+    assert steps.max() <= 6.0e-3 * (1.0 + 1e-9)
+    assert np.abs(held["s"].qd_des).max() == 6.0
+    assert verify(held).identical == 2000
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"q_min_rad": 1.0, "q_max_rad": 0.5}, "above q_min_rad"),
+        ({"q_max_rad": 0.2}, "start within"),
+        ({"q_min_rad": [1.0, 2.0, 3.0]}, "has 3 numbers, and the arm has 2 joints"),
+        ({"tau_rate_limit_nm_s": 0.0}, "tau_rate_limit_nm_s"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(limits: dict[str, object], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        guarded(limits)
+
+
+def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
+    with pytest.raises(
+        ScenarioError, match=r"limits.q_max_rad: is kept under on_stale.action = 'glide' alone"
+    ):
+        load_scenario("free", {"limits.q_max_rad": 9.0})
+
+
+@pytest.mark.parametrize(
+    ("missed", "mode"), [(5, "run"), (20, "run"), (21, "hold"), (200, "hold"), (201, "fault")]
+)
+def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for(
+    missed: int, mode: str
+) -> None:
+    """A simulated arm stands still meanwhile. The log is whole, and is executed again without them."""
+    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
+    scenario = guarded(text=text.replace('law = "pd_d"', 'law = "adaptive"'), duration_s=4.0)
+    at = 2000 + missed
+    log = ordered(scenario, {"s": {at: "overrun"}}, ticks=missed)
+    part = log["s"]
+    assert part.tick.tolist() == [*range(2000), *range(at, 4000)]
+    assert part.mode[2000] == mode
+    assert largest_step(log, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
+    theta_hat = part.theta_hat
+    assert np.abs(theta_hat[2001] - theta_hat[1999]).max() <= 0.01 * np.abs(theta_hat[1999]).max()
+    assert part.skipped == missed
+    assert log.missing("s") == 0
+    assert log.expected_ticks("s") == 4000 - missed
+    verdict = verify(log)
+    assert verdict.identical == 8000 - missed
+    assert verdict.passed
+    assert not verdict.gaps
+    assert compare_with_virtual(log).fed.identical == 8000 - missed
+    if mode == "hold":
+        assert part.mode[-1] == "run"
+
+
+def test_a_site_of_another_rule_knows_no_orders() -> None:
+    with pytest.raises(ScenarioError, match=r"has on_stale\.action = 'use'"):
+        make_site_order(load_scenario("free"), "s", "stop", 0)
