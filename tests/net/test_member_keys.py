@@ -12,11 +12,12 @@ import pytest
 
 from trilat_net.errors import UsageError
 from trilat_net.net import topics
-from trilat_net.net.access_rules import MOST_PUT_BYTES, OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
+from trilat_net.net.access_rules import OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
 from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, MemberKeys, create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
 from .waiting import answered, drained, received, until
 

@@ -1,6 +1,7 @@
 """What the contract of `Bus` does not say: endpoints, encryption, and routers that end and begin again."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from trilat_net.errors import UsageError
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
+from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
 from .networks import Routed, encrypted, meet
 from .waiting import answered, received, until
@@ -21,6 +23,20 @@ def test_a_busy_port_is_the_callers_error_and_named() -> None:
             ZenohBus([endpoint])
     finally:
         first.close()
+
+
+def test_a_message_that_no_member_sends_is_not_taken_in_at_all() -> None:
+    """Rings hold hundreds of messages; of hundreds of megabytes they would fill a memory."""
+    (endpoint,) = find_free_endpoints(1)
+    with closing(ZenohBus([endpoint])) as here, closing(ZenohBus([], [endpoint])) as there:
+        inbox, publish = here.inbox("trilat/x/m/event"), there.publisher("trilat/x/m/event", patient=True)
+
+        def hear() -> tuple[str, bytes] | None:
+            publish(bytes(MOST_PUT_BYTES + 1))
+            publish(b"word")
+            return inbox.poll()
+
+        assert until(hear) == ("trilat/x/m/event", b"word")
 
 
 @pytest.mark.parametrize("endpoint", ["", "nonsense", "tcp/", "carrier-pigeon/1:2"])

@@ -100,10 +100,11 @@ REFUSED = {
         payload(sent_ns=-(2**63)),
         payload(sent_ns=0.5),
         payload(echo=7),
-        b"\x91" * 10_000,
+        payload(echo=[[0, 0, 0]] * 33),
+        b"\x91" * 2_000,
     ],
     "of 1 joints; the scenario has 2": [payload(q=[1.0])],
-    "oversized": [payload(padding="x" * MAX_BYTES), bytes(MAX_BYTES + 1)],
+    "oversized": [payload(padding="x" * 3_000), bytes(MAX_BYTES + 1)],  # thousands may wait
     "version": [payload(v=VERSION + 1), payload(v=0)],
     "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],
     "stranger": [payload(boot=99), payload(site="s"), payload(site="nobody")],

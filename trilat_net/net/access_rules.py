@@ -10,12 +10,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from . import topics
+from .zenoh_config import SIZE_LIMITS, limit_sizes
 
 RECORDER, OPERATOR, ROUTER = topics.RECORDER, "operator", "router"
 PROTOCOLS = ("tls", "quic")
 
-MOST_PUT_BYTES, MOST_QUERY_BYTES, MOST_REPLY_BYTES = 262_144, 65_536, 8_388_608
-"""The largest messages that a link takes: ten records of the longest arms; an order; records sent again."""
+MOST_REPLY_BYTES = 8_388_608
+"""The largest answer that a link takes: records sent again."""
 MOST_SESSIONS = 64
 
 
@@ -80,15 +81,10 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     return {
         "access_control": {**control, "subjects": subjects, "policies": policies},
         "low_pass_filter": [
-            _limit("puts", ["put", "delete"], MOST_PUT_BYTES),
-            _limit("queries", ["query"], MOST_QUERY_BYTES),
-            _limit("replies", ["reply"], MOST_REPLY_BYTES),
+            *SIZE_LIMITS,
+            limit_sizes("replies", ["reply"], MOST_REPLY_BYTES),
         ],
     }
-
-
-def _limit(name: str, messages: list[str], size: int) -> dict[str, Any]:
-    return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": ["**"], "size_limit": size}
 
 
 _ALIVE = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"

@@ -28,6 +28,8 @@ TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
 """Nanoseconds of a clock: eighteen years, so that sums and differences of some still fit a payload."""
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
+MOST_PEERS = 32
+"""A scenario has no more sites."""
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:
@@ -121,7 +123,7 @@ class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     qd: list[float]
     tau_x: list[float]
     sent_ns: Instant = 0
-    echo: list[Stamp] = []
+    echo: Annotated[list[Stamp], Meta(max_length=MOST_PEERS)] = []
     ch: list[float] = []
 
 

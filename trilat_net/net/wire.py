@@ -35,6 +35,8 @@ MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
 MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
+SAMPLE_BYTES, NUMBER_BYTES = 2_048, 9
+"""Of a sample, besides its vectors; of one of their numbers."""
 
 _Sent = LinkStats | Event | Info | RecorderStats | Request
 _KINDS: list[type[msgspec.Struct]] = [State, PeerSample, LinkStats, Event, Info, RecorderStats]
@@ -202,6 +204,8 @@ def make_decoder(
 ) -> Callable[[bytes], Any]:
     """Returns `decode` for one kind of message, with all that it needs at hand."""
     limit, parse = _LIMITS.get(kind, MAX_BYTES), _DECODERS[kind].decode
+    if kind is PeerSample and layout is not None:  # thousands may wait
+        limit = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
     names = _vectors(kind, layout or Layout())
     vectors_of, lengths = attrgetter(*names) if names else None, list(names.values()) if layout else None
 

@@ -26,6 +26,8 @@ LEASE_MS = 5_000
 closed connection; a silent one by the age of its samples."""
 
 BATCHES, BATCH_BYTES = 16, 65_535
+MOST_PUT_BYTES, MOST_QUERY_BYTES = 262_144, 65_536
+"""The largest messages that a link takes: ten records of the longest arms; an order."""
 
 ZenohMode = Literal["peer", "client", "router"]
 Endpoint = str | Mapping[str, Any]
@@ -42,6 +44,17 @@ QUEUES = [
     "background",
 ]
 """Zenoh's queues of a link, by priority."""
+
+
+def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
+    """Returns the setting of Zenoh by which a member drops longer messages of others."""
+    return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": ["**"], "size_limit": size}
+
+
+SIZE_LIMITS = [
+    limit_sizes("puts", ["put", "delete"], MOST_PUT_BYTES),
+    limit_sizes("queries", ["query"], MOST_QUERY_BYTES),
+]
 
 
 def make_zenoh_config(
@@ -79,6 +92,7 @@ def make_zenoh_config(
             },
             "shared_memory": {"enabled": False},
         },
+        "low_pass_filter": SIZE_LIMITS,
     }
     return merge_settings(needed, own or {})
 
@@ -138,7 +152,9 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
     "qos/publication": _UNTOUCHED,
     "qos/network": _UNTOUCHED,
     "downsampling": _UNTOUCHED,
-    "low_pass_filter": _UNTOUCHED,
+    "low_pass_filter": _Requirement(
+        lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"
+    ),
 }
 """Requirements of a session by the path of the key in Zenoh's configuration."""
 
@@ -192,6 +208,7 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
                 open_regular(Path(str(value))).close()
             except OSError as error:
                 raise UsageError(f"{source}: {key}: {value} cannot be read: {error.strerror}") from None
+    settings.pop("low_pass_filter", None)
     mode = settings.pop("mode", "")
     endpoints = {
         side: settings[side].pop("endpoints")
