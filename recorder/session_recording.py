@@ -60,6 +60,7 @@ class Recording:
         self.session, self.epoch, self.publisher = session, epoch, publisher
         self._scenario, self._bus = scenario, bus
         self._boots, self._candidates = dict(epoch.boots), dict[str, int]()
+        self._confirmed: set[int] = set()
         self._vanished: set[tuple[str, str]] = set()
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {name: SiteReception(scenario, name, epoch.boots.get(name)) for name in scenario.names}
@@ -108,11 +109,12 @@ class Recording:
         self._drain(queue, now_ns)
         self._admit_starts()
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
-        for name, repair in self._repairs.items():
+        for name, repair in list(self._repairs.items()):
             for channel, message, payload in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
                 key = topics.key(self.session, name, channel)
                 sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
                 self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
+                self._note_admission(message.content)
         for name, site in self._sites.items():
             if name in self._stored or not site.full:
                 continue
@@ -135,10 +137,10 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Goes over to another start of a site where the one before is gone or has ended."""
+        """Goes over to starts of sites that others admit, or where the one before is gone or has ended."""
         for name, boot in list(self._candidates.items()):
-            before = self._sites[name]
-            if name not in self._gone and before.made is None and name in self._boots:
+            before, left = self._sites[name], name in self._gone or name not in self._boots
+            if not (left or before.made is not None or boot in self._confirmed):
                 continue
             del self._candidates[name]
             self._boots[name] = boot
@@ -158,6 +160,18 @@ class Recording:
         comes = event.kind in ("coming", "join") and event.boots.get(name) == event.boot
         if comes and event.member == name and self._scenario.sites_may_return:
             self._candidates[name] = event.boot
+            self._admit_starts()
+
+    def _note_admission(self, event: object) -> None:
+        """Notes another start of a site, if a message of a site says that it admits it."""
+        if not isinstance(event, Event) or event.kind != "admit":
+            return
+        boot = event.boots.get(event.about)
+        if boot is None or event.about not in self._sites or boot == self._boots.get(event.about):
+            return
+        if self._scenario.sites_may_return and len(self._confirmed) < STARTS_KEPT:
+            self._confirmed.add(boot)
+            self._candidates[event.about] = boot
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
@@ -181,6 +195,7 @@ class Recording:
             raise WireError("stranger", arrived.key)
         site, message = self._read(arrived.key, arrived.payload)
         channel = self._channels[arrived.key][1]
+        self._note_admission(message.content)
         if site.take(channel, message, arrived.mono_ns):
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
             self._writer.add(

@@ -103,10 +103,14 @@ class JoiningSite:
         """
         parts, membership, pinger = self._parts, self._joining.membership, self._joining.pinger
         parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
+        begins = 0
         while not parts.interrupt.requested():
             epoch = self._joining.poll()
             if epoch is not None:
                 return RunningSite(parts, self._publisher, pinger, epoch)
+            if self._joining.coming_at != begins:
+                begins = self._joining.coming_at
+                parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
             now_ns = parts.clock.monotonic_ns()
             if now_ns > give_up_ns:
                 missing = membership.missing()
@@ -148,9 +152,8 @@ class RunningSite:
             )
             for peer, boot in zip(site.peers, boots, strict=True)
         ]
-        if epoch.first:
-            site.begin_at(epoch.first)
-            parts.buffer.begin_at(epoch.first, site.rate_hz)
+        site.begin_at(epoch.first)
+        parts.buffer.begin_at(epoch.first, site.rate_hz)
         self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0])
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
         self._inbox = PeerInbox(

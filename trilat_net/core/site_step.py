@@ -127,6 +127,8 @@ class Site:
         Its arm stands where it starts, no sample of a peer is in use, and none is under way; its channels are
         where they would be.
         """
+        if k <= self._site["first"]:
+            self.prime(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
             sample = (k - 1) * int(link["rate_hz"]) // self.rate_hz

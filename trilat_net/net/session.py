@@ -71,6 +71,11 @@ class SessionJoin:
         bus.announce(liveliness_token(session, self._own.member, self._own.boot))
 
     @property
+    def coming_at(self) -> int:
+        """The first tick that this site has said last, if it comes to a running session; else 0."""
+        return 0 if self._coming is None else self._coming[0].ticks
+
+    @property
     def _own(self) -> Info:
         return self._publisher.info
 
