@@ -23,7 +23,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
-from trilat_net.net.wire import split_states
+from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import (
     Scenario,
     initial_link_tables,
@@ -198,11 +198,26 @@ class SessionView:
             return  # a recorder's own
         single = parts.channel != topics.STATE
         for payload in (arrived.payload,) if single else split_states(arrived.payload):
-            message = site.reception.read(parts.channel, payload)
+            try:
+                message = site.reception.read(parts.channel, payload)
+            except WireError:
+                if parts.channel != topics.EVENT or not self._begin_start(parts.member, payload):
+                    raise
+                message = site.reception.read(parts.channel, payload)
             if site.record is None and site.stats is None and parts.channel != topics.EVENT:
                 self._join(site, message.content)
             if site.reception.take(parts.channel, message, arrived.mono_ns):
                 self._keep(parts.member, site, parts.channel, message.content)
+
+    def _begin_start(self, name: str, payload: bytes) -> bool:
+        """Goes over to another start of a site, if that says that it joins."""
+        event, site = decode(payload, Event), self.sites[name]
+        joins = event.kind == "join" and event.member == name and event.boots.get(name) == event.boot
+        if not joins or self.scenario is None or not self.scenario.sites_may_return:
+            return False
+        site.reception = SiteReception(self.scenario, name, event.boot, site.reception)
+        site.repair = GapRepair(self.bus, self.session, site.reception, site.dropped)
+        return True
 
     def _join(self, site: SiteView, content: State | LinkStats | Event) -> None:
         """Asks a site for no record from before a late first one, and for its events."""

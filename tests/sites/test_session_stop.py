@@ -57,3 +57,35 @@ def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_
 def test_a_session_that_is_not_there_is_not_stopped() -> None:
     with pytest.raises(SessionError, match="no site of session"):
         stop_session(LocalNetwork().join(), ManualClock(), "t")
+
+
+def test_who_watches_sees_a_site_come_back_and_stop_reaches_those_that_are_there(tmp_path: Path) -> None:
+    glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "rate_hz": 200}
+    session = Session.whole(load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={})
+    session.clocks["m1"].dies_ns = 4_000_000_000
+    session.site("m1", at_ns=5_000_000_000)
+    session.clocks["s"].dies_ns = 9_000_000_000
+    said: list[str] = []
+    seen: dict[str, int] = {}
+
+    def stop(bus: Bus, clock: RelayClock) -> None:
+        said.extend(stop_session(bus, clock, SESSION))
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        watch = SessionWatch(bus, clock, SESSION)
+        while clock.monotonic_ns() < 9_000_000_000:
+            watch.update()
+            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+        seen.update({name: site.record.tick for name, site in watch.view.sites.items() if site.record})
+
+    session.stranger(look)
+    session.stranger(stop, at_ns=10_000_000_000)
+    log = session.run()
+    assert [line.split()[0] for line in said] == ["m1", "m2"]
+    ticks = log.expected_ticks("m2")
+    assert ticks < 2200
+    assert max(seen.values()) - seen["m1"] < 10
+    ended = {name: str(end) for name, end in session.ends.items()} if session.ends else {}
+    assert ended["s"] == "killed"
+    assert "s is gone since" in ended["m1"]
+    assert verify(log).differing == 0
