@@ -201,8 +201,7 @@ TAKING = {
     "no name": ["log", "recover", "."],
     "no name of a recovered log": ["log", "recover", "run.mcap", "-o", "."],
     "no name of keys": ["keys", "pair", "."],
-    "set": ["set", "--session", "{}", "link", "m1->s", "--delay", "1ms"],
-    "set link": ["set", "--session", "{}", "link", "m1->s", "--to", "deviation_ms={}"],
+    "set": ["set", "--session", "{}/", "link", "m1->s", "--delay", "1ms"],
     "set dominance": ["set", "--session", "x/y", "dominance", "s", "m1={}"],
     "override": ["scenario", "check", "paper", "--set", "control.Kd={}"],
     "scenario": ["scenario", "check", "{}"],
@@ -218,6 +217,18 @@ def test_odd_words_are_refused_in_one_line_without_their_controls(words: list[st
         done.refuses()
         assert done.err[:-1].isprintable()
         assert len(done.err) < 4100
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "9" * 4000, "0x" + "f" * 5000])
+def test_a_number_that_no_message_holds_is_refused_before_anybody_is_asked(
+    number: str, tmp_path: Path
+) -> None:
+    order = ["link", "m1->s", "--to", f"deviation_ms={number}"]
+    trilat("set", "--session", "x", *order, cwd=tmp_path).refuses("to.deviation_ms: must be a")
+
+
+def test_a_session_has_a_short_name(tmp_path: Path) -> None:
+    trilat("stop", "--session", "9" * 5000, cwd=tmp_path).refuses("at most 80 letters")
 
 
 def test_what_others_wrote_has_no_effect_on_a_terminal() -> None:
@@ -237,9 +248,10 @@ def test_what_others_wrote_has_no_effect_on_a_terminal() -> None:
     assert json.loads("{" + said.getvalue().rpartition("{")[2]) == {"text": attack}
 
 
-def test_a_full_disk_has_one_exit_code(tmp_path: Path, short_log: bytes) -> None:
+@pytest.mark.parametrize("command", ["figure", pytest.param("report", marks=pytest.mark.long)])
+def test_a_full_disk_has_one_exit_code(command: str, tmp_path: Path, short_log: bytes) -> None:
     (tmp_path / "run.mcap").write_bytes(short_log)
     full = OSError(errno.ENOSPC, "No space left on device")
-    for command in (["figure", "run.mcap", "positions"], ["report", "run.mcap"]):
-        with mock.patch("matplotlib.figure.Figure.savefig", side_effect=full):
-            trilat(*command, cwd=tmp_path).refuses("No space left", code=5)
+    names = ["positions"] if command == "figure" else []
+    with mock.patch("matplotlib.figure.Figure.savefig", side_effect=full):
+        trilat(command, "run.mcap", *names, cwd=tmp_path).refuses("No space left", code=5)

@@ -135,7 +135,8 @@ def test_the_command_exits_with_1_if_something_fails(tmp_path: Path, monkeypatch
     assert "--insecure" in done.out
 
 
-def test_a_session_that_nobody_answers_for_fails(tmp_path: Path) -> None:
+def test_a_session_that_nobody_answers_for_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "CONNECT_S", 0.2)
     connection = Connection((), find_free_endpoints(1))
     found = list(examine_machine(connection, None, tmp_path, "x", SystemClock(), insecure=False))
     assert ("clock", "fail") in {(one.check, one.state) for one in found}

@@ -56,10 +56,16 @@ InsecureOption = Annotated[
 ]
 
 
+MOST_LETTERS = 80
+"""Of a session's name: that of a scenario has 64, and that of its demo some more."""
+
+
 def check_session_name(name: str) -> str:
     """Refuses a session name that cannot be part of a key."""
-    if not name or not all(c.isalnum() or c in "_-." for c in name):
-        raise UsageError(f"a session's name is letters, digits, _, - and ., not {name!r}")
+    if not 0 < len(name) <= MOST_LETTERS or not all(c.isalnum() or c in "_-." for c in name):
+        raise UsageError(
+            f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., not {name[:80]!r}"
+        )
     return name
 
 
