@@ -4,6 +4,7 @@ Invariant: the wait ends when every recorder present has all messages that it ca
 """
 
 import signal
+from collections.abc import Sequence
 
 from trilat_net.core.ticks import NS_PER_S, Mode, TickRecord, describe_divergence
 from trilat_net.errors import PeerLeft, RunFailed
@@ -24,7 +25,10 @@ QUERIED_NS = NS_PER_S
 
 
 class LeavingSite:
-    """A site after its last tick, with its last record if any, and the reason for which it ended the run."""
+    """A site after its last tick, with its last record if any, and the reason for which it ended the run.
+
+    `unheard` names the peers that it heard and that did not hear it.
+    """
 
     def __init__(
         self,
@@ -32,8 +36,9 @@ class LeavingSite:
         publisher: EventPublisher,
         output: TickRecord | None,
         failure: RunFailed | None,
+        unheard: Sequence[str] = (),
     ) -> None:
-        self._parts, self._publisher = parts, publisher
+        self._parts, self._publisher, self._unheard = parts, publisher, unheard
         self._ticks = 0 if output is None else output.tick + 1
         self._t_ns = -1 if output is None else output.t_ns
         self._end_kind, self._failure = "failed", failure
@@ -53,6 +58,8 @@ class LeavingSite:
             self._publish("law", hiccups)
             parts.say(hiccups)
         about, why = self._find_cause()
+        if self._unheard:
+            why += f"; {', '.join(self._unheard)} did not hear it at the end"
         self._publish("end", f"{parts.name} made {self._ticks} ticks{why}", about=about)
         code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)

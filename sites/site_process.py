@@ -115,7 +115,7 @@ class JoiningSite:
             if now_ns > give_up_ns:
                 missing = membership.missing()
                 reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
-                reason = self._joining.refusal or reason
+                reason = self._joining.reason or reason
                 for member, problem in membership.unreadable.items():
                     reason += f"; the answer of {member} cannot be read: {problem}"
                 raise SessionError(
@@ -181,7 +181,8 @@ class RunningSite:
             output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
         if output is not None:
             self._tell_skipped(output.tick, output.t_ns)
-        return LeavingSite(parts, self._publisher, output, self._failure)
+        unheard = [meter.peer.name for meter in self._timing.meters if meter.unheard]
+        return LeavingSite(parts, self._publisher, output, self._failure, unheard)
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts

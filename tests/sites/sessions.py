@@ -95,10 +95,11 @@ class Session:
         interrupt: Interrupt | None = None,
         *,
         needs_recorder: bool = False,
+        timeout_s: float = 10.0,
     ) -> int:
         """A site's life, from its connection to its exit code."""
         options = SiteOptions(
-            SESSION, Connection(), 10.0, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
+            SESSION, Connection(), timeout_s, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
         )
         interrupt = interrupt or self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)

@@ -131,7 +131,7 @@ def test_a_site_may_come_late_where_the_first_one_begins_without_it(tmp_path: Pa
     assert check_log([session.path]).passed
 
 
-@pytest.mark.parametrize("dies", ["m1", "s"])
+@pytest.mark.parametrize("dies", ["m1", pytest.param("s", marks=pytest.mark.long)])
 def test_sites_on_clocks_of_their_own_find_the_grid_again(dies: str, tmp_path: Path) -> None:
     """The first site, whose grid the others follow, as well as another."""
     skews = {"m1": (7 * S, 60_000), "s": (-500_000_000, -100_000)}
@@ -197,6 +197,33 @@ def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_pa
     result = verify(log)
     assert (result.differing, result.gaps) == (0, [])
     assert 0 < result.unjudged <= 3 + 4
+
+
+def test_a_cut_in_one_direction_is_in_the_last_words_of_who_is_not_heard(tmp_path: Path) -> None:
+    session = Session.whole(gliding(3.0), tmp_path, ends={})
+    session.lose("m", "trilat/t/m/sample", 3 * S, 60 * S)
+    log = session.run()
+    ends = {event.member: event.text for event in log.events if event.kind == "end"}
+    assert ends == {"m": "m made 600 ticks; s did not hear it at the end", "s": "s made 600 ticks"}
+
+
+def test_a_site_that_some_do_not_admit_names_them(tmp_path: Path) -> None:
+    """What it says does not reach one of them: it waits, and says why it does not join."""
+    session = Session.whole(gliding(9.0, "asymmetric"), tmp_path, ends={})
+    session.clocks["s"].dies_ns = 3 * S
+    failed: list[str] = []
+
+    def again(clock: RelayClock) -> None:
+        session.lose("m2", "trilat/t/m2/event", 4 * S, 60 * S)
+        try:
+            session.live("s", clock, timeout_s=3.0)
+        except SessionError as error:
+            failed.append(str(error))
+
+    session.relay.add("s again", again, 4 * S)
+    session.run()
+    assert len(failed) == 1
+    assert "m2 did not admit it to the running session" in failed[0]
 
 
 def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) -> None:

@@ -71,6 +71,14 @@ class SessionJoin:
         bus.announce(liveliness_token(session, self._own.member, self._own.boot))
 
     @property
+    def reason(self) -> str:
+        """Why this site has not joined a running session, "" if there is none or nobody said."""
+        lacking = sorted({info.member for info in self.membership.running()} - self._admitted)
+        if self._coming is None or not lacking:
+            return self.refusal
+        return self.refusal or f"{', '.join(lacking)} did not admit it to the running session"
+
+    @property
     def coming_at(self) -> int:
         """The first tick that this site has said last, if it comes to a running session; else 0."""
         return 0 if self._coming is None else self._coming[0].ticks
