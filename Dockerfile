@@ -1,6 +1,8 @@
 # One image for every member of a session. What builds it stays behind in the first stage; the second one
 # adds a virtual environment to Python and nothing else: no build tools, no pip, no tests.
-FROM python:3.11-slim-bookworm AS build
+# BASE=python@sha256:... builds on one image and no other.
+ARG BASE=python:3.11-slim-bookworm
+FROM ${BASE} AS build
 # An eighth of what is installed below is symbols for debuggers; `strip` takes them out.
 RUN { apt-get -qq -o Acquire::Retries=0 -o Acquire::http::Timeout=10 update \
         && apt-get -qq install --no-install-recommends binutils >/dev/null 2>&1; } \
@@ -32,7 +34,7 @@ RUN /opt/trilat/bin/trilat sim paper --duration 0.1 -o /tmp/run.mcap \
     && /opt/trilat/bin/python -c 'import sites.site_process, recorder.record_process' \
     && chmod -R a+rX /opt/trilat
 
-FROM python:3.11-slim-bookworm
+FROM ${BASE}
 COPY --from=build /opt/trilat /opt/trilat
 # /tmp is the one place that a member writes to.
 ENV PATH=/opt/trilat/bin:$PATH \
