@@ -17,14 +17,14 @@ from trilat_net.net.requests import ArmMeasurement
 from trilat_net.net.wire import decode
 from trilat_net.scenario.scenario_types import SiteOrder
 
+from .site_loop import STEP_MARGIN_RAD
+
 MEASUREMENTS_KEPT = 64
 """Capacity of the inbox: older measurements are useless."""
 HELD_SILENCE_NS = 30_000_000
 """After a longer silence the site holds."""
 SILENCE_LIMIT_NS = 200_000_000
 """After a longer one it is in fault."""
-STEP_MARGIN_RAD = 0.02
-"""An angle may be so much farther from the last one than the arm's limit of speed lets it go."""
 START_POSE_TOLERANCE_RAD = 0.01
 """A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000

@@ -31,11 +31,18 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
     return [make_reader(PeerSample, layout) for layout in layouts]
 
 
+GUARDED_AHEAD_NS = NS_PER_S
+"""Of a site that glides: a stamp further ahead is dropped."""
+STEP_MARGIN_RAD = 0.02
+"""A peer's angle may be so much farther from the last one than its limit of speed lets it go."""
+
+
 class PeerInbox:
     """The samples of a site's peers; every sequence has one entry for each, in scenario order.
 
     Messages of other boots are dropped; `dropped` counts what is dropped, by reason. A site that joins late
-    passes over samples stamped before its own first tick, at `from_ns`: it takes nothing for the past.
+    passes over samples stamped before its own first tick, at `from_ns`: it takes nothing for the past. Under
+    `glide` a sample that the peer's arm cannot have made since the last is dropped too, and one far ahead.
     """
 
     def __init__(
@@ -53,12 +60,13 @@ class PeerInbox:
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = list(boots), monitors, dropped
         self._last = [first_tick_at(from_ns, rate_hz) - 1 for rate_hz in rates]
+        self._newest: list[PeerSample | None] = [None] * len(peers)
         if from_ns:
             self.drain(from_ns)  # what came while it waited must not burden the first tick
 
     def admit(self, index: int, boot: int, first: int) -> None:
         """Takes from now on the samples of another start of a peer, which begins at a tick of its own."""
-        self._boots[index] = boot
+        self._boots[index], self._newest[index] = boot, None
         self._last[index] = max(self._last[index], first - 1)
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
@@ -83,8 +91,12 @@ class PeerInbox:
         stamp_ns = sample.tick * NS_PER_S // self._rates[index]
         if stamp_ns < self._from_ns:
             return None
-        if stamp_ns - since_epoch_ns > AHEAD_LIMIT_NS:
+        guarded = bool(self._links[index].speed_limit)
+        if stamp_ns - since_epoch_ns > (GUARDED_AHEAD_NS if guarded else AHEAD_LIMIT_NS):
             self._dropped["ahead"] += 1
+            return None
+        if guarded and not self._is_plausible(index, sample):
+            self._dropped["implausible"] += 1
             return None
         if sample.tick > self._last[index] + 1:  # dropped on the way, or the ring overflowed
             self._dropped["missing"] += sample.tick - self._last[index] - 1
@@ -93,6 +105,20 @@ class PeerInbox:
         link, delay_us = self._links[index], delay_ns // 1000
         ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
         return Arrival(index, sample.tick, sample.q, sample.qd, delay_us, sample.tau_x, ch)
+
+    def _is_plausible(self, index: int, sample: PeerSample) -> bool:
+        """True if a peer's arm can be where a sample says, and as fast, after the newest one so far."""
+        limits, newest = self._links[index].speed_limit, self._newest[index]
+        if not all(abs(speed) <= limit for speed, limit in zip(sample.qd, limits, strict=True)):
+            return False
+        if newest is not None:
+            passed_s = abs(sample.tick - newest.tick) / self._rates[index]
+            ways = zip(sample.q, newest.q, limits, strict=True)
+            if not all(abs(a - b) <= limit * passed_s + STEP_MARGIN_RAD for a, b, limit in ways):
+                return False
+        if newest is None or sample.tick > newest.tick:
+            self._newest[index] = sample
+        return True
 
 
 BLOCKS_PER_S = 100

@@ -26,6 +26,12 @@ LIMITS = {"tau_rate_limit_nm_s": RATE_NM_S, "qd_des_limit_rad_s": 6.0, "q_min_ra
 KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "limit": 4.0}
 
 
+def adaptive_text() -> str:
+    """The scenario of the rule, with the paper's law."""
+    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
+    return text.replace('law = "pd_d"', 'law = "adaptive"')
+
+
 def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
     """The scenario of the rule, with limits of all sites or of one."""
     overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
@@ -93,10 +99,14 @@ def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
     assert again.sites["s"].identical == 6000
 
 
+@functools.cache
+def adaptive_stop() -> Log:
+    """The slave under the adaptive law is stopped at 2 s and enabled at 3 s."""
+    return ordered(guarded(text=adaptive_text()), {"s": {2000: "stop", 3000: "enable"}})
+
+
 def test_estimates_of_a_site_that_is_stopped_stay_as_they_are() -> None:
-    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
-    text = text.replace('law = "pd_d"', 'law = "adaptive"')
-    log = ordered(guarded(text=text), {"s": {2000: "stop", 3000: "enable"}})
+    log = adaptive_stop()
     theta_hat = log["s"].theta_hat
     assert np.ptp(theta_hat[1999:3000], axis=0).max() == 0.0
     assert np.ptp(theta_hat[3000:], axis=0).max() > 0.0
@@ -195,8 +205,7 @@ def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for
     missed: int, mode: str
 ) -> None:
     """A simulated arm stands still meanwhile. The log is whole, and is executed again without them."""
-    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
-    scenario = guarded(text=text.replace('law = "pd_d"', 'law = "adaptive"'), duration_s=4.0)
+    scenario = guarded(text=adaptive_text(), duration_s=4.0)
     at = 2000 + missed
     log = ordered(scenario, {"s": {at: "overrun"}}, ticks=missed)
     part = log["s"]

@@ -175,6 +175,53 @@ def test_an_arm_that_falls_silent_is_held_then_in_fault_and_the_session_goes_on(
     whole(log)
 
 
+def braked(bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]]) -> None:
+    """The program of an arm with brakes, every millisecond."""
+    arm = Pendulum((0.3, -0.1))
+    with ArmPort(bus, clock, SESSION, "s") as port:
+        next_ns = clock.monotonic_ns()
+        while not port.over:
+            port.send(arm.q, arm.qd)
+            tau = port.torque()
+            if tau is None:
+                arm.qd = [0.0, 0.0]
+            else:
+                arm.move(tau)
+            poses.append((clock.monotonic_ns(), list(arm.q)))
+            next_ns += PERIOD_NS
+            clock.sleep_until(next_ns)
+
+
+@pytest.mark.parametrize(
+    "frozen_s", [0.3, 1.0, *(pytest.param(s, marks=pytest.mark.long) for s in (3.0, 10.0))]
+)
+def test_a_site_that_was_frozen_makes_up_for_nothing_and_its_arm_stays_where_it_was(
+    frozen_s: float, tmp_path: Path
+) -> None:
+    poses: list[tuple[int, list[float]]] = []
+    at_ns = 4 * A_SECOND
+    scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
+    session = Session.whole(scenario, tmp_path, ends={})
+    session.stranger(lambda bus, clock: braked(bus, clock, poses), at_ns=A_SECOND + 200_250_000)
+    session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    part, missed = log["s"], round(1e3 * frozen_s)
+    (jump,) = np.flatnonzero(np.diff(part.tick) > 1)
+    assert abs(int(part.tick[jump + 1] - part.tick[jump]) - missed) <= 1
+    assert part.skipped == int(part.tick[jump + 1] - part.tick[jump]) - 1
+    assert set(part.mode[jump + 1 :]) == {"fault"}
+    held = next(q for now_ns, q in poses if now_ns >= at_ns)
+    assert (
+        max(abs(a - b) for now_ns, q in poses if now_ns >= at_ns for a, b in zip(q, held, strict=True)) < 0.05
+    )
+    before, after = part.theta_hat[jump], part.theta_hat[-1]
+    assert np.abs(after - before).max() <= 0.01 * np.abs(before).max()
+    assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
+    assert log["m"].mode[-1] in ("run", "hold", "return")
+    whole(log)
+
+
 def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 

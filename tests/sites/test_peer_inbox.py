@@ -1,6 +1,7 @@
 """What comes in is a peer's sample, or it is counted by reason and dropped; nothing raises."""
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import msgpack
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from sites.site_loop import PeerInbox, make_sample_readers
 from trilat_net.core.link import AHEAD_LIMIT_NS
+from trilat_net.core.site_setup import LinkSetup
 from trilat_net.core.ticks import MAX_ARRIVALS
 from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import ManualClock
@@ -37,7 +39,12 @@ EPOCH_NS = 7_000_000_000
 class Desk:
     """An intake with two peers, and their ends of the rings."""
 
-    def __init__(self, capacity: int = 16_384, rates: tuple[int, int] = (RATE_HZ, RATE_HZ)) -> None:
+    def __init__(
+        self,
+        capacity: int = 16_384,
+        rates: tuple[int, int] = (RATE_HZ, RATE_HZ),
+        links: Sequence[LinkSetup] = SETUP.links,
+    ) -> None:
         network = LocalNetwork()
         receiver, sender = network.join(), network.join()
         self.clock = ManualClock(EPOCH_NS)
@@ -52,7 +59,7 @@ class Desk:
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, SETUP.links)
+        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, links)
 
     def wait(self, until_ns: int) -> None:
         """Time goes on, to an instant since the epoch."""
@@ -170,3 +177,47 @@ def test_duplicates_are_handed_on_because_the_record_lists_them() -> None:
         desk.send[0](payload(tick, 0))
     assert [a.tick for a in desk.intake.drain(1_000_000_000)] == [0, 1, 1, 0]
     assert not desk.dropped
+
+
+GUARDED = load_scenario("paper", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 5.0}).setup("m1").links
+"""At 5 rad/s, 5 mrad in a period, and 20 mrad besides."""
+
+
+@pytest.mark.parametrize(
+    ("q", "qd", "taken"),
+    [
+        ([0.024, 0.2], [0.0, 0.0], True),
+        ([0.026, 0.2], [0.0, 0.0], False),
+        ([0.0, 0.2], [0.0, 4.9], True),
+        ([0.0, 0.2], [0.0, -5.1], False),
+        ([1e6, 0.2], [0.0, 0.0], False),
+    ],
+)
+def test_a_guarded_site_drops_what_an_arm_cannot_have_done(
+    q: list[float], qd: list[float], taken: bool
+) -> None:
+    desk = Desk(links=GUARDED)
+    desk.send[0](payload(7, q=[0.0, 0.2], qd=[0.0, 0.0]))
+    desk.send[0](payload(8, q=q, qd=qd))
+    desk.send[0](payload(9, q=[0.003, 0.2], qd=[0.0, 0.0]))
+    assert [a.tick for a in desk.intake.drain(9_000_000)] == ([7, 8, 9] if taken else [7, 9])
+    assert desk.dropped["implausible"] == (not taken)
+
+
+def test_another_start_of_a_peer_may_be_anywhere_and_a_late_sample_is_measured_by_its_stamp() -> None:
+    desk = Desk(links=GUARDED)
+    desk.send[0](payload(100, q=[0.5, 0.2]))
+    desk.send[0](payload(20, q=[0.15, 0.2]))  # 80 ms earlier
+    assert len(desk.intake.drain(100_000_000)) == 2
+    desk.intake.admit(0, 99, 200)
+    desk.send[0](payload(200, boot=99, q=[-2.0, 0.2]))
+    assert len(desk.intake.drain(200_000_000)) == 1
+    assert not desk.dropped["implausible"]
+
+
+def test_a_guarded_site_takes_no_stamp_that_is_more_than_a_second_ahead() -> None:
+    for links, ahead in ((GUARDED, [1000]), (SETUP.links, [1000, 1001])):
+        desk = Desk(links=links)
+        for tick in (1000, 1001):
+            desk.send[0](payload(tick, q=[0.0, 0.2]))
+        assert [a.tick for a in desk.intake.drain(0)] == ahead

@@ -106,6 +106,7 @@ class LinkSetup(NamedTuple):
         outages: when the link is cut: pairs of first stamp and end, ns.
         channel: what the peer's law sends besides its motion.
         place: the site's place among the peers of its peer, in scenario order.
+        speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; () for no one.
     """
 
     peer: str
@@ -118,6 +119,7 @@ class LinkSetup(NamedTuple):
     outages: tuple[tuple[int, int], ...] = ()
     channel: LawChannel = LawChannel()
     place: int = 0
+    speed_limit: tuple[float, ...] = ()
 
 
 class Layout(NamedTuple):

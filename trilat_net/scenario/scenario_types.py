@@ -435,7 +435,15 @@ class Scenario(Frozen, frozen=True, dict=True):
             outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
             channel=self.channel(peer),
             place=self.peers(peer).index(site),
+            speed_limit=self._speed_limit(peer) if self.sites[site].on_stale.action == "glide" else (),
         )
+
+    def _speed_limit(self, site: str) -> tuple[float, ...]:
+        """Returns the largest speed of a site's joints, rad/s; () if peers do not get their angles."""
+        spec, joints = self.sites[site], self.arms[site].counts.joints
+        if spec.task.space != "joints":
+            return ()
+        return tuple(np.broadcast_to(spec.limits.qd_limit_rad_s, joints).tolist())
 
     def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> DominanceRamp:
         """Returns a change of a site's dominance factors, as the core has it."""

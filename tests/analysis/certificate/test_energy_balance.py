@@ -6,11 +6,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.core.test_safeguards import adaptive_stop
 from tests.theory.delay_equations import DelayEquations, equations, inertia
 from tests.theory.energy import balance as balance_by_hand
 from tests.theory.energy import left_null_vector
 from tests.virtual_runs import run
-from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
+from trilat_net.analysis.certificate.energy_balance import (
+    EnergyBalance,
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.scenario import load_scenario
 
 from . import runs
@@ -69,6 +74,24 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
         float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max()) for hz in (200, 400)
     ]
     assert np.log2(rest[0] / rest[1]) == pytest.approx(2.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("key", "limit", "term"),
+    [("tau_rate_limit_nm_s", 100.0, "torque limit"), ("qd_des_limit_rad_s", 0.5, "rule")],
+)
+def test_what_a_limit_of_torque_rate_or_reference_takes_is_booked(key: str, limit: float, term: str) -> None:
+    b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
+    assert np.abs(b.work[term]).max() > 0.01 * b.V.max()
+    assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
+
+
+def test_a_site_that_stops_and_goes_on_is_booked() -> None:
+    """Its torque is not that of the law, and its estimates stand still."""
+    b = compute_energy_balance(compute_site_energies(adaptive_stop()))
+    assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
+    assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
+    assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
 
 
 def test_a_wall_closes_to_1e_4_though_it_gives_energy_to_r() -> None:

@@ -559,7 +559,9 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     later = rows + 1
     v, a = site.follows.reference(later, e, ed)
     Yr[rows] = c.arm.gradient(at.q[later], at.qd[later], v, a, r)
-    tau[rows] = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
+    found = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
+    bound = site.stopped | (site.cut.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
+    tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)  # then no jump of e moves it
     return tau, Yr
 
 
