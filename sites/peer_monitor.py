@@ -12,6 +12,9 @@ from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.membership import EventPublisher, read_events
 from trilat_net.net.messages import Event
 
+MEET_AGAIN_NS = 1_000_000_000
+"""A site that is heard longer after its token went is there: a reconnection may report that late."""
+
 
 class PeerMonitor:
     """The other members, as one site sees them; with `admits` it lets sites come back.
@@ -71,6 +74,12 @@ class PeerMonitor:
                 self._lose(publisher, parts.member, t_ns)
         for event in coming:
             self._consider(publisher, event, t_ns)
+
+    def meet_again(self, member: str, t_ns: int) -> None:
+        """Takes a site that is heard for present, if its token went some time ago and it has not ended."""
+        since_ns, _ = self.away.get(member, (t_ns, ""))
+        if t_ns - since_ns > MEET_AGAIN_NS and self.boots.get(member) not in self._ended:
+            del self.away[member]
 
     def _lose(self, publisher: EventPublisher, member: str, t_ns: int) -> None:
         publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)

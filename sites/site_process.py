@@ -259,6 +259,9 @@ class RunningSite:
         """Takes in who has come, and gives up where somebody has been away for too long."""
         parts, monitor = self._parts, self._parts.monitor
         monitor.watch(self._publisher, t_ns)
+        for meter in self._timing.meters if monitor.away else ():
+            if meter.is_heard(parts.clock.monotonic_ns()):
+                monitor.meet_again(meter.peer.name, t_ns)
         for event in monitor.admitted:
             index, rate_hz = parts.site.peers.index(event.member), parts.scenario.sites[event.member].rate_hz
             bound_ns = None if event.clock == parts.clock.identity() else event.bound_ns

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.net.waiting import until
-from trilat_net.process import Interrupt, hold_sigint, worker_pool
+from trilat_net.process import ENDING_SIGNALS, Interrupt, hold_sigint, worker_pool
 
 
 def test_a_signal_is_remembered_and_ends_nothing() -> None:
@@ -25,10 +25,22 @@ def test_a_signal_is_remembered_and_ends_nothing() -> None:
 
 
 def test_handlers_are_put_back() -> None:
-    before = [signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)]
+    before = [signal.getsignal(name) for name in ENDING_SIGNALS]
     with Interrupt():
         pass
-    assert [signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)] == before
+    assert [signal.getsignal(name) for name in ENDING_SIGNALS] == before
+
+
+@pytest.mark.parametrize("handler", [signal.SIG_DFL, signal.SIG_IGN], ids=["as usual", "under nohup"])
+def test_the_end_of_a_terminal_is_a_signal_like_others_unless_it_is_ignored(handler: signal.Handlers) -> None:
+    before = signal.signal(signal.SIGHUP, handler)
+    try:
+        with Interrupt() as interrupt:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert interrupt.requested() is (handler is signal.SIG_DFL)
+        assert signal.getsignal(signal.SIGHUP) is handler
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_long_work_is_broken_off_at_once() -> None:

@@ -312,3 +312,12 @@ def test_recorders_that_follow_each_other_agree_on_what_was_not_made(tmp_path: P
     assert "missing 0" in log.account("m")
     assert verify(log).passed
     assert check_log(parts).passed
+
+
+def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None:
+    """As a reconnection may report the end of a connection after its return."""
+    session = Session.whole(gliding(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}})
+    session.clocks["s"].at(3 * S, lambda: session.lose_token("m"))
+    log = session.run()
+    assert kinds_about(log, "s", "m") == ["lost"]
+    assert session.ends == {"m": 0, "s": 0}

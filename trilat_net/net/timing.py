@@ -170,12 +170,16 @@ class LinkTimingMonitor:
                     self._rtt_ns = there_ns + delay_ns
         return delay_ns
 
+    def is_heard(self, now_ns: int) -> bool:
+        """True if a sample of the peer arrived within UNHEARD_NS."""
+        return self._heard_ns >= 0 and now_ns - self._heard_ns <= UNHEARD_NS
+
     def hears(self, now_ns: int) -> bool | None:
         """True if the peer acknowledged a newer sample within UNHEARD_NS.
 
         None before its first acknowledgement, and while it is silent itself.
         """
-        if self._acknowledged < 0 or now_ns - self._heard_ns > UNHEARD_NS:
+        if self._acknowledged < 0 or not self.is_heard(now_ns):
             return None
         return self._heard_ns - self._acknowledged_ns <= UNHEARD_NS
 
