@@ -232,7 +232,8 @@ class RunningSite:
 
     def attend(self, k: int, t_ns: int) -> None:
         """See `LoopIO`: answers queries, follows the leader's grid, publishes news."""
-        self._publisher.update(ticks=k + 1)
+        grid_ns = self._timing.schedule.deadline(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
+        self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
         self._watch_members(t_ns)

@@ -52,6 +52,14 @@ def members(log: Log) -> dict[str, Member]:
     return clocks
 
 
+def again(log: Log, name: str) -> Member:
+    """The clock of the last start of a member that joined the running session."""
+    event = [e for e in log.events if e.kind == "coming" and e.member == name][-1]
+    skew = SKEWED.search(event.clock)
+    offset_ns, drift_ppb, start_ns = map(int, skew.groups()) if skew else (0, 0, 0)
+    return Member(event.epoch_mono_ns, start_ns, offset_ns, 1 + Fraction(drift_ppb, NS_PER_S))
+
+
 @dataclass
 class Judged:
     """One link's samples: how wrong the logged delay of each was, and what was said of that at most.

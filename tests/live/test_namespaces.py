@@ -1,17 +1,21 @@
 """Separate machines: the README's recipes, as written, in network namespaces with addresses of their own."""
 
+import signal
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
-from tests.truth import judged, members, offset_errors
+from tests.truth import Member, again, judged, members, offset_errors
+from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
-from trilat_net.log.log_reader import Log
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
 from .namespaces import Machines, bridged, pairs, reaches, starred
 from .processes import Session, Stage, connections, executed_again, whole
+from .test_returning import FOLLOWS, GLIDE, JOINS, engaged_after_s
 
 SITES = ("m1", "m2", "s")
 ALL = (*SITES, "recorder")
@@ -147,6 +151,53 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
     late = [tick for tick, sample in heard(log, "m2", "m1").arrivals if tick > sample + 200]
     assert len(late) > 300
     assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
+
+
+@pytest.mark.long
+def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_when_killed(
+    stage: Stage, apart: Machines
+) -> None:
+    """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
+    bridged(apart, ALL)
+    session = Apart(stage, apart, "--duration", "40", *GLIDE)
+    session.all()
+    session.begun()
+    for name in SITES:
+        session.processes[name].prints(FOLLOWS)
+    clock = SystemClock()
+    apart.part("m1", "m2")
+    clock.sleep_until(clock.monotonic_ns() + 6_000_000_000)
+    apart.mend("m1", "m2")
+    clock.sleep_until(clock.monotonic_ns() + 6_000_000_000)
+    killed = session.processes.pop("m1")
+    killed.signal(signal.SIGKILL)
+    assert killed.code() == -signal.SIGKILL
+    session.site("m1", called="m1 again").prints(JOINS)
+    session.ends_well()
+    log = open_log(session.log)
+    assert {str(log[name].mode[-1]) for name in SITES} == {"run"}
+    assert max(engaged_after_s(log)) <= 2.0
+    for name in ("m1", "m2"):
+        held = np.count_nonzero(log[name].mode == "hold")
+        assert held > 4000
+    assert [log.missing(name) for name in SITES] == [0, 0, 0]
+    result = verify(log)
+    assert result.passed
+    assert result.differing == 0
+    assert [site for site, _, _ in result.absences] == ["m1"]
+    clocks = {**members(log), "m1": again(log, "m1")}  # of each the one at the end
+    begun_ns = {name: np.median(began_ns(log, name, clocks[name])) for name in SITES}
+    assert max(begun_ns.values()) - min(begun_ns.values()) <= 1_000_000
+
+
+def began_ns(log: Log, name: str, clock: Member) -> list[int]:
+    """When tick 0 would have been by each record of the last five seconds, on the clock under all others."""
+    part = log[name]
+    sent_ns = part.sent_ns[part.tick >= part.last_tick - 5000].tolist()
+    return [
+        clock.true_ns(sent) - t_ns
+        for sent, t_ns in zip(sent_ns, part.t_ns[-len(sent_ns) :].tolist(), strict=True)
+    ]
 
 
 def back_to_nominal(log: Log, site: str, peer: str, delay: int, nominal: int) -> None:

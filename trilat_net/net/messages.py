@@ -299,6 +299,7 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         epoch_mono_ns: the epoch on its clock, once it is fixed.
         epoch_unix_ns: the epoch in Unix time.
         boots: the members of the session and their boots.
+        grid_ns: the epoch on its clock by which its ticks lie at present, which follow the first site's.
     """
 
     v: int = VERSION
@@ -315,6 +316,7 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     epoch_mono_ns: Instant = 0
     epoch_unix_ns: int = 0
     boots: dict[str, int] = {}
+    grid_ns: Instant = 0
 
 
 TASK_VECTORS = ("x", "xd", "wrench")

@@ -129,7 +129,10 @@ class SessionJoin:
                 # as the clocks stand now: their drift apart since the epoch is unknown
                 offset_ns = 0 if info.clock == own else self.pinger.estimate(info.boot).offset_at(now_ns)
                 epoch = Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
-                return self._ask_to_join(epoch, running, now_ns) if self._sites else epoch
+                if not self._sites:
+                    return epoch
+                grid_ns = (info.grid_ns or info.epoch_mono_ns) - offset_ns
+                return self._ask_to_join(epoch._replace(mono_ns=grid_ns), running, now_ns)
         return None
 
     def _rank(self, info: Info) -> tuple[int, ...]:
