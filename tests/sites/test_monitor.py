@@ -4,7 +4,6 @@ import io
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from sites.monitor import LINE_EVERY, SessionDisplay, SessionMonitor
 from trilat_net.core.site_step import Site
@@ -14,6 +13,7 @@ from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
+from trilat_net.reporting.terminal_output import TextConsole
 from trilat_net.scenario import load_scenario
 
 SCENARIO = load_scenario("paper")
@@ -33,11 +33,11 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     for junk in (b"", b"\xc1", bytes(70_000)):
         say("m1", topics.LINK, junk)
         say("m1", topics.EVENT, junk)
-    say("m1", topics.LINK, encode(STATISTICS))
+    say("m1", topics.LINK, encode(msgspec.structs.replace(STATISTICS, mode="[/red]\x1b[7mX")))
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
     say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
     out = io.StringIO()
-    with SessionDisplay(SCENARIO, Console(file=out, force_terminal=terminal, width=120)) as display:
+    with SessionDisplay(SCENARIO, TextConsole(file=out, force_terminal=terminal, width=160)) as display:
         watch.poll()
         assert list(watch.latest) == ["m1"]
         for _ in range(LINE_EVERY):
@@ -47,4 +47,5 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     assert watch.take_news() == []
     assert "[/red] s is gone [x]" in out.getvalue()
     assert "m1" in out.getvalue()
+    assert "[/red]<U+001B>[7mX" in out.getvalue()
     assert "nobody" not in out.getvalue()
