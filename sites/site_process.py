@@ -9,7 +9,17 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
 from trilat_net.core.site_setup import StaleAction
-from trilat_net.core.ticks import NS_PER_S, Arrival, Mode, TickInput, TickRecord, describe_mode, tick_ns
+from trilat_net.core.ticks import (
+    NS_PER_S,
+    Arrival,
+    LifeReason,
+    Mode,
+    TickInput,
+    TickRecord,
+    describe_mode,
+    find_life_reason,
+    tick_ns,
+)
 from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
@@ -136,7 +146,7 @@ class RunningSite:
         self._given_up = False
         self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
-        self._status_s = 0
+        self._status_s = self._told_s = 0
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
@@ -245,6 +255,7 @@ class RunningSite:
             self._publisher.publish("mark", text, t_ns=at_ns, ticks=tick)
         self._parts.changes.marks.clear()
         self._tell_skipped(k, t_ns)
+        self._tell_waiting(k, t_ns)
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))
@@ -255,6 +266,18 @@ class RunningSite:
             ticks, self._skipped = " ".join(self._skipped), []
             text = f"{self._parts.name} did not make ticks {ticks}"
             self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
+
+    def _tell_waiting(self, k: int, t_ns: int) -> None:
+        """Publishes once a second that the site does not go to its peers because they are too far away."""
+        output = self._output
+        holds = output is not None and output.mode in (Mode.WAITING, Mode.HOLD)
+        if output is None or not holds or self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+            return
+        if find_life_reason(output) is LifeReason.ALIGN_LIMIT and t_ns // NS_PER_S > self._told_s:
+            self._told_s = t_ns // NS_PER_S
+            text = describe_mode(self._parts.name, output, glides=True)
+            self._publisher.publish("waiting", text, t_ns=t_ns, ticks=k)
+            self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
         """Takes in who has come, and gives up where somebody has been away for too long."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from live.terminal_watch import HEADS, SessionWatch, describe_row
-from sites.session_stop import stop_session
+from sites.session_stop import order_sites, stop_session
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.net.bus import Bus, LocalNetwork
@@ -52,6 +52,56 @@ def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_
     assert describe_row(shown[-1][0]).startswith(f"m1 {(ticks - 1) / 1000:.1f} s ")
     assert titles[0].endswith("waits for its members")
     assert " V = " in titles[-1]
+
+
+GLIDES = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 20.0}
+
+
+def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> None:
+    session = Session.whole(load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}), tmp_path, ends={})
+    said: list[tuple[bool, str]] = []
+
+    def order(bus: Bus, clock: RelayClock) -> None:
+        for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
+            clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+            said.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, sites, name))
+
+    session.stranger(order)
+    log = session.run()
+    assert session.ends == {"m": 0, "s": 0}
+    assert [accepted for accepted, _ in said] == [True, False, False, True]
+    assert said[1][1] == "s is in stopped; reset is for a site in fault"
+    assert said[2][1].startswith("m is in ")
+    tick = int(said[0][1].rpartition(" ")[2])
+    back = int(said[3][1].rpartition(" ")[2])
+    assert set(log["s"].mode[tick:back]) == {"stopped"}
+    assert log["s"].mode[back] == "return"
+    assert "stopped" not in set(log["m"].mode)
+    assert any(event.text.startswith("s is STOPPED: it was ordered to") for event in log.events)
+    assert verify(log).identical == 8000
+
+
+def test_a_site_whose_peers_are_too_far_says_so_once_a_second(tmp_path: Path) -> None:
+    """Their start poses are 0.4 rad apart."""
+    rule = {**GLIDES, "on_stale.align_limit_rad": 0.05, "duration_s": 3.2}
+    log = Session.whole(load_scenario("two_sites", rule), tmp_path).run()
+    told = [event for event in log.events if event.kind == "waiting" and event.member == "s"]
+    assert [event.t_ns // 1_000_000_000 for event in told] == [1, 2, 3]
+    assert "s waits for its peers: its peers are farther away than align_limit_rad" in told[0].text
+    assert set(log["s"].mode) == {"waiting"}
+
+
+def test_an_arm_whose_rule_is_not_glide_is_told_how_its_session_ends(tmp_path: Path) -> None:
+    session = Session.whole(load_scenario("two_sites", {"duration_s": 2.0}), tmp_path, ends={})
+    said: list[str] = []
+
+    def order(bus: Bus, clock: RelayClock) -> None:
+        clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
+        said.extend(one.text for one in order_sites(bus, clock, SESSION, ["s"], "stop") if not one.accepted)
+
+    session.stranger(order)
+    session.run()
+    assert "trilat stop --end" in said[0]
 
 
 def test_a_session_that_is_not_there_is_not_stopped() -> None:

@@ -197,7 +197,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boot: the sender's process start.
         kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
             "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand",
-            "mark"; where sites come and go "left", "coming", "admit", "join", "unheard", "heard".
+            "mark"; where sites come and go "left", "coming", "admit", "join", "unheard", "heard"; of a site
+            that does not go to its peers "waiting", of ticks that it did not make "overrun".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.

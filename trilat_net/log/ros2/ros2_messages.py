@@ -69,6 +69,7 @@ _LEVELS = {
     "lost": RosLogLevel.WARN,
     "left": RosLogLevel.WARN,
     "unheard": RosLogLevel.WARN,
+    "waiting": RosLogLevel.WARN,
     "refused": RosLogLevel.WARN,
     "clock fault": RosLogLevel.WARN,
 }
