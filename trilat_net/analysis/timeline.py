@@ -10,6 +10,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from ..core.session_life import HELD_OVERRUN_TICKS
 from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
@@ -67,6 +68,8 @@ class StatedModel(NamedTuple):
 def list_changes(log: Log) -> list[AppliedChange]:
     """Returns the changes before the end of the run, in the order of the times from which they held.
 
+    Ticks that were not made are among them if they were so many that the site held.
+
     Raises:
         LogError: a record names a change that is none.
     """
@@ -79,7 +82,8 @@ def list_changes(log: Log) -> list[AppliedChange]:
             except msgspec.MsgspecError as error:
                 raise LogError(f"{log.source}: a record names a change that is none: {error}") from None
     before_s = recorded_end_s(log)
-    return sorted((c for c in found if c.change.at_s < before_s), key=lambda changed: changed.change.at_s)
+    kept = (c for c in found if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS)
+    return sorted(kept, key=lambda changed: changed.change.at_s)
 
 
 def list_stated_models(log: Log, link: str, changed: Sequence[AppliedChange]) -> list[StatedModel]:
