@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long bench lock clean
+.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long faults bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -13,6 +13,7 @@ help:
 	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
+	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 
 demo: setup
@@ -75,6 +76,9 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+faults: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.faults --seeds 2000 --write
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks

@@ -12,7 +12,7 @@ from recorder.record_process import Recorder
 from sites import realtime
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import take_part
-from trilat_net.errors import RunFailed, SessionError
+from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
@@ -103,12 +103,16 @@ class Session:
         )
         interrupt = interrupt or self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
-        bus = self.network.join()
+        bus = self.join(name)
         try:
             return take_part(SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append))
         finally:
             bus.close()
             self.left_ns[name] = clock.monotonic_ns()
+
+    def join(self, name: str) -> Bus:  # noqa: ARG002 - for networks that know their members
+        """The connection of a member."""
+        return self.network.join()
 
     def _own(self, name: str, clock: RelayClock) -> Clock:
         return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
@@ -119,7 +123,7 @@ class Session:
         """Adds the recorder."""
 
         def run(clock: RelayClock) -> Sequence[str]:
-            bus = self.network.join()
+            bus = self.join("recorder")
             try:
                 own = self._own("recorder", clock)
                 recorder = Recorder(
@@ -135,6 +139,11 @@ class Session:
                 self.left_ns["recorder"] = clock.monotonic_ns()
                 problem = recording.problem()
                 return [*recording.summary(), *([problem] if problem else [])]
+            except LogRefused as refused:
+                if self.ends is None:
+                    raise
+                self.ends["recorder"] = refused
+                return [str(refused)]
             finally:
                 bus.close()
 
@@ -172,7 +181,7 @@ class Session:
 
     def stranger(self, act: Stranger, at_ns: int = 0) -> None:
         """Adds somebody who does what `act` does."""
-        self.relay.add(f"stranger {len(self.clocks)}", lambda clock: act(self.network.join(), clock), at_ns)
+        self.relay.add(f"stranger {len(self.clocks)}", lambda clock: act(self.join("stranger"), clock), at_ns)
 
     def play(self) -> None:
         """Runs it in this process, which is left as it is: no real-time priority, no locked memory."""

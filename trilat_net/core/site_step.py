@@ -94,6 +94,9 @@ class Site:
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._glides = setup.on_stale.action is StaleAction.GLIDE
         self._remembers = self._glides or self._user_law is not None
+        s = self._site  # its fields are looked up once: that takes longer than to read them
+        own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
+        self._held_fields = (*own, self._links["used_ns"])
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
     def order(self, command: CoreChange, t_ns: int) -> None:
@@ -228,12 +231,12 @@ class Site:
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
-        s: Row = self._site[0]
-        held = [*s.q_held.tolist(), float(s.return_from_ns)]
+        q_held, return_from_ns, qd_held, reason, tau_held, used_ns = self._held_fields
+        held = [*q_held.tolist(), float(return_from_ns.item())]
         if not self._glides:
             return held
-        heard = self._links["used_ns"].astype(float).tolist()
-        return [*held, *s.qd_held.tolist(), float(s.reason), *heard, *s.tau_held.tolist()]
+        heard = map(float, used_ns.tolist())
+        return [*held, *qd_held.tolist(), float(reason.item()), *heard, *tau_held.tolist()]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""

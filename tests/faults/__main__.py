@@ -1,0 +1,138 @@
+"""Judges seeds on all cores: `python -m tests.faults`; with --write the matrix of docs/faults.md is made."""
+
+import argparse
+import re
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+from .fault_matrix import LIVE, ROWS, Row
+from .judged_seed import Judged, judge_seed
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "faults.md"
+BEGIN, END = "<!-- made by python -m tests.faults --write -->", "<!-- end -->"
+
+
+class Seeds(NamedTuple):
+    """What came of some seeds.
+
+    Attributes:
+        judged: each.
+        wall_s: how long all took, s.
+    """
+
+    judged: Sequence[Judged]
+    wall_s: float
+
+    @property
+    def failed(self) -> list[tuple[int, Judged]]:
+        """Those in which an invariant did not hold."""
+        return [(seed, one) for seed, one in enumerate(self.judged) if one.violations]
+
+    def of(self, kind: str) -> list[Judged]:
+        """Those in which a kind of fault happened, or several."""
+        if kind == "several":
+            return [one for one in self.judged if len(one.faults) > 1]
+        return [one for one in self.judged if kind in {fault.kind for fault in one.faults}]
+
+
+def judge_seeds(count: int) -> Seeds:
+    """Judges the first seeds, each run twice."""
+    began_s = time.monotonic()
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+        judged = list(pool.map(judge_seed, range(count), chunksize=4))
+    return Seeds(judged, time.monotonic() - began_s)
+
+
+def find_tests(wanted: Sequence[str]) -> list[str]:
+    """The tests of some names, with the files in which they are."""
+    files = {
+        path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in (ROOT / LIVE).glob("test_*.py")
+    }
+    found = []
+    for name in wanted:
+        if "/" in name:
+            found.append(name)
+            continue
+        (file,) = (file for file, text in files.items() if f"def test_{name}(" in text)
+        found.append(f"{file}::test_{name}")
+    return found
+
+
+def run_tests(names: Sequence[str]) -> dict[str, str]:
+    """Runs tests; by name how they ended: passed, failed, or skipped."""
+    command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", *dict.fromkeys(names)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    ends: dict[str, set[str]] = {}
+    for word, name in re.findall(r"^(PASSED|FAILED|ERROR|SKIPPED) (\S+)", done.stdout, re.MULTILINE):
+        for asked in names:
+            if name.startswith(asked):
+                ends.setdefault(asked, set()).add(word)
+    bad = {"FAILED", "ERROR"}
+    return {name: "failed" if bad & found else "passed" for name, found in ends.items()}
+
+
+def describe_row(row: Row, seeds: Seeds, ends: dict[str, str]) -> str:
+    """A row of the page."""
+    sessions = [one for kind in row.kinds for one in seeds.of(kind)]
+    broken = sum(bool(one.violations) for one in sessions)
+    virtual = [f"{len(sessions)} sessions, {broken} violations"] if row.kinds else []
+    cells = []
+    for tests, shown in ((row.virtual, virtual), (row.real, [])):
+        names = find_tests(tests)
+        words = [f"{ends.get(name, 'not run')}: `{name.rpartition('::test_')[2] or name}`" for name in names]
+        cells.append("; ".join([*shown, *words]) or "–")
+    failed = broken or any(ends.get(name) != "passed" for name in find_tests((*row.virtual, *row.real)))
+    state = "not ok" if failed else f"ok, gap: {row.gap}" if row.gap else "ok"
+    return f"| {row.mark} | {row.fault} | {row.required} | {cells[0]} | {cells[1]} | {state} |"
+
+
+def describe_seeds(seeds: Seeds) -> list[str]:
+    """Figures of all seeds, and what they came by."""
+    visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
+    holds = [ticks for one in seeds.judged for ticks in one.holds]
+    rate = 2 * len(seeds.judged) / seeds.wall_s * 60.0
+    came = ", ".join(f"{name} {count}" for name, count in sorted(visited.items()))
+    count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
+    return [
+        f"{count} seeds, each run twice: {broken} with a violation; {rate:.0f} sessions of 5 s a minute. "
+        f"Held {len(holds)} times: at most {most} ticks after the last sample that came into use.",
+        "",
+        f"What they came by: {came}.",
+    ]
+
+
+def main() -> int:
+    """Prints the violations of the seeds; the exit code is 1 if there is one."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=200, help="how many")
+    parser.add_argument(
+        "--write", action="store_true", help="run the matrix's tests too, and write docs/faults.md"
+    )
+    asked = parser.parse_args()
+    seeds = judge_seeds(asked.seeds)
+    for seed, one in seeds.failed:
+        print(f"seed {seed}:\n{one}\n")
+    lines = describe_seeds(seeds)
+    print("\n".join(lines))
+    if asked.write:
+        ends = run_tests(find_tests([name for row in ROWS for name in (*row.virtual, *row.real)]))
+        table = [describe_row(row, seeds, ends) for row in ROWS]
+        heads = ["| | fault | required | virtual time | real | |", "|---|---|---|---|---|---|"]
+        text = PAGE.read_text("utf-8")
+        before, _, rest = text.partition(BEGIN)
+        made = "\n".join([BEGIN, "", *lines, "", *heads, *table, "", END])
+        PAGE.write_text(before + made + rest.partition(END)[2], "utf-8")
+        print("\n".join(line for line in table if "| not ok |" in line))
+    return int(bool(seeds.failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

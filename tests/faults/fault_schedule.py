@@ -1,0 +1,112 @@
+"""What goes wrong in a session, and when: drawn from a seed, or given.
+
+All of it happens in `TROUBLE_S` and has ended by `HEALED_S`; what is left of the session must be enough for
+everybody to follow everybody again.
+"""
+
+from collections.abc import Callable, Sequence
+from random import Random
+from typing import NamedTuple
+
+from trilat_net.net.requests import ChangeRequest
+
+SITES = ("m1", "m2", "s")
+MEMBERS = (*SITES, "recorder")
+LENGTH_S = 5.0
+TROUBLE_S = (0.8, 2.2)
+"""Tick 0 is at 0 s."""
+HEALED_S = 2.4
+MOST_FAULTS = 4
+
+
+class Fault(NamedTuple):
+    """One thing that goes wrong.
+
+    Attributes:
+        kind: one of `KINDS`.
+        at_s: when, s since tick 0.
+        for_s: how long.
+        of: whom it befalls: a site, or sender and receiver.
+        size: how much, in the kind's own measure.
+    """
+
+    kind: str
+    at_s: float
+    for_s: float
+    of: tuple[str, ...]
+    size: float = 0.0
+
+
+def _a_site(rng: Random) -> tuple[str, ...]:
+    return (rng.choice(SITES),)
+
+
+def _a_way(rng: Random) -> tuple[str, ...]:
+    return tuple(rng.sample(MEMBERS, 2))
+
+
+def _nobody(_rng: Random) -> tuple[str, ...]:
+    return ()
+
+
+class Kind(NamedTuple):
+    """How a kind is drawn: how often among others, whom it befalls, its sizes."""
+
+    weight: float
+    of: Callable[[Random], tuple[str, ...]]
+    sizes: tuple[float, float] = (0.0, 0.0)
+
+
+KINDS = {
+    "kill": Kind(2.0, _a_site),  # and start it again
+    "end": Kind(1.0, _a_site),  # by SIGTERM, and start it again
+    "freeze": Kind(2.0, _a_site),
+    "cut": Kind(2.0, _a_way),
+    "cut one way": Kind(2.0, _a_way),
+    "cut all": Kind(1.0, _nobody),  # a router that dies
+    "delay": Kind(1.5, _a_way, (0.001, 0.08)),  # s
+    "jitter": Kind(1.5, _a_way, (0.001, 0.06)),  # s
+    "loss": Kind(1.5, _a_way, (0.02, 0.9)),
+    "duplicate": Kind(1.0, _a_way, (0.05, 1.0)),
+    "corrupt": Kind(1.0, _a_way, (0.02, 1.0)),
+    "replay": Kind(1.0, _a_way),  # old messages once more
+    "stranger": Kind(1.0, _a_site),  # in the name of a site, of another start
+    "wall clock": Kind(1.0, _a_site, (-3600.0, 3600.0)),  # s
+    "order": Kind(1.5, _a_site, (0.0, 1.0)),  # somebody changes dominance, or a link
+    "stop": Kind(1.0, _a_site),  # by an operator
+    "full disk": Kind(0.5, _nobody, (1e5, 2e6)),  # bytes
+}
+
+
+def draw_faults(seed: int) -> list[Fault]:
+    """The faults of a seed, in time."""
+    rng = Random(seed)
+    names, weights = list(KINDS), [kind.weight for kind in KINDS.values()]
+    faults = []
+    for kind in rng.choices(names, weights, k=rng.randint(1, MOST_FAULTS)):
+        at_s = round(rng.uniform(*TROUBLE_S), 4)
+        longest_s = HEALED_S - at_s
+        for_s = round(min(longest_s, rng.choice([0.01, 0.03, 0.1, 0.5, 1.5]) * rng.uniform(0.5, 1.5)), 4)
+        size = round(rng.uniform(*KINDS[kind].sizes), 4)
+        faults.append(Fault(kind, at_s, for_s, KINDS[kind].of(rng), size))
+    return sorted(faults, key=lambda fault: fault.at_s)
+
+
+def order_of(fault: Fault) -> tuple[str, ChangeRequest]:
+    """What somebody asks of a site: another delay of a link, or other shares."""
+    (site,) = fault.of
+    first, second = (name for name in SITES if name != site)
+    share = round(0.1 + 0.8 * fault.size, 3)
+    if fault.size < 0.5:
+        to = {"delay_ms": 20.0 + round(20.0 * fault.size, 1)}
+        return site, ChangeRequest(link=f"{first}->{site}", to=to)
+    shares = {first: share, second: round(1.0 - share, 3)}
+    return site, ChangeRequest(dominance=site, to=shares, ramp_s=0.5)
+
+
+def describe(faults: Sequence[Fault]) -> str:
+    """The faults in words, one to a line."""
+    return "\n".join(
+        f"  {fault.at_s:.3f} s: {fault.kind} {' -> '.join(fault.of)} for {fault.for_s:g} s, {fault.size:g}"
+        for fault in faults
+    )

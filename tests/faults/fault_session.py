@@ -1,0 +1,266 @@
+"""A session of three sites and a recorder with faults, in one process, and what was published in it."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from random import Random
+from typing import Any
+from unittest import mock
+
+import msgpack
+
+from tests.log.disks import SmallDisk, file_on
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import SESSION, Session
+from trilat_net.errors import WireError
+from trilat_net.log.log_file import LogFile
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.net.requests import ChangeRequest
+from trilat_net.net.wire import decode, encode, split_states
+from trilat_net.process import Interrupt
+from trilat_net.scenario import Scenario, load_scenario
+
+from .fault_schedule import HEALED_S, LENGTH_S, MEMBERS, SITES, Fault, order_of
+from .faulty_network import FaultyNetwork
+
+NEVER_NS = 10**15
+"""Of a start whose time is known once the session begins."""
+LINK_S = 0.03
+KEYS: dict[str, Any] = {
+    "rate_hz": 1000,
+    "duration_s": LENGTH_S,
+    "link": {"delay_ms": 1e3 * LINK_S},
+    "on_stale.action": "glide",
+    "on_stale.align_limit_rad": 3.0,
+    "on_stale.align_speed_rad_s": 2.0,
+    "limits": {
+        "tau_limit_nm": 80.0,
+        "tau_rate_limit_nm_s": 300.0,
+        "qd_limit_rad_s": 10.0,
+        "qd_des_limit_rad_s": 5.0,
+        "q_min_rad": -6.0,
+        "q_max_rad": 6.0,
+    },
+}
+
+
+def make_scenario() -> Scenario:
+    """The paper's arms and law without hands, which wait, align, hold and come back."""
+    return load_scenario("free", KEYS)
+
+
+@dataclass
+class Published:
+    """What the sites of a session published.
+
+    Attributes:
+        states: every record, by site, in the order in which it was sent.
+        events: every event.
+    """
+
+    states: dict[str, list[State]] = field(default_factory=lambda: {name: [] for name in SITES})
+    events: list[Event] = field(default_factory=list)
+
+
+@dataclass
+class FaultSession(Session):
+    """A session on a network that fails, with everything that its sites publish."""
+
+    faults: Sequence[Fault] = ()
+    seed: int = 0
+    published: Published = field(default_factory=Published)
+    epoch_ns: int = 0
+    plans: list[tuple[Fault, RelayClock, Interrupt, RelayClock]] = field(default_factory=list)
+    """Sites that end before their time: the fault, clock and signals, and the clock of the next start."""
+
+    def __post_init__(self) -> None:
+        self.network: FaultyNetwork = FaultyNetwork(self.relay, self.seed)
+        self._boots = Random(self.seed)
+        self._payloads: dict[str, list[bytes]] = {name: [] for name in SITES}
+        self._events: list[bytes] = []
+        self._recent: dict[str, list[bytes]] = {name: [] for name in SITES}
+        self._stats: dict[str, bytes] = {}
+
+    def join(self, name: str) -> Bus:
+        """See `Session`."""
+        return self.network.join_as(name)
+
+    def prepare(self) -> None:
+        """Adds the members; the faults begin to count when the session does."""
+        watcher = self.network.join_as("watcher")
+        for name in SITES:
+            records = self._payloads[name]
+            watcher.tap(topics.key(SESSION, name, topics.STATE), lambda _, load, to=records: to.append(load))
+            recent = self._recent[name]
+            watcher.tap(topics.key(SESSION, name, topics.SAMPLE), lambda _, load, to=recent: to.append(load))
+            link = topics.key(SESSION, name, topics.LINK)
+            watcher.tap(link, lambda _, load, name=name: self._stats.update({name: load}))
+        watcher.tap(topics.key(SESSION, "*", topics.EVENT), self._take_event)
+        self.ends = {}
+        self.recorder()
+        for name in SITES:
+            self.site(name, needs_recorder=False)
+        for fault in self.faults:
+            if fault.kind in ("kill", "end"):
+                self._returns(fault)
+
+    def _returns(self, fault: Fault) -> None:
+        """Adds a site that will be started again; when is known once the session begins."""
+        (name,) = fault.of
+        clock, interrupt = self.clocks[name], self.interrupts[name]
+        self.site(name, needs_recorder=False, at_ns=NEVER_NS)
+        self.plans.append((fault, clock, interrupt, self.clocks[name]))
+
+    def _take_event(self, _key: str, payload: bytes) -> None:
+        self._events.append(payload)
+        if not self.epoch_ns and b"start" in payload:
+            event = decode(payload, Event)
+            if event.kind == "start":
+                self.epoch_ns = event.epochs[event.member]
+                self._begin()
+
+    def _begin(self) -> None:
+        """Tick 0 is known: sets the time of every fault."""
+        for fault, clock, interrupt, after in self.plans:
+            at_ns = self._at(fault.at_s)
+            if fault.kind == "kill":
+                clock.dies_ns = at_ns
+            else:
+                clock.at(at_ns, lambda interrupt=interrupt: setattr(interrupt, "number", 15))
+            after.begins(self._at(fault.at_s + max(0.05, fault.for_s)))
+        self.relay.happens(self._at(HEALED_S), self._mend)
+        for fault in self.faults:
+            act = getattr(self, "_" + fault.kind.replace(" ", "_"), None)
+            if act is not None:
+                self.relay.happens(self._at(fault.at_s), lambda act=act, fault=fault: act(fault))
+
+    def _at(self, t_s: float) -> int:
+        return self.epoch_ns + round(t_s * 1e9)
+
+    def _later(self, fault: Fault, act: Callable[[], None]) -> None:
+        self.relay.happens(self._at(fault.at_s + fault.for_s), act)
+
+    def _freeze(self, fault: Fault) -> None:
+        self.clocks[fault.of[0]].stall(self._at(fault.at_s), round(fault.for_s * 1e9))
+
+    def _cut_ways(self, fault: Fault, ways: Sequence[tuple[str, str]]) -> None:
+        for way in ways:
+            self.network.cut(*way)
+        self._later(fault, lambda: [self.network.mend(*way) for way in ways])
+
+    def _cut_one_way(self, fault: Fault) -> None:
+        self._cut_ways(fault, [fault.of])
+
+    def _cut(self, fault: Fault) -> None:
+        self._cut_ways(fault, [fault.of, fault.of[::-1]])
+
+    def _cut_all(self, fault: Fault) -> None:
+        self._cut_ways(fault, [(a, b) for a in MEMBERS for b in MEMBERS if a != b])
+
+    def _set_way(self, fault: Fault, name: str, value: float) -> None:
+        way = self.network.way(*fault.of)
+        setattr(way, name, value)
+        self._later(fault, lambda: setattr(way, name, 0))
+
+    def _delay(self, fault: Fault) -> None:
+        self._set_way(fault, "delay_ns", round(fault.size * 1e9))
+
+    def _jitter(self, fault: Fault) -> None:
+        self._set_way(fault, "jitter_ns", round(fault.size * 1e9))
+
+    def _loss(self, fault: Fault) -> None:
+        self._set_way(fault, "loss", fault.size)
+
+    def _duplicate(self, fault: Fault) -> None:
+        self._set_way(fault, "doubled", fault.size)
+
+    def _corrupt(self, fault: Fault) -> None:
+        self._set_way(fault, "corrupted", fault.size)
+
+    def _publish(self, key: str, payloads: Sequence[bytes]) -> None:
+        bus = self.network.join_as("stranger")
+        publish = bus.publisher(key)
+        for payload in payloads:
+            publish(payload)
+        bus.close()
+
+    def _replay(self, fault: Fault) -> None:
+        name = next(one for one in fault.of if one in SITES)
+        self._publish(topics.key(SESSION, name, topics.SAMPLE), self._recent[name][-600:-100:5])
+
+    def _stranger(self, fault: Fault) -> None:
+        """The newest samples of a site as of another start, and far ahead, and what is no sample at all."""
+        (name,) = fault.of
+        loads = []
+        for load in self._recent[name][-50:]:
+            sample = msgpack.unpackb(load)
+            loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "q": [9.0, 9.0]}))
+            loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "tick": sample["tick"] + 9700}))
+        self._publish(topics.key(SESSION, name, topics.SAMPLE), [*loads, b"", b"\xff" * 2000])
+
+    def _wall_clock(self, fault: Fault) -> None:
+        self.clocks[fault.of[0]].wall_ahead_ns = round(fault.size * 1e9)
+
+    def _order(self, fault: Fault) -> None:
+        self._ask(*order_of(fault))
+
+    def _ask(self, site: str, asked: ChangeRequest) -> None:
+        bus = self.network.join_as("operator")
+        bus.ask(topics.key(SESSION, site, topics.SET), encode(asked))
+        bus.close()
+
+    def _stop(self, fault: Fault) -> None:
+        (site,) = fault.of
+        self._ask(site, ChangeRequest(order="stop"))
+
+    def _mend(self) -> None:
+        """What was latched is let go, as an operator does who has looked."""
+        for site in SITES:
+            for order in ("reset", "enable"):
+                self._ask(site, ChangeRequest(order=order))
+
+    def payloads(self) -> Iterator[bytes]:
+        """All records and events that were published, as they were sent."""
+        return chain(*self._payloads.values(), self._events)
+
+    def dropped(self) -> Iterator[str]:
+        """Why sites dropped messages, by the last that each said."""
+        for payload in self._stats.values():
+            yield from decode(payload, LinkStats).dropped
+
+    def play(self) -> None:
+        """See `Session`; starts are numbered by the seed."""
+        boots = iter(lambda: self._boots.getrandbits(63) | 1 << 40, 0)
+        patches = [mock.patch("sites.site_parts.new_boot", side_effect=boots)]
+        for disk in (SmallDisk(int(fault.size)) for fault in self.faults if fault.kind == "full disk"):
+            opened = partial(_file_on, disk)
+            patches.append(mock.patch("trilat_net.log.log_writer.LogFile", opened))
+        with ExitStack() as stack:
+            for patch in patches:
+                stack.enter_context(patch)
+            super().play()
+        for name, payloads in self._payloads.items():
+            for payload in payloads:
+                self.published.states[name] += [decode(one, State) for one in split_states(payload)]
+        for payload in self._events:
+            try:
+                self.published.events.append(decode(payload, Event))
+            except WireError:
+                continue
+
+
+def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:
+    return file_on(disk, path)
+
+
+def run_faults(faults: Sequence[Fault], folder: Path, seed: int = 0) -> FaultSession:
+    """A session with these faults, run to its end."""
+    session = FaultSession(make_scenario(), folder / "run.mcap", faults=faults, seed=seed)
+    session.prepare()
+    session.play()
+    return session

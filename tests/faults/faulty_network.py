@@ -1,0 +1,203 @@
+"""A network in one process whose ways fail: cut, one-way, slow, lossy, doubling, out of order, corrupting.
+
+A way leads from one member to another. While it is cut, what is sent is kept, as by a transport that sends
+again, and comes in one burst when it is mended soon; a cut as long as a lease ends the connection: what was
+kept is gone, and each side sees the other's liveliness token disappear until the way is mended.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from random import Random
+
+from tests.sites.relay import Relay
+from trilat_net.net.bus import RING_CAPACITY, Inbox, LocalBus, LocalNetwork, StampedInbox, T, matches_key
+
+LEASE_NS = 1_000_000_000
+"""As `trilat_net.net.zenoh_config` sets it."""
+KEPT = 4096
+"""Messages that a transport keeps while its way is cut."""
+
+Deliver = Callable[[str, bytes], None]
+
+
+@dataclass
+class Way:
+    """What happens to messages from one member to another.
+
+    Attributes:
+        cut_ns: since when nothing passes; None: it is open.
+        ended: True once a lease has passed since then.
+        delay_ns: every message takes so long.
+        jitter_ns: and up to so much longer, so that messages overtake each other.
+        loss, doubled, corrupted: shares of the messages of sites to which that happens.
+        kept: what was sent since the way was cut.
+    """
+
+    cut_ns: int | None = None
+    ended: bool = False
+    delay_ns: int = 0
+    jitter_ns: int = 0
+    loss: float = 0.0
+    doubled: float = 0.0
+    corrupted: float = 0.0
+    kept: deque[Callable[[], None]] = field(default_factory=lambda: deque(maxlen=KEPT))
+
+
+class FaultyNetwork(LocalNetwork):
+    """The network of some members on a relay's time; chance comes from a seed."""
+
+    def __init__(self, relay: Relay, seed: int) -> None:
+        super().__init__()
+        self._relay, self._chance = relay, Random(seed)
+        self._ways: dict[tuple[str, str], Way] = {}
+        self.changes = 0
+        """How often somebody has joined, left or subscribed."""
+
+    def join_as(self, name: str) -> "FaultyBus":
+        """The connection of a member that has a name."""
+        member = FaultyBus(self, name)
+        self.changes += 1
+        self.members.append(member)
+        return member
+
+    def way(self, sender: str, receiver: str) -> Way:
+        """The way from one member to another, whoever runs under these names."""
+        return self._ways.setdefault((sender, receiver), Way())
+
+    def open(self, sender: str, receiver: str) -> bool:
+        """True if messages pass."""
+        return self.way(sender, receiver).cut_ns is None
+
+    def carry(self, sender: str, receiver: str, key: str, payload: bytes, sink: Deliver) -> None:
+        """Takes a message over a way, or does to it what the way does."""
+        way, chance = self.way(sender, receiver), self._chance
+        if way.cut_ns is not None:
+            if not way.ended:
+                way.kept.append(lambda: sink(key, payload))
+            return
+        often = key.endswith(("/sample", "/state", "/link"))  # the others are sent again by the transport
+        if often and way.loss and chance.random() < way.loss:
+            return
+        if often and way.corrupted and chance.random() < way.corrupted:
+            place = chance.randrange(len(payload))
+            flipped = bytes([payload[place] ^ (1 << chance.randrange(8))])
+            payload = payload[:place] + flipped + payload[place + 1 :]
+        for _ in range(2 if way.doubled and chance.random() < way.doubled else 1):
+            late_ns = way.delay_ns + (chance.randrange(way.jitter_ns) if way.jitter_ns else 0)
+            if late_ns:
+                at_ns = self._relay.now_ns + late_ns
+                self._relay.happens(at_ns, lambda payload=payload: sink(key, payload))
+            else:
+                sink(key, payload)
+
+    def cut(self, sender: str, receiver: str) -> None:
+        """Nothing passes from now on; after a lease the connection has ended in both directions."""
+        way = self.way(sender, receiver)
+        if way.cut_ns is not None:
+            return
+        way.cut_ns = since_ns = self._relay.now_ns
+
+        def end() -> None:
+            if way.cut_ns == since_ns:
+                way.ended = True
+                way.kept.clear()
+                self._tell_presence(sender, receiver, False)
+
+        self._relay.happens(since_ns + LEASE_NS, end)
+
+    def mend(self, sender: str, receiver: str) -> None:
+        """Everything passes again, and first what was kept."""
+        way = self.way(sender, receiver)
+        ended, kept = way.ended, list(way.kept)
+        way.kept.clear()
+        way.cut_ns, way.ended = None, False
+        for deliver in kept:
+            deliver()
+        if ended:
+            self._tell_presence(sender, receiver, True)
+
+    def _tell_presence(self, sender: str, receiver: str, alive: bool) -> None:
+        for token in [token for one in self._named(sender) for token in one._tokens]:
+            for member in self._named(receiver):
+                for expression, ring in member._presence_rings:
+                    if matches_key(expression, token):
+                        ring.put((token, alive))
+
+    def _named(self, name: str) -> Iterator["FaultyBus"]:
+        return (one for one in self.members if isinstance(one, FaultyBus) and one.name == name)
+
+
+class FaultyBus(LocalBus):
+    """The connection of a member to a `FaultyNetwork`."""
+
+    def __init__(self, network: FaultyNetwork, name: str) -> None:
+        super().__init__(network)
+        self.name, self._faulty = name, network
+
+    def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
+        """See `Bus`."""
+        self._faulty.changes += 1
+        return super().inbox(key, capacity)
+
+    def stamped(
+        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+    ) -> StampedInbox[T]:
+        """See `Bus`."""
+        self._faulty.changes += 1
+        return super().stamped(key, now_ns, read, capacity)
+
+    def tap(self, key: str, callback: Deliver) -> None:
+        """See `Bus`."""
+        self._faulty.changes += 1
+        super().tap(key, callback)
+
+    def close(self) -> None:
+        """See `Bus`."""
+        self._faulty.changes += 1
+        super().close()
+
+    def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
+        """See `Bus`."""
+
+        takers: list[tuple[str, Deliver]] = []
+        known = -1
+
+        def publish(payload: bytes) -> None:
+            nonlocal known
+            if known != self._faulty.changes:  # who takes a key is looked up once
+                known = self._faulty.changes
+                takers[:] = [
+                    (_name(member), sink)
+                    for member in self._faulty.members
+                    for expression, sink in member._sinks
+                    if member is not self and matches_key(expression, key)
+                ]
+            for name, sink in takers:
+                self._faulty.carry(self.name, name, key, payload, sink)
+
+        return publish
+
+    def ask(self, key: str, payload: bytes = b"") -> Inbox:
+        """See `Bus`; who cannot be reached, or cannot reach the asker, does not answer."""
+        everyone = self._faulty.members
+        self._faulty.members = [member for member in everyone if member is self or self._meets(member)]
+        try:
+            return super().ask(key, payload)
+        finally:
+            self._faulty.members = everyone
+
+    def _meets(self, member: LocalBus) -> bool:
+        name = _name(member)
+        return self._faulty.open(self.name, name) and self._faulty.open(name, self.name)
+
+    def _notify(self, token: str, alive: bool) -> None:
+        for member in self._faulty.members:
+            if member is not self and self._faulty.open(self.name, _name(member)):
+                for expression, ring in member._presence_rings:
+                    if matches_key(expression, token):
+                        ring.put((token, alive))
+
+
+def _name(member: LocalBus) -> str:
+    return member.name if isinstance(member, FaultyBus) else ""

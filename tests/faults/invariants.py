@@ -1,0 +1,212 @@
+"""What must hold in every session, whatever goes wrong in it: laws of its records, tick by tick.
+
+Each looks at what the sites published, on a way that no fault touches, or at the log.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby, pairwise
+
+import numpy as np
+
+from trilat_net.analysis.arm_rows import inertia_product_rows
+from trilat_net.errors import TrilatError
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.messages import State
+from trilat_net.scenario import Scenario
+
+from .fault_schedule import LENGTH_S, SITES
+from .fault_session import FaultSession, Published
+
+SILENT_TICKS = 20
+_LIFE = {("waiting", "return"), ("return", "run"), ("return", "hold"), ("run", "hold"), ("hold", "return")}
+_FREE = ("waiting", "return", "run", "hold")
+LEGAL = {
+    *_LIFE,
+    *((mode, latched) for mode in _FREE for latched in ("fault", "stopped")),
+    *((latched, after) for latched in ("fault", "stopped") for after in ("waiting", "return")),
+    ("stopped", "fault"),
+}
+"""How a site may change its mode; every start begins with `waiting`."""
+STEP_SHARE = 1.1
+"""Most that the torque may step between ticks, of what it does in the run without faults."""
+ENGAGED_S = 0.2
+"""So long before its end everybody follows everybody again."""
+RESIDUAL = 1e-9
+
+
+def stretches(states: Sequence[State]) -> Iterator[list[State]]:
+    """The records of each start of a site."""
+    for _, of_boot in groupby(states, key=lambda state: state.boot):
+        yield list(of_boot)
+
+
+def check_edges(session: FaultSession) -> Iterator[str]:
+    """I1: modes change only as `session_life` draws it."""
+    for name, states in session.published.states.items():
+        for stretch in stretches(states):
+            if stretch[0].mode != "waiting":
+                yield f"{name} begins with {stretch[0].mode} at tick {stretch[0].tick}"
+            for before, after in pairwise(stretch):
+                if before.mode != after.mode and (before.mode, after.mode) not in LEGAL:
+                    yield f"{name} goes from {before.mode} to {after.mode} at tick {after.tick}"
+
+
+def check_limits(session: FaultSession) -> Iterator[str]:
+    """I2: what is published is finite and within the limits."""
+    for name, states in session.published.states.items():
+        tau_limit, qd_limit = (
+            session.scenario.setup(name).tau_limit_nm,
+            session.scenario.setup(name).qd_limit_rad_s,
+        )
+        for state in states:
+            numbers = np.array([*state.q, *state.qd, *state.tau, *state.q_des, *state.qd_des])
+            if not np.isfinite(numbers).all():
+                yield f"{name} publishes what is not finite at tick {state.tick}"
+            if (np.abs(state.tau) > tau_limit).any() or (np.abs(state.qd) > qd_limit).any():
+                yield f"{name} is beyond its limits at tick {state.tick}"
+
+
+def count_silence(stretch: Sequence[State]) -> Iterator[tuple[State, int]]:
+    """Yields the records of a start, and for how many ticks the most silent peer has been so."""
+    used, since = dict(stretch[0].used), dict.fromkeys(stretch[0].used, stretch[0].tick)
+    for state in stretch:
+        for peer, tick in state.used.items():
+            if tick != used[peer]:
+                used[peer], since[peer] = tick, state.tick
+        yield state, state.tick - min(since.values())
+
+
+def check_silence(session: FaultSession) -> Iterator[str]:
+    """I3 and I7: a site follows only while of every peer a sample came into use within the last 20 ticks."""
+    for name, states in session.published.states.items():
+        for stretch in stretches(states):
+            for state, silent in count_silence(stretch):
+                if state.mode in ("run", "return") and (
+                    silent > SILENT_TICKS or min(state.used.values()) < 0
+                ):
+                    yield f"{name} is in {state.mode} at tick {state.tick}, {silent} ticks after a new sample"
+
+
+def find_holds(session: FaultSession) -> Iterator[int]:
+    """Ticks from the last sample of a peer that came into use to every hold."""
+    for states in session.published.states.values():
+        for stretch in stretches(states):
+            before = ""
+            for state, silent in count_silence(stretch):
+                if state.mode == "hold" != before:
+                    yield silent
+                before = state.mode
+
+
+def check_order(session: FaultSession) -> Iterator[str]:
+    """I4: of every peer the samples in use never go back, nor beyond the present."""
+    for name, states in session.published.states.items():
+        for stretch in stretches(states):
+            for before, after in pairwise(stretch):
+                if any(after.used[peer] < used for peer, used in before.used.items()):
+                    yield f"{name} goes back to an older sample at tick {after.tick}"
+                if max(after.used.values()) > after.tick:
+                    yield f"{name} uses a sample of the future at tick {after.tick}"
+
+
+def check_storage(session: FaultSession) -> Iterator[str]:
+    """I5: held and left alone, the storage of the adaptive law never rises from 20 ticks on."""
+    for name, states in session.published.states.items():
+        for mode, held in groupby(states, key=lambda state: (state.boot, state.mode)):
+            S = compute_storage(session.scenario, name, list(held)) if mode[1] == "hold" else np.zeros(0)
+            rises = np.diff(S[SILENT_TICKS:])
+            if rises.size and rises.max() > RESIDUAL * max(1.0, S.max()):
+                yield f"{name}: the storage rises by {rises.max():.3g} J while it holds"
+
+
+def compute_storage(scenario: Scenario, name: str, states: Sequence[State]) -> np.ndarray:
+    """S = 1/2 (r'M r + e'Lambda Kd e + theta~'Gamma^-1 theta~) of some records, J."""
+    gains, theta = scenario.setup(name).gains, scenario.arms[name].theta
+    q, qd, q_des, theta_hat = (
+        np.array([getattr(state, key) for state in states]) for key in ("q", "qd", "q_des", "theta_hat")
+    )
+    e, off = q - q_des, theta_hat - theta
+    r = qd + np.asarray(gains.Lambda) * e
+    kinetic = (r * inertia_product_rows(theta, q, r)).sum(axis=1)
+    stored = (np.asarray(gains.Lambda) * np.asarray(gains.Kd) * e**2).sum(axis=1)
+    learnt: np.ndarray = (off**2 / np.asarray(gains.Gamma)).sum(axis=1)
+    return 0.5 * (kinetic + stored + learnt)
+
+
+def largest_step(published: Published, from_tick: int) -> float:
+    """The largest step of a torque between ticks, N m, in the starts of a session, from a tick of each on."""
+    most = 0.0
+    for states in published.states.values():
+        for stretch in stretches(states):
+            tau = np.array([state.tau for state in stretch[from_tick:]])
+            most = max(most, np.abs(np.diff(tau, axis=0)).max(initial=0.0))
+    return most
+
+
+def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
+    """I6: the torque steps no more than its rate allows, or not much more than in the run without faults."""
+    setup = session.scenario.setup(SITES[0])
+    allowed_nm = max(STEP_SHARE * undisturbed_nm, float(np.max(setup.limits.tau_rate)) / setup.rate_hz)
+    most = largest_step(session.published, 0)
+    if most > allowed_nm * (1.0 + RESIDUAL):
+        yield f"a torque steps by {most:.4g} N m between ticks; at most {allowed_nm:.4g}"
+
+
+def check_liveness(session: FaultSession) -> Iterator[str]:
+    """I8: once everything is mended, everybody follows everybody again."""
+    rate_hz = session.scenario.sites[SITES[0]].rate_hz
+    last = round(LENGTH_S * rate_hz)
+    for name, states in session.published.states.items():
+        modes = {state.mode for state in states if state.tick >= last - ENGAGED_S * rate_hz}
+        if modes != {"run"}:
+            yield f"{name} ends in {' and '.join(sorted(modes)) or 'silence'}"
+
+
+def check_starts(session: FaultSession) -> Iterator[str]:
+    """I9: one start of a site after the other, and every tick once."""
+    for name, states in session.published.states.items():
+        boots = [boot for boot, _ in groupby(states, key=lambda state: state.boot)]
+        if len(set(boots)) < len(boots):
+            yield f"{name}: two starts at one time"
+        for before, after in pairwise(states):
+            if after.tick <= before.tick:
+                yield f"{name} makes tick {after.tick} after {before.tick}"
+
+
+def check_log(session: FaultSession) -> Iterator[str]:
+    """I10: what was published stands in the log, or is counted; and every record is what its inputs give."""
+    if any(fault.kind == "full disk" for fault in session.faults):
+        return  # its log ends where the disk does
+    try:
+        log = open_log(session.path)
+        found = verify(log)
+    except TrilatError as error:
+        yield f"the log cannot be read: {error}"
+        return
+    changed = any(fault.kind == "corrupt" and "recorder" not in fault.of for fault in session.faults)
+    if found.differing and not changed:  # a site that took in other numbers than were sent is found out
+        yield f"{found.differing} records differ when they are executed again"
+    touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)
+    for name, states in session.published.states.items():
+        ticks = {state.tick for state in states}
+        there = set(log[name].tick.tolist()) if len(log[name]) else set()
+        if there - ticks:
+            yield f"{name}: {len(there - ticks)} records in the log that nobody published"
+        lost = len(ticks - there)
+        if lost > log.missing(name) or (lost and not touched):
+            yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
+
+
+Invariant = Callable[[FaultSession], Iterator[str]]
+
+INVARIANTS: dict[str, Invariant] = {
+    "I1 edges": check_edges,
+    "I2 limits": check_limits,
+    "I3, I7 silence": check_silence,
+    "I4 order": check_order,
+    "I5 storage": check_storage,
+    "I8 liveness": check_liveness,
+    "I9 starts": check_starts,
+    "I10 log": check_log,
+}

@@ -1,0 +1,89 @@
+"""One seed judged: its session is run, and again, and every invariant is looked at."""
+
+import hashlib
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from .fault_schedule import Fault, describe, draw_faults
+from .fault_session import FaultSession, run_faults
+from .invariants import INVARIANTS, check_torque, find_holds, largest_step
+
+TORQUE, AGAIN = "I6 torque", "I11 again"
+
+
+class Judged(NamedTuple):
+    """What came of a session with faults.
+
+    Attributes:
+        faults: what went wrong.
+        violations: by invariant, in words; empty if all held.
+        visited: how often what happened: modes that were entered, events, what was dropped, how sites ended.
+        holds: ticks from the last sample that came into use to each hold.
+    """
+
+    faults: Sequence[Fault]
+    violations: dict[str, list[str]]
+    visited: Counter[str]
+    holds: list[int]
+
+    def __str__(self) -> str:
+        found = [f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]]
+        return "\n".join([describe(self.faults), *found])
+
+
+def judge_seed(seed: int, *, again: bool = True) -> Judged:
+    """Judges the faults of a seed; `again` runs them twice and compares."""
+    return judge_faults(draw_faults(seed), seed, again=again)
+
+
+def judge_faults(faults: Sequence[Fault], seed: int = 0, *, again: bool = False) -> Judged:
+    """Judges some faults; chance in the network comes from the seed."""
+    undisturbed_nm = find_undisturbed_step()
+    with tempfile.TemporaryDirectory() as folder:
+        session = run_faults(faults, Path(folder), seed)
+        found = {name: list(check(session)) for name, check in INVARIANTS.items()}
+        found[TORQUE] = list(check_torque(session, undisturbed_nm))
+        digest = digest_session(session)
+    if again:
+        with tempfile.TemporaryDirectory() as folder:
+            if digest_session(run_faults(faults, Path(folder), seed)) != digest:
+                found[AGAIN] = ["the same seed publishes or records other bytes"]
+    violations = {name: texts for name, texts in found.items() if texts}
+    return Judged(faults, violations, count_visited(session), list(find_holds(session)))
+
+
+@cache
+def find_undisturbed_step() -> float:
+    """The largest step of a torque in the session without faults, after its first 0.1 s, N m."""
+    with tempfile.TemporaryDirectory() as folder:
+        return largest_step(run_faults((), Path(folder)).published, 100)
+
+
+def digest_session(session: FaultSession) -> str:
+    """SHA-256 of all that was published, and of the log as far as it came."""
+    digest = hashlib.sha256()
+    for payload in session.payloads():
+        digest.update(payload)
+    for path in sorted(session.path.parent.glob("run*")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def count_visited(session: FaultSession) -> Counter[str]:
+    """What happened in a session, by name."""
+    visited: Counter[str] = Counter()
+    for states in session.published.states.values():
+        before = ""
+        for state in states:
+            if state.mode != before:
+                visited[f"mode {state.mode}"] += 1
+            before = state.mode
+    visited.update(f"event {event.kind}" for event in session.published.events)
+    visited.update(f"dropped {reason}" for reason in session.dropped())
+    visited.update(f"fault {fault.kind}" for fault in session.faults)
+    visited.update(f"end {type(end).__name__}" for end in (session.ends or {}).values())
+    return visited

@@ -1,0 +1,168 @@
+"""Bugs that are put into the program on purpose: each breaks one invariant, and the seeds must find it."""
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+from unittest import mock
+
+from sites.peer_monitor import PeerMonitor
+from sites.site_loop import PeerInbox
+from sites.site_process import RunningSite
+from trilat_net.core.site_setup import SiteSetup, StaleAction
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import Arrival, TickRecord
+from trilat_net.log.log_writer import LogParts
+from trilat_net.net.membership import Epoch
+from trilat_net.scenario import Scenario
+
+from .judged_seed import AGAIN, TORQUE
+
+
+def _with_setups(change: Callable[[SiteSetup, int], SiteSetup]) -> AbstractContextManager[Any]:
+    """Sites are built from other set-ups; the number says how often one was built before."""
+    build, built = Scenario.setup, 0
+
+    def setup(scenario: Scenario, site: str) -> SiteSetup:
+        nonlocal built
+        built += 1
+        return change(build(scenario, site), built)
+
+    return mock.patch.object(Scenario, "setup", setup)
+
+
+def _with_records(change: Callable[[TickRecord], TickRecord]) -> AbstractContextManager[Any]:
+    """Sites put other records out than their step has made."""
+    step = Site.step
+    return mock.patch.object(Site, "step", lambda site, inputs: change(step(site, inputs)))
+
+
+@contextmanager
+def waits_too_long() -> Iterator[None]:
+    """A silence of 60 ms is no silence yet."""
+
+    def slower(setup: SiteSetup, _: int) -> SiteSetup:
+        rule = setup.on_stale
+        return setup._replace(on_stale=rule._replace(age_ns=3 * rule.age_ns))
+
+    with _with_setups(slower):
+        yield
+
+
+@contextmanager
+def follows_at_once() -> Iterator[None]:
+    """Sites begin to follow without waiting or aligning."""
+
+    def at_once(setup: SiteSetup, _: int) -> SiteSetup:
+        return setup._replace(on_stale=setup.on_stale._replace(action=StaleAction.USE))
+
+    with _with_setups(at_once):
+        yield
+
+
+@contextmanager
+def jumps_back() -> Iterator[None]:
+    """Held and let go, the reference is where the peers are at once."""
+
+    def faster(setup: SiteSetup, _: int) -> SiteSetup:
+        return setup._replace(on_stale=setup.on_stale._replace(align_speed=1e9))
+
+    with _with_setups(faster), mock.patch("trilat_net.core.session_life.MIN_ALIGN_NS", 1):
+        yield
+
+
+@contextmanager
+def learns_the_wrong_way() -> Iterator[None]:
+    """The estimate goes up the gradient."""
+
+    def wrong(setup: SiteSetup, _: int) -> SiteSetup:
+        gains = setup.gains
+        return setup._replace(gains=gains._replace(Gamma=tuple(-gain for gain in gains.Gamma)))
+
+    with _with_setups(wrong):
+        yield
+
+
+@contextmanager
+def exceeds_its_limit() -> Iterator[None]:
+    """Now and then a torque leaves without its limit."""
+
+    def beyond(record: TickRecord) -> TickRecord:
+        return record._replace(tau=[1e4, 0.0]) if record.tick % 1500 == 1200 else record
+
+    with _with_records(beyond):
+        yield
+
+
+@contextmanager
+def says_an_older_sample() -> Iterator[None]:
+    """Now and then a record names an older sample than the one before."""
+
+    def older(record: TickRecord) -> TickRecord:
+        used = [max(-1, tick - 100) for tick in record.used]
+        return record._replace(used=used) if record.tick % 1500 == 1200 else record
+
+    with _with_records(older):
+        yield
+
+
+@contextmanager
+def never_admits_again() -> Iterator[None]:
+    """A site that comes back stays a stranger to the others."""
+    with mock.patch.object(PeerMonitor, "_consider", return_value=None):
+        yield
+
+
+@contextmanager
+def begins_at_zero() -> Iterator[None]:
+    """A site that comes back counts its ticks from 0."""
+    begin = RunningSite.__init__
+
+    def at_zero(site: RunningSite, parts: Any, publisher: Any, pinger: Any, epoch: Epoch) -> None:
+        begin(site, parts, publisher, pinger, epoch._replace(first=0))
+
+    with mock.patch.object(RunningSite, "__init__", at_zero):
+        yield
+
+
+@contextmanager
+def loses_records() -> Iterator[None]:
+    """The recorder forgets a message in a thousand."""
+    add, count = LogParts.add, 0
+
+    def forgetful(log: LogParts, *message: Any) -> Any:
+        nonlocal count
+        count += 1
+        return None if count % 1000 == 999 else add(log, *message)
+
+    with mock.patch.object(LogParts, "add", forgetful):
+        yield
+
+
+@contextmanager
+def depends_on_chance() -> Iterator[None]:
+    """The order of arrivals is another one in every run."""
+    drain = PeerInbox.drain
+
+    def shuffled(inbox: PeerInbox, since_epoch_ns: int) -> list[Arrival]:
+        arrivals = drain(inbox, since_epoch_ns)
+        random.shuffle(arrivals)
+        return arrivals
+
+    with mock.patch.object(PeerInbox, "drain", shuffled):
+        yield
+
+
+PLANTED: Sequence[tuple[Callable[[], AbstractContextManager[None]], str]] = (
+    (follows_at_once, "I1 edges"),
+    (exceeds_its_limit, "I2 limits"),
+    (waits_too_long, "I3, I7 silence"),
+    (says_an_older_sample, "I4 order"),
+    (learns_the_wrong_way, "I5 storage"),
+    (jumps_back, TORQUE),
+    (never_admits_again, "I8 liveness"),
+    (begins_at_zero, "I9 starts"),
+    (loses_records, "I10 log"),
+    (depends_on_chance, AGAIN),
+)
+"""Bugs, and the invariant that each must break."""

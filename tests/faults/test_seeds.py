@@ -1,0 +1,83 @@
+"""Whole sessions in which things go wrong by a seed, on virtual time, over the code that runs live."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from .fault_schedule import HEALED_S, KINDS, SITES, TROUBLE_S, Fault, draw_faults
+from .judged_seed import Judged, judge_faults, judge_seed
+from .planted_bugs import PLANTED
+
+ON_PUSH, BLOCK, ALL = 40, 100, 2000
+FINDS_WITHIN = 200
+
+
+@pytest.mark.parametrize("first", range(0, ON_PUSH, 10))
+def test_invariants_hold_whatever_goes_wrong(first: int) -> None:
+    """Forty seeds on a push; every tenth of them is run twice."""
+    for seed in range(first, first + 10):
+        assert_holds(judge_seed(seed, again=seed % 10 == 0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("first", range(ON_PUSH, ALL, BLOCK))
+def test_invariants_hold_in_two_thousand_sessions(first: int) -> None:
+    visited: Counter[str] = Counter()
+    for seed in range(first, min(first + BLOCK, ALL)):
+        judged = judge_seed(seed)
+        assert_holds(judged)
+        visited += judged.visited
+    assert not set(SOMETIMES) - set(visited)
+
+
+def assert_holds(judged: Judged) -> None:
+    assert not judged.violations, f"\n{judged}"
+
+
+SOMETIMES = (
+    *(f"mode {mode}" for mode in ("waiting", "return", "run", "hold")),
+    *(f"event {kind}" for kind in ("mode", "change", "lost", "left", "join", "end")),
+    *(f"fault {kind}" for kind in KINDS),
+    "dropped stranger",
+    "dropped missing",
+)
+"""What a hundred seeds must have come by, or they try too little."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("bug", "breaks"), PLANTED, ids=[bug.__name__ for bug, _ in PLANTED])
+def test_a_planted_bug_is_found(bug, breaks: str) -> None:  # type: ignore[no-untyped-def]
+    judge_faults(())  # what is undisturbed is measured before
+    with bug():
+        for seed in range(FINDS_WITHIN):
+            if breaks in judge_seed(seed, again=breaks.startswith("I11")).violations:
+                return
+    pytest.fail(f"{FINDS_WITHIN} seeds do not find it")
+
+
+def faults_of(kind: str) -> st.SearchStrategy[Fault]:
+    least, most = KINDS[kind].sizes
+    at_s = st.floats(*TROUBLE_S).map(lambda x: round(x, 3))
+    of = {
+        0: st.just(()),
+        1: st.tuples(st.sampled_from(SITES)),
+        2: st.permutations([*SITES, "recorder"]).map(lambda names: tuple(names[:2])),
+    }[len(draw_of(kind))]
+    for_s = st.floats(0.001, HEALED_S - TROUBLE_S[1]).map(lambda x: round(x, 3))
+    return st.builds(Fault, st.just(kind), at_s, for_s, of, st.floats(least, most))
+
+
+def draw_of(kind: str) -> tuple[str, ...]:
+    """Whom a kind befalls, for once."""
+    return next(fault.of for seed in range(10_000) for fault in draw_faults(seed) if fault.kind == kind)
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.lists(st.sampled_from(sorted(KINDS)).flatmap(faults_of), max_size=5))
+def test_any_faults_at_all(faults: Sequence[Fault]) -> None:
+    """Hypothesis makes those that fail small."""
+    assert_holds(judge_faults(sorted(faults, key=lambda fault: fault.at_s)))
