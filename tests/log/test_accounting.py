@@ -1,5 +1,6 @@
 """Accounts and ranges, against the set of numbers that came."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -111,3 +112,32 @@ def test_of_very_many_gaps_the_first_are_named() -> None:
     assert account.as_text().endswith(
         "largest gap 1 (" + " ".join(f"{n}-{n}" for n in range(1, 40, 2)) + " ...)"
     )
+
+
+@pytest.mark.parametrize(
+    ("first_start", "made", "missing", "unmade"),
+    [
+        (range(5), 0, 0, 5),  # it was killed: what it made besides is not known
+        (range(5), 7, 2, 3),  # it stated seven at its end
+        ((0, 1, 4), 0, 2, 5),  # a gap of its own stays one
+        ((), 0, 0, 10),  # it was never there
+    ],
+)
+def test_what_lies_between_two_starts_is_not_made_and_not_missing(
+    first_start: Sequence[int], made: int, missing: int, unmade: int
+) -> None:
+    for told_first in (True, False):
+        account = Account()
+        for number in first_start:
+            account.take(number)
+        account.expect(made)
+        if told_first:
+            account.begin_anew(10, made)
+        for number in range(10, 13):
+            account.take(number)
+        if not told_first:
+            account.begin_anew(10, made)
+        assert (account.missing, account.unmade) == (missing, unmade)
+        assert account.expected == account.received + account.missing == 13 - unmade
+        account.begin_anew(10, made)  # said twice, it counts once
+        assert account.unmade == unmade
