@@ -141,7 +141,7 @@ def largest_step(log: Log, site: str, first: int = 0) -> float:
     return float(np.abs(np.diff(tau, axis=0))[first:].max())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))])
 def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) -> None:
     """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""
     random = np.random.default_rng(seed)
@@ -199,7 +199,14 @@ def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("missed", "mode"), [(5, "run"), (20, "run"), (21, "hold"), (200, "hold"), (201, "fault")]
+    ("missed", "mode"),
+    [
+        pytest.param(5, "run", marks=pytest.mark.long),
+        (20, "run"),
+        (21, "hold"),
+        pytest.param(200, "hold", marks=pytest.mark.long),
+        (201, "fault"),
+    ],
 )
 def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for(
     missed: int, mode: str
