@@ -16,8 +16,8 @@ from .running import trilat
         (["--exclude", "**"], ["no message for this selection"]),
         (["--time", "arrival"], ["--time is publish (as it was sent) or log (as it arrived), not 'arrival'"]),
         (["--preload", "-1"], ["--preload is a number of MiB, not -1"]),
-        (["--prefix", "a/b"], ["a session's name is letters, digits, _, - and ., not 'a/b-paper'"]),
-        (["--session", "a b"], ["a session's name is letters", "'a b'"]),
+        (["--prefix", "a/b"], ["a session's name is at most 80 letters, digits, _", "not 'a/b-paper'"]),
+        (["--session", "a b"], ["a session's name is at most 80 letters", "'a b'"]),
         (["--connect", "tcp/127.0.0.1:1", "--router", "tcp/127.0.0.1:2"], ["--router"]),
     ],
 )
