@@ -22,6 +22,7 @@ def test_every_command_parses_as_it_is_written(words: list[str]) -> None:
     parses(words)
 
 
+@pytest.mark.long
 def test_every_experiment_runs_and_every_log_is_one_that_was_made(tmp_path: Path) -> None:
     logs = set()
     for _, command, *rest in COMMANDS:

@@ -132,6 +132,7 @@ def test_stored_truths_and_words_without_a_log_are_those_found_anew(seeds: Itera
         assert say_of(trilat_net.simulate(drawn.scenario)) == say_of_run(drawn.scenario), seed
 
 
+@pytest.mark.long
 @settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1))
 def test_no_seed_makes_it_call_unstable_runs_stable(seed: int) -> None:

@@ -112,6 +112,7 @@ def test_the_table_has_every_state() -> None:
     assert {state for state, _ in ROWS} == {*MADE, "part"}
 
 
+@pytest.mark.long
 def test_a_report_asks_for_the_coverage_that_it_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

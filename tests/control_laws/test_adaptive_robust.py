@@ -71,6 +71,7 @@ def test_the_residue_is_the_largest_of_its_function() -> None:
     assert worst <= ROBUST_RESIDUE * 2.0 * 0.4
 
 
+@pytest.mark.long
 def test_what_it_dissipates_stays_below_its_bound_and_that_of_the_box_does_not() -> None:
     def bound(log: Log) -> float:
         balance = compute_energy_balance(compute_site_energies(log))

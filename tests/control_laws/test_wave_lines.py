@@ -139,6 +139,7 @@ MESH = {"m1-m2": 2.0, "m1-s": 18.0, "m2-s": 4.0}
 SHARES = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
 
 
+@pytest.mark.long
 def test_three_sites_are_the_network_of_springs_b_over_T() -> None:
     law = {"law": "wave", "lines": MESH}
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}

@@ -220,6 +220,7 @@ for name in KINDS:
 """
 
 
+@pytest.mark.long
 def test_without_the_compiler_draws_and_fates_have_the_same_bits() -> None:
     plain = printed(_PROGRAM, compiled=False)
     assert plain.count("0x") == 300 * (2 + 1 + 1 + 1)

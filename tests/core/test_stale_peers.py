@@ -201,6 +201,7 @@ def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: Stal
 # What it is good for.
 
 
+@pytest.mark.long
 def test_a_ramped_return_takes_the_kick_out_of_a_healed_link() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and hears of it all at once."""
 

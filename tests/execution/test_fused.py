@@ -178,6 +178,7 @@ for scheme in ("second_order", "digital"):
 """
 
 
+@pytest.mark.long
 def test_without_the_compiler_it_has_the_same_bits() -> None:
     plain = printed(_PROGRAM, compiled=False)
     assert plain.count("\n") == 8

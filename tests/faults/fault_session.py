@@ -28,7 +28,7 @@ from trilat_net.scenario import Scenario, load_scenario
 from .fault_schedule import HEALED_S, LENGTH_S, MEMBERS, SITES, Fault, order_of
 from .faulty_network import FaultyNetwork
 
-NEVER_NS = 10**15
+NEVER_NS = 2_000 * 10**9
 """Of a start whose time is known once the session begins."""
 LINK_S = 0.03
 KEYS: dict[str, Any] = {

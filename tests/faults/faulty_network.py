@@ -31,6 +31,7 @@ class Way:
         delay_ns: every message takes so long.
         jitter_ns: and up to so much longer, so that messages overtake each other.
         loss, doubled, corrupted: shares of the messages of sites to which that happens.
+        tokens: liveliness tokens of the sender that the receiver knows, while the way is cut.
         kept: what was sent since the way was cut.
     """
 
@@ -41,6 +42,7 @@ class Way:
     loss: float = 0.0
     doubled: float = 0.0
     corrupted: float = 0.0
+    tokens: frozenset[str] = frozenset()
     kept: deque[Callable[[], None]] = field(default_factory=lambda: deque(maxlen=KEPT))
 
 
@@ -97,28 +99,33 @@ class FaultyNetwork(LocalNetwork):
         if way.cut_ns is not None:
             return
         way.cut_ns = since_ns = self._relay.now_ns
+        way.tokens = self._tokens_of(sender)
 
         def end() -> None:
             if way.cut_ns == since_ns:
                 way.ended = True
                 way.kept.clear()
-                self._tell_presence(sender, receiver, False)
+                self._tell_presence(way.tokens, receiver, False)
+                way.tokens = frozenset()
 
         self._relay.happens(since_ns + LEASE_NS, end)
 
     def mend(self, sender: str, receiver: str) -> None:
         """Everything passes again, and first what was kept."""
         way = self.way(sender, receiver)
-        ended, kept = way.ended, list(way.kept)
+        kept, now, known = list(way.kept), self._tokens_of(sender), way.tokens
         way.kept.clear()
         way.cut_ns, way.ended = None, False
         for deliver in kept:
             deliver()
-        if ended:
-            self._tell_presence(sender, receiver, True)
+        self._tell_presence(known - now, receiver, False)
+        self._tell_presence(now - known, receiver, True)
 
-    def _tell_presence(self, sender: str, receiver: str, alive: bool) -> None:
-        for token in [token for one in self._named(sender) for token in one._tokens]:
+    def _tokens_of(self, sender: str) -> frozenset[str]:
+        return frozenset(token for one in self._named(sender) for token in one._tokens)
+
+    def _tell_presence(self, tokens: frozenset[str], receiver: str, alive: bool) -> None:
+        for token in sorted(tokens):
             for member in self._named(receiver):
                 for expression, ring in member._presence_rings:
                     if matches_key(expression, token):

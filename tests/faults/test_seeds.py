@@ -11,15 +11,15 @@ from .fault_schedule import HEALED_S, KINDS, SITES, TROUBLE_S, Fault, draw_fault
 from .judged_seed import Judged, judge_faults, judge_seed
 from .planted_bugs import PLANTED
 
-ON_PUSH, BLOCK, ALL = 40, 100, 2000
+ON_PUSH, BLOCK, ALL = 8, 100, 2000
 FINDS_WITHIN = 200
 
 
-@pytest.mark.parametrize("first", range(0, ON_PUSH, 10))
+@pytest.mark.parametrize("first", range(0, ON_PUSH, 4))
 def test_invariants_hold_whatever_goes_wrong(first: int) -> None:
-    """Forty seeds on a push; every tenth of them is run twice."""
-    for seed in range(first, first + 10):
-        assert_holds(judge_seed(seed, again=seed % 10 == 0))
+    """Eight seeds on a push, one of them twice."""
+    for seed in range(first, first + 4):
+        assert_holds(judge_seed(seed, again=seed == 0))
 
 
 @pytest.mark.long

@@ -10,6 +10,9 @@ from collections.abc import Callable
 
 from greenlet import greenlet
 
+LONGEST_NS = 3_600 * 10**9
+"""No session of a test lasts so long."""
+
 
 class Relay:
     """Time shared by runners, of which one at a time runs; between them things happen by themselves."""
@@ -67,6 +70,8 @@ class Relay:
             self.now_ns = max(self.now_ns, at_ns)
             act()
         self.now_ns = max(self.now_ns, deadline_ns)
+        if self.now_ns > LONGEST_NS:
+            raise TimeoutError("an hour has passed: somebody waits for what never comes")
 
     def sleep(self, seat: int, deadline_ns: int) -> None:
         """Returns when nobody else has anything to do before this runner's deadline."""

@@ -31,6 +31,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     assert measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend is EnvelopeTrend.GROWS
 
 
+@pytest.mark.long
 def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
     """-0.8, so 1.6: as `docs/lab.md` asks."""
     row = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
@@ -51,6 +52,7 @@ def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
     assert peak(made) == printed(3e-3, 1e-3)
 
 
+@pytest.mark.long
 def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))

@@ -32,6 +32,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
     return found
 
 
+@pytest.mark.long
 def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
     """The judge of the package, in this process and in two others."""
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])

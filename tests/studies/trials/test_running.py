@@ -25,6 +25,7 @@ def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], 
     ]
 
 
+@pytest.mark.long
 def test_two_processes_give_the_results_of_one_in_the_same_order() -> None:
     batch = trilat_net.trials(quick(), [5, 2, 9, 4])
     told: list[TrialResult] = []

@@ -37,6 +37,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
     return asked(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(jobs=1)
 
 
+@pytest.mark.long
 def test_the_same_request_makes_the_same_result_whatever_the_number_of_processes(
     found: TuningResult, tmp_path: Path
 ) -> None:
