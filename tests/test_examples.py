@@ -45,6 +45,7 @@ def test_a_look_into_a_log(
     assert (tmp_path / "look_into_a_log.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_springs_with_reactions_rest_where_their_sum_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces of springs that act at both ends move no centre: by d qd_i summed, the mean pose stays."""
     monkeypatch.syspath_prepend(LOOK.parent)

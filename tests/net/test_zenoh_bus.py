@@ -122,6 +122,7 @@ def test_a_router_lets_in_who_has_the_password_and_through_what_is_allowed(tmp_p
             bus.close()
 
 
+@pytest.mark.long
 def test_messages_go_over_quic_too(tmp_path: Path) -> None:
     network = encrypted("quic", tmp_path)
     try:

@@ -34,6 +34,7 @@ def edge(B: float = 0.0, b: float = 0.0) -> LinearEdge | None:
     return find_linear_edge(scenario, STIFFNESS, 1e3, 2e5, rest, points=12)
 
 
+@pytest.mark.long
 def test_the_map_in_contact_has_its_edge() -> None:
     found = edge()
     assert found is not None

@@ -72,6 +72,7 @@ def test_what_the_scenarios_are_known_to_do(name: str, changes: dict[str, Any], 
     assert judged(load_scenario(name, changes)).verdict is verdict
 
 
+@pytest.mark.long
 def test_a_law_in_python_is_judged_as_the_same_law_of_the_kernel() -> None:
     """`tests.laws:Adaptive` is Eq. (13) and (15) by other code, with the gains of the scenario."""
     short = {"duration_s": 2.0, "link.delay_ms": 5.0}
