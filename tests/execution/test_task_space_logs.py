@@ -7,12 +7,10 @@ import trilat_net
 from tests.task_arms import planar_task
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
 from trilat_net.analysis.run_end import classify_log_end
-from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.figures.registry import list_drawable_figures
 from trilat_net.scenario import load_scenario, parse_scenario
-from trilat_net.theory.operating_point import derive_operating_conditions
 
 pytestmark = pytest.mark.long  # compiled for arms of seven joints that follow places
 SHORT = {"duration_s": 1.0}
@@ -56,11 +54,6 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
 
 def test_the_end_of_a_run_is_told_in_metres(log: Log) -> None:
     assert classify_log_end(log).error_unit == "m"
-
-
-def test_linear_analysis_says_why_it_has_none(log: Log) -> None:
-    with pytest.raises(ScenarioError, match="not in task space"):
-        derive_operating_conditions(log.scenario)
 
 
 TOUCH = """[[sites.m.hands]]
