@@ -53,7 +53,7 @@ def live_command(
         alone = {"--duration", "--out", "--seed", "--set", "--force", "scenario"}
         if extra := alone & set(options.given_options(context)):
             raise UsageError(f"--session shows a session that runs: leave out {', '.join(sorted(extra))}")
-        connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+        connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
         name = options.check_session_name(session)
         code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)
         raise typer.Exit(code)

@@ -206,6 +206,13 @@ def resolve_connection(
     return secure_connection(connection, read_keys(keys), insecure=insecure)
 
 
+def resolve_client_connection(
+    connect: list[str] | None, routers: list[str] | None, zenoh_config: Path | None, keys: Path | None
+) -> "Connection":
+    """Returns how a command reaches a session of which it is no member, by its options."""
+    return resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
+
+
 def read_keys(folder: Path | None) -> "MemberKeys | None":
     """Returns a member's keys, None without a folder."""
     if folder is None:

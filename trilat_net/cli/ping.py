@@ -43,7 +43,7 @@ def ping_command(
     from ..net.clock import make_system_clock
     from ..process import Interrupt
 
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         probe = ping_session(

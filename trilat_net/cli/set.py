@@ -62,7 +62,7 @@ def set_command(
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
     name = None if session is None else options.check_session_name(session)
-    context.obj = name, options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    context.obj = name, options.resolve_client_connection(connect, router, zenoh_config, keys)
 
 
 def set_link_command(

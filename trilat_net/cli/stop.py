@@ -68,7 +68,7 @@ def stop_command(
     They stay so until `trilat enable`. With --end all sites end their run at one time instead. Without
     endpoints it asks the first site, at its loopback port, for the others.
     """
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     if not end:
         _order(session, connection, sites, "stop")
         return
@@ -92,12 +92,8 @@ def enable_command(
     keys: options.KeysOption = None,
 ) -> None:
     """Lets arms that were stopped follow again: they wait for their peers and align with them."""
-    _order(
-        session,
-        options.resolve_connection(None, connect, router, zenoh_config, [], None, keys),
-        sites,
-        "enable",
-    )
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    _order(session, connection, sites, "enable")
 
 
 def reset_command(
@@ -109,9 +105,5 @@ def reset_command(
     keys: options.KeysOption = None,
 ) -> None:
     """Ends the fault of sites, unless its reason is still there: they wait for their peers and align."""
-    _order(
-        session,
-        options.resolve_connection(None, connect, router, zenoh_config, [], None, keys),
-        sites,
-        "reset",
-    )
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    _order(session, connection, sites, "reset")

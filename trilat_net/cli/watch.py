@@ -29,7 +29,7 @@ def watch_command(
     from ..scenario import embedded_names_reader
 
     name, clock = options.check_session_name(session), SystemClock()
-    connection = options.resolve_connection(None, connect, router, zenoh_config, [], None, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     with Interrupt() as interrupt:
         with connect_to_session(
             connection,
