@@ -281,7 +281,10 @@ class PageServer:
         sending = asyncio.create_task(self._send(page))
         try:
             async for text in connection:
-                await self._take(page, text)
+                self._take(page, text)
+                if page.floods:  # what else it has sent is not even read
+                    await connection.close(_POLICY_VIOLATION, "too many messages")
+                    break
         except ConnectionClosed as closed:
             self.refused["too large"] += closed.sent is not None and closed.sent.code == _TOO_LARGE
         finally:
@@ -289,12 +292,10 @@ class PageServer:
             sending.cancel()
             self._pages.discard(page)
 
-    async def _take(self, page: Page, text: str | bytes) -> None:
-        """Takes a message of a page; a page that floods is closed."""
+    def _take(self, page: Page, text: str | bytes) -> None:
+        """Takes a message of a page, unless it sends more than it may."""
         if not page.allows(self._clock.monotonic_ns()):
             self.refused["too many"] += 1
-            if page.floods:
-                await page.connection.close(_POLICY_VIOLATION, "too many messages")
             return
         try:
             message = read_page_message(text)
