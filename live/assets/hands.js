@@ -77,7 +77,7 @@ export class Hands {
   }
 
   take(card, to, how) {
-    card.hold = { to, told: 0, ...how };
+    card.hold = { to, told: 0, moved: 0, ...how };
     card.card.classList.add("held");
     this.tell(card);
   }
@@ -93,8 +93,9 @@ export class Hands {
 
   tell(card) {
     const now = performance.now();
-    if (now - card.hold.told < EVERY_MS - 1) return;
-    Object.assign(card.hold, { told: now, asked: card.hold.to });
+    const moved = card.hold.to !== card.hold.asked;
+    if (now - (moved ? card.hold.moved : card.hold.told) < EVERY_MS - 1) return; // a rest's heartbeat delays no move
+    Object.assign(card.hold, { told: now, moved: moved ? now : card.hold.moved, asked: card.hold.to });
     this.send({ do: "hand", site: card.name, grip: true, to: this.goal(card) });
   }
 
