@@ -40,15 +40,23 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 class ChangeServer:
     """The change requests to one site, whose mode after the last tick `mode` returns.
 
+    While its dead-man switch is not `held` it neither takes up its work again nor ends a fault.
+
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
         marks: moments that somebody marked and that no event names yet: ticks, and texts.
     """
 
     def __init__(
-        self, scenario: Scenario, site: str, queries: QueryInbox, mode: Callable[[], Mode] = lambda: Mode.RUN
+        self,
+        scenario: Scenario,
+        site: str,
+        queries: QueryInbox,
+        mode: Callable[[], Mode] = lambda: Mode.RUN,
+        held: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._scenario, self._site, self._queries, self._mode = scenario, site, queries, mode
+        self._scenario, self._site, self._queries = scenario, site, queries
+        self._mode, self._held = mode, held
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
         self._links = initial_link_tables(scenario)
@@ -102,6 +110,8 @@ class ChangeServer:
         if needed is not None and mode is not needed:
             doing = mode.name.lower()
             raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {needed.name.lower()}")
+        if needed is not None and not self._held():
+            raise ScenarioError(f"the dead-man switch of {self._site} is not held; {order} it while it is")
         change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
         return to_core_change(self._scenario, change)
 

@@ -1,19 +1,20 @@
-"""Measurements of an external arm (`plant = "external"`), as its site receives them.
+"""Measurements of an external arm (`plant = "external"`) and its dead-man switch, as its site receives them.
 
 Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The newest
 measurement counts; a site does not begin without one, holds when none arrive for a moment, and is in fault
-when none arrive any more. One that the arm cannot have made since the last is dropped, and is none.
+when none arrive any more. One that the arm cannot have made since the last is dropped, and is none. A switch
+of which nothing is heard is not held.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Mode, PlantState
+from trilat_net.core.ticks import LifeReason, Mode, PlantState
 from trilat_net.errors import SessionError, WireError
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
-from trilat_net.net.requests import ArmMeasurement
+from trilat_net.net.requests import ArmEnable, ArmMeasurement
 from trilat_net.net.wire import decode
 from trilat_net.scenario.scenario_types import SiteOrder
 
@@ -25,6 +26,10 @@ HELD_SILENCE_NS = 30_000_000
 """After a longer silence the site holds."""
 SILENCE_LIMIT_NS = 200_000_000
 """After a longer one it is in fault."""
+SWITCH_SILENCE_NS = 100_000_000
+"""A dead-man switch of which nothing is heard for longer is not held."""
+STARTS_KEPT = 64
+"""Of so many earlier holders no message has an effect any more."""
 START_POSE_TOLERANCE_RAD = 0.01
 """A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000
@@ -150,3 +155,50 @@ class ExternalArm:
             return True
         way = [limit * passed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
         return all(abs(a - b) <= most for a, b, most in zip(q, self.newest.q, way, strict=True))
+
+
+class DeadManSwitch:
+    """The dead-man switch of one arm: held by one program at a time, until it lets go or is silent.
+
+    Its age is taken on the own clock from where a message came in, so that a site that slept is not held.
+    """
+
+    def __init__(self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]) -> None:
+        self._site, self._ring, self._clock, self._dropped = site, ring, clock, dropped
+        self._boot = self._n = -1
+        self._held_ns: int | None = None
+        self._earlier: deque[int] = deque(maxlen=STARTS_KEPT)
+
+    @property
+    def held(self) -> bool:
+        """True if somebody held it a moment ago."""
+        return self._held_ns is not None and self._clock.monotonic_ns() - self._held_ns <= SWITCH_SILENCE_NS
+
+    def poll(self) -> None:
+        """Takes in the messages that have arrived."""
+        while (message := self._ring.poll()) is not None:
+            self._take(*message)
+
+    def take_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
+        """Returns what the switch asks of its site, which is in some mode for a reason; "": nothing."""
+        if self.held:
+            return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
+        return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
+
+    def _take(self, payload: bytes, came_ns: int) -> None:
+        try:
+            message = decode(payload, ArmEnable)
+        except WireError as error:
+            self._dropped[error.reason] += 1
+            return
+        another = message.boot != self._boot
+        if message.site != self._site or message.boot in self._earlier or (another and self.held):
+            self._dropped["stranger"] += 1
+            return
+        if another:
+            self._earlier.append(self._boot)
+            self._boot, self._n = message.boot, -1
+        if message.n <= self._n:
+            self._dropped["old switch message"] += 1
+            return
+        self._n, self._held_ns = message.n, came_ns if message.held else None

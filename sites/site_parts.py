@@ -28,7 +28,7 @@ from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder
 
 from .change_server import ChangeServer
-from .external_arm import MEASUREMENTS_KEPT, ExternalArm
+from .external_arm import MEASUREMENTS_KEPT, DeadManSwitch, ExternalArm
 from .hand_server import MESSAGES_KEPT, HandServer
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
@@ -71,6 +71,7 @@ class SiteParts:
         rings: the peers' records as they arrive.
         watchdog: steps the site under a user's law; None without one.
         arm: measurements of its external arm; None without one.
+        switch: its dead-man switch; None without one.
         hand: whoever holds its arm; None without a live hand.
         publish_sample: publishes what peers need of a tick.
         states: the records that recorders have still to get.
@@ -102,11 +103,8 @@ class SiteParts:
             for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
         ]
         self.arm: ExternalArm | None = None
-        if name in scenario.external:
-            key = topics.key(session, name, topics.MEASURED)
-            ring = bus.stamped(key, clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
-            place = " at ".join([key, *map(str, options.connection.places[:1])])
-            self.arm = ExternalArm(self.site, ring, clock, self.stats.dropped, place)
+        self.switch: DeadManSwitch | None = None
+        self._meet_outside_arm()
         self.hand: HandServer | None = None
         if (live := find_live_hand(scenario.sites[name].hands)) is not None:
             inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
@@ -122,8 +120,22 @@ class SiteParts:
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         questions = bus.questions(topics.key(session, name, topics.SET))
-        self.changes = ChangeServer(scenario, name, questions, lambda: self.site.mode)
+        self.changes = ChangeServer(scenario, name, questions, lambda: self.site.mode, self._is_held)
         warm_up(scenario, name, clock)
+
+    def _meet_outside_arm(self) -> None:
+        name, session, dropped = self.name, self.options.session, self.stats.dropped
+        measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
+        if name in self.scenario.external:
+            ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+            place = " at ".join([measured, *map(str, self.options.connection.places[:1])])
+            self.arm = ExternalArm(self.site, ring, self.clock, dropped, place)
+        if self.scenario.sites[name].arm.dead_man:
+            ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+            self.switch = DeadManSwitch(name, ring, self.clock, dropped)
+
+    def _is_held(self) -> bool:
+        return self.switch is None or self.switch.held
 
     def _states_publisher(self) -> Callable[[list[bytes]], None]:
         keep = self.buffer.channels[topics.STATE].keep
@@ -156,7 +168,10 @@ class SiteParts:
         self._next_tick = k + 1
         if skipped:
             self.buffer.skip(k - skipped, k)
-        orders: list[tuple[SiteOrder, int]] = [("overrun", skipped), (self.arm.take_order(self.site.mode), 0)]
+        mode = self.site.mode
+        orders: list[tuple[SiteOrder, int]] = [("overrun", skipped), (self.arm.take_order(mode), 0)]
+        if self.switch is not None:
+            orders.append((self.switch.take_order(mode, self.site.life_reason), 0))
         for order, ticks in orders:
             if ticks or (order and order != "overrun"):
                 t_ns = tick_ns(k, self.site.rate_hz)

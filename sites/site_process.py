@@ -223,8 +223,9 @@ class RunningSite:
     def should_stop(self) -> bool:
         """See `LoopIO`."""
         parts = self._parts
-        if parts.arm is not None:
-            parts.arm.poll()
+        for input_ in (parts.arm, parts.switch):
+            if input_ is not None:
+                input_.poll()
         ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
         return bool(ended) or parts.interrupt.requested() or self._given_up
 

@@ -12,20 +12,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.external_arm import HELD_SILENCE_NS, MEASUREMENTS_KEPT, SILENCE_LIMIT_NS, ExternalArm
+from sites.external_arm import (
+    HELD_SILENCE_NS,
+    MEASUREMENTS_KEPT,
+    SILENCE_LIMIT_NS,
+    SWITCH_SILENCE_NS,
+    DeadManSwitch,
+    ExternalArm,
+)
+from sites.session_stop import order_sites
 from tests.scenario.chains import six
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Mode, TickInput
-from trilat_net.errors import SessionError
+from trilat_net.core.ticks import LifeReason, Mode, TickInput
+from trilat_net.errors import ScenarioError, SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.arm_port import ArmPort
+from trilat_net.net.arm_port import ArmPort, EnablePort
 from trilat_net.net.bus import Bus, LocalNetwork, StampingRing
 from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import VERSION, Event
-from trilat_net.net.requests import ArmMeasurement
+from trilat_net.net.requests import ArmEnable, ArmMeasurement
 from trilat_net.net.site_port import FRESH_NS
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
@@ -220,6 +228,75 @@ def test_a_site_that_was_frozen_makes_up_for_nothing_and_its_arm_stays_where_it_
     assert np.abs(np.diff(part.tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
     assert log["m"].mode[-1] in ("run", "hold", "return")
     whole(log)
+
+
+def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
+    """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
+    session, ends = session_of(tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5})
+    told: list[tuple[bool, str]] = []
+
+    def hold(bus: Bus, clock: RelayClock) -> None:
+        with EnablePort(bus, clock, SESSION, "s") as switch:
+            while switch.record is None:
+                clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
+            begun_ns = clock.monotonic_ns() - switch.record.t_ns
+            for from_s, to_s in ((0.2, 0.5), (0.8, 1.1)):
+                clock.sleep_until(begun_ns + round(from_s * 1e9))
+                while clock.monotonic_ns() < begun_ns + round(to_s * 1e9):
+                    switch.send(held=True)
+                    clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            switch.send(held=False)
+            clock.sleep_until(clock.monotonic_ns() + 20_000_000)
+            told.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, ["s"], "enable"))
+
+    session.stranger(hold, at_ns=A_SECOND)
+    log = session.run()
+    assert ends == {"m": 0, "s": 0}
+    changes = [int(k) + 1 for k in np.flatnonzero(np.diff(log["s"].mode == "stopped"))]
+    starts = np.array([0, *changes])
+    assert log["s"].mode[0] == "stopped"
+    assert np.abs(starts - [0, 200, 580, 800, 1100]).max() <= 5  # 480 ms and a silence of 100 ms
+    assert {log["s"].mode[k] for k in changes} == {"stopped", "return"}
+    assert sum("STOPPED: its dead-man switch is not held" in event.text for event in log.events) == 3
+    assert told == [(False, "the dead-man switch of s is not held; enable it while it is")]
+    assert np.abs(np.diff(log["s"].tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
+    whole(log)
+
+
+def test_a_switch_is_for_an_arm_outside_alone() -> None:
+    with pytest.raises(ScenarioError, match=r"sites\.s\.arm\.dead_man: is for an arm outside"):
+        load_scenario("two_sites", {"sites.s.arm.dead_man": True})
+
+
+def test_a_switch_is_held_by_one_program_until_it_lets_go_or_is_silent() -> None:
+    clock, dropped = ManualClock(), Counter[str]()
+    ring = StampingRing(clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+    switch = DeadManSwitch("s", ring, clock, dropped)
+
+    def hear(boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0) -> bool:
+        clock.sleep_until(clock.monotonic_ns() + after_ns)
+        ring.take(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
+        switch.poll()
+        return switch.held
+
+    assert switch.take_order(Mode.RUN, LifeReason.START) == "released"
+    assert switch.take_order(Mode.FAULT, LifeReason.START) == ""
+    assert not hear(1, 0, site="m")
+    assert hear(1, 5)
+    assert switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert switch.take_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
+    assert hear(2, 0, held=False)  # another one has no effect
+    clock.sleep_until(clock.monotonic_ns() + SWITCH_SILENCE_NS)
+    assert switch.held
+    assert not hear(1, 5, after_ns=1)  # said before
+    assert switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == ""
+    assert hear(1, 6)
+    assert not hear(1, 7, held=False)
+    assert hear(2, 1)
+    assert not hear(1, 8, after_ns=SWITCH_SILENCE_NS + 1)  # of an earlier holder nothing counts any more
+    ring.take(b"garbage")
+    switch.poll()
+    assert dropped == {"stranger": 3, "old switch message": 1, "malformed": 1}
 
 
 def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
@@ -420,7 +497,10 @@ def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
     assert port.torque() is None
     say(at(103))
     assert port.torque() == (1.5, -2.5)
-    say(at(104, mode="diverged"))
+    for tick, reason, torque in ((110, LifeReason.RELEASED, None), (120, LifeReason.STOP, (1.5, -2.5))):
+        say(at(tick, mode="stopped", mem=[0.0, 0.0, 1e6, 0.0, 0.0, float(reason)]))
+        assert port.torque() == torque
+    say(at(130, mode="diverged"))
     assert port.torque() is None
     assert not port.over
     site.publisher("trilat/t/s/event")(encode(Event(member="s", boot=5, kind="end", text="made 3 ticks")))
@@ -448,6 +528,9 @@ def test_the_page_names_every_field_of_a_message() -> None:
     table = page[page.index("| key |") : page.index("The torque stands")]
     assert set(re.findall(r"`(\w+)`", table)) == set(ArmMeasurement.__struct_fields__)
     assert f"| {VERSION}, the version of the messages |" in table
-    for seconds in (HELD_SILENCE_NS, SILENCE_LIMIT_NS, FRESH_NS):
+    switch = page[page.index("| of `enable` |") : page.index("At most one")]
+    assert set(re.findall(r"^\| `(\w+)`", switch, re.MULTILINE)) == {"held"}
+    assert set(ArmEnable.__struct_fields__) - set(ArmMeasurement.__struct_fields__) == {"held"}
+    for seconds in (HELD_SILENCE_NS, SILENCE_LIMIT_NS, FRESH_NS, SWITCH_SILENCE_NS):
         assert f"{seconds * 1e-9:g} s" in page
     assert f"at most {MEASUREMENTS_KEPT} wait" in page

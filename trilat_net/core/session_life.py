@@ -2,14 +2,15 @@
 
     WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD -> RETURN -> RUN
     any -> FAULT (a limit, a number that is not finite, its arm lost)  -- RESET  -> WAITING
-    any -> STOPPED (an order)                                          -- ENABLE -> WAITING
+    any -> STOPPED (an order, or nobody holds its dead-man switch) -- ENABLE, HELD -> WAITING
 
 Invariant: the reference and its derivative never jump, and the second is the derivative of the first. Held,
 the rate of the reference falls to zero over the time after which a peer counts as silent, and the reference
 is its integral; while the site aligns, the way from the peers' reference falls to zero with its rate, no
 faster than `align_speed` beyond what it had. A peer that holds or aligns itself is followed like any other.
 FAULT and STOPPED are latched: the torque goes over from the last one to damping and gravity (`safeguards`),
-the reference is the own pose, estimates stay as they are. No message of a peer leads there or back.
+the reference is the own pose, estimates stay as they are. No message of a peer leads there or back. A switch
+that is held again ends what its release began, but no stop by order.
 """
 
 from math import isfinite
@@ -36,9 +37,10 @@ _LIMIT_Q, _LIMIT_QD = int(LifeReason.LIMIT_Q), int(LifeReason.LIMIT_QD)
 _NOT_FINITE, _STOP = int(LifeReason.NOT_FINITE), int(LifeReason.STOP)
 _ENABLE, _RESET = int(LifeReason.ENABLE), int(LifeReason.RESET)
 _ARM_SILENT, _ARM_BACK = int(LifeReason.ARM_SILENT), int(LifeReason.ARM_BACK)
+_RELEASED, _HELD = int(LifeReason.RELEASED), int(LifeReason.HELD)
 _TO_STOP, _TO_ENABLE, _TO_RESET = int(LifeOrder.STOP), int(LifeOrder.ENABLE), int(LifeOrder.RESET)
 _HEAR_SILENCE, _LOSE_ARM = int(LifeOrder.ARM_SILENT), int(LifeOrder.ARM_LOST)
-_HEAR_ARM = int(LifeOrder.ARM_BACK)
+_HEAR_ARM, _LET_GO, _TAKE_HOLD = int(LifeOrder.ARM_BACK), int(LifeOrder.RELEASED), int(LifeOrder.HELD)
 
 
 @leaf
@@ -140,8 +142,12 @@ def _obey(t_ns: int, before_ns: int, site: Row) -> None:
         _wait(t_ns, site, _RESET)
     elif order == _TO_ENABLE and mode == _STOPPED:
         _wait(t_ns, site, _ENABLE)
-    elif order == _TO_STOP and mode != _FAULT and mode != _STOPPED:
-        latch(before_ns, site, _STOPPED, _STOP)
+    elif order == _TAKE_HOLD and mode == _STOPPED and site.reason == _RELEASED:
+        _wait(t_ns, site, _HELD)
+    elif order == _TO_STOP and mode == _STOPPED:
+        site.reason = _STOP
+    elif order in (_TO_STOP, _LET_GO) and mode != _FAULT and mode != _STOPPED:
+        latch(before_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
     elif mode in (_FAULT, _STOPPED):
         return
     elif order == _LOSE_ARM or skipped > FAULT_OVERRUN_TICKS:

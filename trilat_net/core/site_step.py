@@ -29,6 +29,7 @@ from .ticks import (
     Arrival,
     CoreChange,
     LifeOrder,
+    LifeReason,
     LinkCounts,
     Mode,
     TickInput,
@@ -200,6 +201,11 @@ class Site:
     def mode(self) -> Mode:
         """Its mode at the last tick."""
         return _MODES[self._mode.item()]
+
+    @property
+    def life_reason(self) -> LifeReason:
+        """Why it last changed its mode, under the rule `glide`."""
+        return LifeReason(self._site["reason"].item())
 
     @property
     def q(self) -> list[float]:

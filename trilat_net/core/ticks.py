@@ -74,6 +74,8 @@ class LifeReason(IntEnum):
     OVERRUN = 12
     ARM_SILENT = 13
     ARM_BACK = 14
+    RELEASED = 15
+    HELD = 16
 
 
 class LifeOrder(IntEnum):
@@ -81,17 +83,20 @@ class LifeOrder(IntEnum):
 
     STOP leads to STOPPED, from where ENABLE leads back; RESET leads back from FAULT. The others come from the
     site itself, at an arm outside of the program: ARM_SILENT and ARM_LOST say that no measurement came for a
-    time, ARM_BACK that one came again, OVERRUN that it did not make some ticks. Of several in one tick, the
-    one of the highest number counts, and OVERRUN besides.
+    time, ARM_BACK that one came again, RELEASED that nobody holds its dead-man switch, HELD that somebody
+    does again, OVERRUN that it did not make some ticks. Of several in one tick, the one of the highest number
+    counts, and OVERRUN besides.
     """
 
     ENABLE = 1
     RESET = 2
-    ARM_BACK = 3
-    ARM_SILENT = 4
-    STOP = 5
-    ARM_LOST = 6
-    OVERRUN = 7
+    HELD = 3
+    ARM_BACK = 4
+    ARM_SILENT = 5
+    RELEASED = 6
+    STOP = 7
+    ARM_LOST = 8
+    OVERRUN = 9
 
 
 class Arrival(NamedTuple):
@@ -270,6 +275,8 @@ _REASONS = {
     LifeReason.RESET: "its fault was reset",
     LifeReason.OVERRUN: "it missed ticks",
     LifeReason.ARM_SILENT: "its arm is silent",
+    LifeReason.RELEASED: "its dead-man switch is not held",
+    LifeReason.HELD: "its dead-man switch is held",
 }
 
 

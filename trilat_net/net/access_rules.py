@@ -45,7 +45,7 @@ SITE_ROLE = _Role(
     answers=(topics.INFO, topics.PING, topics.PAST, topics.SET),
     hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
     asks=(topics.INFO, topics.PING),
-    hears_own=(topics.STATE, topics.MEASURED, topics.HAND),
+    hears_own=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
 RECORDER_ROLE = _Role(
     publishes=(topics.EVENT, topics.STATS),
@@ -58,7 +58,7 @@ OPERATOR_ROLE = _Role(
     answers=(),
     hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS),
     asks=(topics.INFO, topics.PING, topics.PAST, topics.SET),
-    addresses=(topics.HAND,),
+    addresses=(topics.HAND, topics.ENABLE),
 )
 ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE}
 """Of members that are no sites."""

@@ -1,4 +1,4 @@
-"""Messages between two parties: pings, changes, backfill, measurements of an external arm, live hands.
+"""Messages between two parties: pings, changes, backfill, external arms and their switches, live hands.
 
 Invariant: none of these is logged. Their effects are: a change as an event, a backfilled message as
 itself, a measurement as q and qd of the record of the tick that used it, a hand as `hand` of the records of
@@ -120,6 +120,23 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
         """Refuses a torque that is not one finite number per joint."""
         if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
             raise ValueError(f"tau_x must be {len(self.q)} finite numbers, as q is")
+
+
+class ArmEnable(Request, frozen=True, kw_only=True):
+    """Says that somebody holds the dead-man switch of an external arm, at least ten times a second.
+
+    Attributes:
+        boot: the start of the program, random: a switch is held by one of them.
+        n: number of the message of that start, from 0.
+        held: false: it was let go, and nobody waits for the silence.
+        sent_ns: time of sending, ns of the program's own monotonic clock.
+    """
+
+    site: str
+    boot: U64
+    n: TickNumber
+    held: bool = True
+    sent_ns: Instant
 
 
 class HandMessage(Request, frozen=True, kw_only=True):

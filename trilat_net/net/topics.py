@@ -10,7 +10,7 @@ RECORDER = "recorder"
 STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
 SAMPLE = "sample"
 PAST, STATS = "past", "stats"
-MEASURED, HAND = "measured", "hand"
+MEASURED, HAND, ENABLE = "measured", "hand", "enable"
 
 
 class KeyParts(NamedTuple):

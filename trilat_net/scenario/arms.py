@@ -71,6 +71,8 @@ class Arm(Frozen, frozen=True):
         g_m_s2: gravitational acceleration, m/s^2.
         known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
             formula. Only for an arm outside of the program.
+        dead_man: true: it moves only while somebody holds its dead-man switch (`docs/external-arm.md`). Only
+            for an arm outside of the program.
         urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": it is the planar arm.
         base_xyz_m: place of the base in the frame that the sites share; walls and operators are there too.
         base_rpy_rad: its orientation there: about the fixed axes x, y, z, in this order.
@@ -94,6 +96,7 @@ class Arm(Frozen, frozen=True):
     I2_kg_m2: NotNegative = 0.0
     g_m_s2: NotNegative = 9.81
     known: bool = True
+    dead_man: bool = False
     urdf: str = ""
     base_xyz_m: Three = (0.0, 0.0, 0.0)
     base_rpy_rad: Three = (0.0, 0.0, 0.0)

@@ -150,7 +150,9 @@ SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale"
 """Tables that a scenario may have for all sites, and each site for itself."""
 
 
-SiteOrder = Literal["", "stop", "enable", "reset", "overrun", "arm_silent", "arm_lost", "arm_back"]
+SiteOrder = Literal[
+    "", "stop", "enable", "reset", "overrun", "arm_silent", "arm_lost", "arm_back", "released", "held"
+]
 """What a site may be ordered, from outside (the first three) or by itself."""
 TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
 """Keys of a change that a scenario may have."""

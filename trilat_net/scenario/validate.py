@@ -115,13 +115,7 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
         ScenarioError: with the path of the key.
     """
     path, law = f"sites.{name}", site.control
-    external = site.plant == "external"
-    if not site.arm.known and not external:
-        raise ScenarioError(
-            "a simulated arm moves by its masses: leave it true, or set plant = 'external' for an arm "
-            "outside of the program",
-            path=f"{path}.arm.known",
-        )
+    _check_plant(path, site)
     if isinstance(law, AdaptiveBox):
         law.check(f"{path}.control")
     if isinstance(law, ForceReflecting) and sites != FORCE_REFLECTION_SITES:
@@ -146,6 +140,22 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
             "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
             "horizontal plane, or choose adaptive, which learns it",
             path=f"{path}.control.gravity",
+        )
+
+
+def _check_plant(path: str, site: SiteSpec) -> None:
+    """Refuses what contradicts that an arm is in the program, or outside of it."""
+    external = site.plant == "external"
+    if not site.arm.known and not external:
+        raise ScenarioError(
+            "a simulated arm moves by its masses: leave it true, or set plant = 'external' for an arm "
+            "outside of the program",
+            path=f"{path}.arm.known",
+        )
+    if site.arm.dead_man and not external:
+        raise ScenarioError(
+            "is for an arm outside of the program (plant = 'external'): nobody is near a simulated one",
+            path=f"{path}.arm.dead_man",
         )
     for group in ("hands", "environment") if external else ():
         if getattr(site, group):
