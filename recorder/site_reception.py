@@ -8,9 +8,10 @@ scenario has ticks; of events a log takes so many bytes, and the first word of a
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account, count_messages, number_message, skipped_numbers
+from trilat_net.log.accounting import Account
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
+from trilat_net.net.message_numbers import count_messages, number_message, skipped_numbers
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.wire import decode

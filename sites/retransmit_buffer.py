@@ -9,7 +9,7 @@ from array import array
 from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
-from trilat_net.net.loop_stats import STATS_PER_SECOND, find_skipped_stats, ticks_per_stats
+from trilat_net.net.message_numbers import STATS_PER_SECOND, count_messages, skipped_numbers
 from trilat_net.net.pinging import answer_backfill
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 
@@ -102,13 +102,13 @@ class RetransmitBuffer:
     def begin_at(self, tick: int, rate_hz: int) -> None:
         """Lets tick be the first one of the site."""
         self.channels[topics.STATE].begin_at(tick)
-        self.channels[topics.LINK].begin_at(-(-tick // ticks_per_stats(rate_hz)))
+        self.channels[topics.LINK].begin_at(count_messages(topics.LINK, tick, rate_hz))
 
     def skip(self, first: int, next_tick: int) -> None:
         """Adds the numbers of what a site never publishes that makes no ticks from one on, up to another."""
         self.channels[topics.STATE].skip(next_tick - first)
-        before, after = find_skipped_stats(first, next_tick, self._rate_hz)
-        self.channels[topics.LINK].skip(after - before)
+        number, first_skipped = skipped_numbers(topics.LINK, next_tick, next_tick - first, self._rate_hz)
+        self.channels[topics.LINK].skip(max(0, number - first_skipped))
 
     def answer_query(self) -> bool:
         """Answers the oldest query; False without one."""

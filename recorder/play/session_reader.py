@@ -18,7 +18,6 @@ from trilat_net import process
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, ScenarioError, UsageError
 from trilat_net.files import open_regular
-from trilat_net.log.accounting import number_message
 from trilat_net.log.log_layout import (
     ALL_CHANNELS,
     SCENARIO,
@@ -29,6 +28,7 @@ from trilat_net.log.log_layout import (
 )
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
+from trilat_net.net.message_numbers import number_message
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage

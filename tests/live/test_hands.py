@@ -14,6 +14,7 @@ import pytest
 import trilat_net
 from tests.cli.running import PLAIN, trilat
 from tests.net.waiting import until
+from trilat_net.analysis.certificate.stability_certificate import BROKEN_BALANCE_SHARE
 from trilat_net.log.log_reader import Log
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
@@ -140,6 +141,7 @@ def test_a_minute_of_two_programs_a_page_and_ten_changes_is_verified_and_repeate
     assert sum(len(log.changes(name)) for name in PAPER) == 10
     found = trilat_net.certify(log)
     assert found.balance is not None
+    assert np.abs(found.balance.residual).max() < BROKEN_BALANCE_SHARE * found.balance.V.max()
 
 
 LINKS = [("m1", "s"), ("m2", "s"), ("s", "m1"), ("s", "m2"), ("m1", "m2"), ("m2", "m1")]

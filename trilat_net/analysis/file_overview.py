@@ -18,7 +18,7 @@ from ..log.log_layout import SESSION
 from ..log.log_reader import open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
 from ..net import topics
-from ..net.loop_stats import ticks_per_stats
+from ..net.message_numbers import ticks_per_stats
 from .health import describe_link_health, describe_session, describe_site_health, percentiles
 from .json_values import JsonObject
 

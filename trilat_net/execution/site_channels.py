@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..core.ticks import Arrival, Mode, TickRecord, describe_divergence, describe_mode
-from ..log.accounting import Account, number_message, skipped_numbers
+from ..log.accounting import Account
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
 from ..log.log_writer import LogWriter
 from ..net import topics
+from ..net.message_numbers import number_message, skipped_numbers
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.wire import encode, encode_state
 from ..scenario import Scenario

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError
 from ..net import topics
-from ..net.loop_stats import ticks_per_stats
+from ..net.message_numbers import count_messages, number_message, skipped_numbers
 from ..net.messages import READABLE, Event
 from ..net.wire import decode
 from ..scenario import parse_embedded
@@ -210,24 +210,6 @@ class Account:
             self.last = number
             return True
         return self._gaps.remove(number)
-
-
-def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number in its channel of the record or the statistics of a tick."""
-    return tick // ticks_per_stats(rate_hz) if channel == topics.LINK else tick
-
-
-def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
-    """Returns how many records or statistics a site publishes in so many ticks."""
-    return -(-ticks // ticks_per_stats(rate_hz)) if channel == topics.LINK else ticks
-
-
-def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
-    """Returns what a site does not publish that makes no ticks for so many before one, see `begin_anew`.
-
-    That is the number of the message with that tick, or that stands for it, and that of the first not made.
-    """
-    return number_message(channel, tick, rate_hz), count_messages(channel, tick - skipped, rate_hz)
 
 
 def parse_counts(account: str) -> dict[str, int]:

@@ -18,6 +18,7 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import topics
+from ..net.message_numbers import count_messages, number_message, skipped_numbers
 from ..net.messages import (
     READABLE,
     SENT_TIME_SINCE,
@@ -31,7 +32,7 @@ from ..net.messages import (
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
-from .accounting import Account, count_messages, number_message, parse_counts, skipped_numbers
+from .accounting import Account, parse_counts
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress

@@ -6,24 +6,10 @@ from typing import Any
 
 from ..core.site_step import Site
 from ..core.ticks import NS_PER_S, TickRecord
+from .message_numbers import ticks_per_stats
 from .messages import VERSION, LinkStats
 
-STATS_PER_SECOND = 10
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
-
-
-def ticks_per_stats(rate_hz: int) -> int:
-    """Returns the ticks from one statistics message to the next, from tick 0 on."""
-    return max(1, rate_hz // STATS_PER_SECOND)
-
-
-def find_skipped_stats(first: int, next_tick: int, rate_hz: int) -> tuple[int, int]:
-    """Returns which statistics a site does not publish that makes no ticks from one on, up to another.
-
-    As the number of the first of them and of the next that it does publish.
-    """
-    every = ticks_per_stats(rate_hz)
-    return min(-(-first // every), next_tick // every), next_tick // every
 
 
 class LoopStats:
