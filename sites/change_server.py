@@ -8,11 +8,12 @@ jumps; the record has the ramp that holds.
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
-from trilat_net.net.bus import QueryInbox
+from trilat_net.net.bus import Query, QueryInbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import (
@@ -40,7 +41,8 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 class ChangeServer:
     """The change requests to one site, whose mode after the last tick `mode` returns.
 
-    While its dead-man switch is not `held` it neither takes up its work again nor ends a fault.
+    Who may ask for nothing else asks it to stop by `stops`. While its dead-man switch is not `held` it takes
+    up no work again and ends no fault.
 
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
@@ -54,8 +56,9 @@ class ChangeServer:
         queries: QueryInbox,
         mode: Callable[[], Mode] = lambda: Mode.RUN,
         held: Callable[[], bool] = lambda: True,
+        stops: QueryInbox | None = None,
     ) -> None:
-        self._scenario, self._site, self._queries = scenario, site, queries
+        self._scenario, self._site, self._queries, self._stops = scenario, site, queries, stops
         self._mode, self._held = mode, held
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
@@ -71,12 +74,9 @@ class ChangeServer:
         """Replies to every request; returns the accepted changes, for the next tick, k."""
         if self._stop_tick is not None:
             self.stopped = k + 1 >= self._stop_tick
-        query = self._queries.poll()
-        if query is None:
-            return ()
         changes: list[CoreChange] = []
         first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
-        while query is not None:
+        while (query := self._queries.poll()) is not None or (query := self._poll_stop()) is not None:
             try:
                 request = decode(query.payload, ChangeRequest)
                 if request.stop_s is not None:
@@ -94,8 +94,17 @@ class ChangeServer:
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
             query.answer(encode(reply))
-            query = self._queries.poll()
         return changes
+
+    def _poll_stop(self) -> Query | None:
+        """Returns the next question of somebody who may ask the site to stop, and nothing else."""
+        while self._stops is not None and (query := self._stops.poll()) is not None:
+            with suppress(WireError):
+                if decode(query.payload, ChangeRequest) == ChangeRequest(order="stop"):
+                    return query
+            text = f"{self._site} can be asked to stop under this key, and nothing else"
+            query.answer(encode(ChangeReply(member=self._site, accepted=False, text=text)))
+        return None
 
     def _mark(self, k: int, text: str) -> ChangeReply:
         if len(self.marks) >= MARKS_WAITING:

@@ -119,8 +119,8 @@ class SiteParts:
         self.publish_link = self._keeping_publisher(topics.LINK)
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
-        questions = bus.questions(topics.key(session, name, topics.SET))
-        self.changes = ChangeServer(scenario, name, questions, lambda: self.site.mode, self._is_held)
+        asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
+        self.changes = ChangeServer(scenario, name, asked, lambda: self.site.mode, self._is_held, stops)
         warm_up(scenario, name, clock)
 
     def _meet_outside_arm(self) -> None:

@@ -7,10 +7,10 @@ import pytest
 from tests.net.certificates import Certificates
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.log.log_reader import open_log
-from trilat_net.net.access_rules import RECORDER, ROUTER
+from trilat_net.net.access_rules import OPERATOR, RECORDER, ROUTER
 from trilat_net.net.member_keys import create_keys
 
-from .processes import PAPER, Process, Session, Stage
+from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
 SITES = ("m", "s")
 
@@ -97,3 +97,39 @@ def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stag
         # of a link of 200 ms, on a machine that may be busy
         assert log[name].states[-1].tick - used[-1] <= 1000
         assert {event.kind for event in log.events if event.member == name} >= {"end"}
+
+
+@pytest.mark.long
+def test_with_keys_every_member_stops_an_arm_and_the_operator_alone_enables_it(stage: Stage) -> None:
+    glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
+    session = Session(stage, "two_sites", SITES, "--duration", "60", *glide)
+    create_keys(stage.folder / "keys", [*SITES, RECORDER, OPERATOR], [], 1)
+    session.endpoints = [place.replace("tcp", "tls") for place in session.endpoints]
+    session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
+
+    def keys(name: str) -> tuple[str, str]:
+        return "--keys", str(stage.folder / "keys" / name)
+
+    def order(words: str, whose: str) -> tuple[int, str]:
+        ways = connections(session.endpoints)
+        asked = stage.start(f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose))
+        return asked.code(), asked.text()
+
+    session.recorder(*keys(RECORDER))
+    for name in SITES:
+        session.site(name, "--needs-recorder", *keys(name))
+    session.begun()
+    for whose in (RECORDER, "m"):
+        code, text = order("stop s", whose)
+        assert (code, text.startswith("s: stop at tick")) == (0, True), text
+        code, text = order("enable s", whose)
+        assert code != 0
+        assert "only the operator's may ask for it" in text
+        assert order("enable s", OPERATOR)[0] == 0
+    assert order("stop --end", "m")[0] != 0
+    assert order("stop --end", OPERATOR)[0] == 0
+    session.ends_well()
+    log = open_log(session.log)
+    executed_again(log)
+    changes = [change for state in log["s"].states for change in state.cmd]
+    assert [change.rpartition(":")[2] for change in changes] == ['"stop"}', '"enable"}'] * 2

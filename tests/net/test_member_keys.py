@@ -130,16 +130,29 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     operator = meeting.join(read_member_keys(folder / OPERATOR).settings)
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
-    inbox = meeting.m1.inbox(key("m1", topics.HAND))
-    forged, true = (bus.publisher(key("m1", topics.HAND)) for bus in (attacker, operator))
+    channels = (topics.HAND, topics.ENABLE)
+    inboxes = [meeting.m1.inbox(key("m1", channel)) for channel in channels]
     assert until(lambda: answered(operator, key("m1", topics.SET), b"order"))
     assert answered(attacker, key("m1", topics.SET), b"order") is None
 
-    def say(payload: bytes) -> None:
-        forged(b"forged")
-        true(payload)
+    for channel, inbox in zip(channels, inboxes, strict=True):
+        forged, true = (bus.publisher(key("m1", channel)) for bus in (attacker, operator))
 
-    assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+        def say(payload: bytes, forged: Any = forged, true: Any = true) -> None:
+            forged(b"forged")
+            true(payload)
+
+        assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+
+
+def test_every_member_may_ask_a_site_to_stop_and_nothing_else(meeting: Meeting, folder: Path) -> None:
+    for channel in (topics.STOP, topics.SET):
+        meeting.m1.respond(key("m1", channel), lambda payload: payload)
+    members = [meeting.join(read_member_keys(folder / name).settings) for name in ("s", RECORDER, OPERATOR)]
+    for member in members:
+        assert until(lambda bus=member: answered(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
+    assert until(lambda: answered(members[2], key("m1", topics.SET), b"reset"))
+    assert [answered(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [None, None]
 
 
 def test_what_is_too_long_is_dropped_and_what_is_not_goes_on(meeting: Meeting) -> None:

@@ -19,6 +19,7 @@ from trilat_net.scenario import Scenario, load_scenario, parse_core_change
 
 SESSION = "changes"
 KEY = topics.key(SESSION, "s", topics.SET)
+STOP = topics.key(SESSION, "s", topics.STOP)
 
 
 class Asked:
@@ -28,13 +29,14 @@ class Asked:
         network = LocalNetwork()
         self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
-        self.changes = ChangeServer(self.scenario, "s", network.join().questions(KEY))
+        asked, stops = (network.join().questions(key) for key in (KEY, STOP))
+        self.changes = ChangeServer(self.scenario, "s", asked, stops=stops)
 
-    def send(self, payload: bytes) -> Inbox:
-        return self._client.ask(KEY, payload)
+    def send(self, payload: bytes, key: str = KEY) -> Inbox:
+        return self._client.ask(key, payload)
 
-    def ask(self, k: int, **order: Any) -> tuple[list[CoreChange], ChangeReply]:
-        replies = self.send(encode(ChangeRequest(**order)))
+    def ask(self, k: int, key: str = KEY, **order: Any) -> tuple[list[CoreChange], ChangeReply]:
+        replies = self.send(encode(ChangeRequest(**order)), key)
         taken = list(self.changes.take(k))
         answer = replies.poll()
         assert answer is not None
@@ -149,3 +151,27 @@ def test_a_mark_changes_nothing_and_waits_for_the_next_event() -> None:
     assert asked.changes.marks == [(7, "the wall")]
     replies = [asked.ask(8, mark=str(n))[1] for n in range(MARKS_WAITING)]
     assert [reply.accepted for reply in replies] == [True] * (MARKS_WAITING - 1) + [False]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"order": "enable"},
+        {"order": "reset"},
+        {"stop_s": 1.0},
+        {"mark": "x"},
+        {"link": "m1->s", "to": {"delay_ms": 1.0}},
+        {"order": "stop", "mark": "x"},
+    ],
+)
+def test_under_the_key_of_every_member_a_site_can_be_asked_to_stop_alone(more: dict[str, Any]) -> None:
+    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    garbage = asked.send(b"garbage", STOP)
+    taken, reply = asked.ask(10, STOP, **more)
+    assert (taken, reply.accepted) == ([], False)
+    assert "nothing else" in reply.text
+    assert (answer := garbage.poll()) is not None
+    assert not decode(answer[1], ChangeReply).accepted
+    (change,), reply = asked.ask(11, STOP, order="stop")
+    assert reply.accepted
+    assert '"order":"stop"' in change.text

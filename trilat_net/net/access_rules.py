@@ -42,22 +42,22 @@ class _Role(NamedTuple):
 
 SITE_ROLE = _Role(
     publishes=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.MEASURED),
-    answers=(topics.INFO, topics.PING, topics.PAST, topics.SET),
+    answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
-    asks=(topics.INFO, topics.PING),
+    asks=(topics.INFO, topics.PING, topics.STOP),
     hears_own=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
 RECORDER_ROLE = _Role(
     publishes=(topics.EVENT, topics.STATS),
     answers=(topics.INFO, topics.PING),
     hears=(topics.STATE, topics.LINK, topics.EVENT),
-    asks=(topics.INFO, topics.PING, topics.PAST),
+    asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
 )
 OPERATOR_ROLE = _Role(
     publishes=(),
     answers=(),
     hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS),
-    asks=(topics.INFO, topics.PING, topics.PAST, topics.SET),
+    asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     addresses=(topics.HAND, topics.ENABLE),
 )
 ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE}

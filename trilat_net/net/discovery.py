@@ -133,12 +133,13 @@ def request_change(
 
 
 def send_change(bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest) -> ChangeReply:
-    """Sends a request to a site of a session that runs, and returns its reply.
+    """Sends a request to a site of a session that runs, and returns its reply; any member may ask to stop.
 
     Raises:
         SessionError: the site does not reply.
     """
-    replies = bus.ask(topics.key(session, site, topics.SET), encode(request))
+    channel = topics.STOP if request.order == "stop" else topics.SET
+    replies = bus.ask(topics.key(session, site, channel), encode(request))
     give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
@@ -147,7 +148,8 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
                 return decode(reply[1], ChangeReply)
             except WireError as error:
                 raise SessionError(f"the answer of {site} cannot be read: {error}") from None
-    raise SessionError(f"{site} gave no answer; its records show whether it made the change")
+    whose = "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
+    raise SessionError(f"{site} gave no answer; its records show whether it made the change{whose}")
 
 
 def find_site_info(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:

@@ -8,6 +8,8 @@ from .bus import PresenceInbox
 ROOT = "trilat"
 RECORDER = "recorder"
 STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
+STOP = "stop"
+"""What every member may ask of a site; all other changes are asked for under `SET`."""
 SAMPLE = "sample"
 PAST, STATS = "past", "stats"
 MEASURED, HAND, ENABLE = "measured", "hand", "enable"
