@@ -5,6 +5,7 @@ is whole. Extremes between two frames are kept. Forces are those ON the arm, N; 
 the Jacobian, which near a singular pose gives the least force that explains the torque.
 """
 
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -213,12 +214,14 @@ class SessionFrames:
         now, extremes = self._arms[name].now(window.rows(first, newest))
         self._seen[name] = newest
         account = site.reception.accounts["state"]
+        alarm = None if site.reception.made is not None else site.find_alarm(self._view.session, name)
         return {
             **now,
             "new": newest > seen,
             "t": record.t_ns / NS_PER_S,
             "tick": record.tick,
             "mode": record.mode,
+            "alarm": None if alarm is None else alarm._asdict(),
             "silent": self._view.silent(site),
             "holder": site.holder if now.get("source") else "",
             "late_us": stats.late_max_us if stats else 0,
@@ -273,5 +276,10 @@ def _link_counts(stats: LinkStats | None, peer: str) -> Json:
 def show_event(event: Event) -> Json:
     """Returns an event as a page lists it."""
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    change = msgspec.json.decode(event.command) if event.command else None
+    change = None
+    if event.kind == "change":
+        with suppress(msgspec.DecodeError):
+            change = msgspec.json.decode(event.command)
+    if not isinstance(change, dict) or not ("link" in change or "dominance" in change):
+        change = None  # an order to a site: its text says it
     return {"t": t_s, "member": event.member, "kind": event.kind, "text": event.text, "change": change}

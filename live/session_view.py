@@ -16,7 +16,7 @@ from recorder.site_reception import SiteReception
 from trilat_net.analysis.certificate.running_energy import RunningEnergy
 from trilat_net.analysis.record_window import RecordWindow, make_windows
 from trilat_net.core.live_hand import TAKEN
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -71,6 +71,7 @@ class SiteView:
         holds_from: its first tick that was seen.
         hand: the live hand that its scenario has there; None without one.
         holder: who took hold of its arm last.
+        glides: true: its rule for stale peers is "glide".
     """
 
     def __init__(
@@ -80,7 +81,10 @@ class SiteView:
         reception: SiteReception,
         window: RecordWindow,
         hand: LiveHand | None = None,
+        *,
+        glides: bool = False,
     ) -> None:
+        self.glides = glides
         self.reception, self.window, self.hand = reception, window, hand
         self.holder = ""
         self.dropped: Counter[str] = Counter()
@@ -88,6 +92,13 @@ class SiteView:
         self.record: State | None = None
         self.stats: LinkStats | None = None
         self.holds_from = 0
+
+    def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
+        """Returns what nobody may overlook of the site, of some name; None if there is nothing."""
+        record = self.record
+        if record is None or not self.glides:
+            return None
+        return find_alarm(session, name, record.mode, record.mem, len(record.q_des))
 
     @property
     def complete(self) -> int:
@@ -188,6 +199,7 @@ class SessionView:
             name: SiteView(
                 *(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name]),
                 find_live_hand(scenario.sites[name].hands),
+                glides=scenario.sites[name].on_stale.action == "glide",
             )
             for name in scenario.names
         }
@@ -243,7 +255,7 @@ class SessionView:
             words, took_hold, _ = content.text.partition(f" {TAKEN} ")
             if content.kind == "hand" and took_hold:
                 site.holder = words.removeprefix(f"{name}: ")
-            if content.command:
+            if content.command and content.kind == "change":
                 self._change(name, content.command)
 
     def _change(self, site: str, text: str) -> None:
@@ -260,7 +272,7 @@ class SessionView:
         table = msgspec.json.decode(text)
         if "link" in table:
             self.links[table["link"]] = table["to"]
-        else:
+        elif "dominance" in table:
             self.dominance[site] = table["to"]
 
     def _follow_timeline(self) -> None:

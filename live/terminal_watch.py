@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 
 import numpy as np
-from rich.console import Console
+from rich.box import HEAVY
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
+from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
 from trilat_net.core.live_hand import HandInForce
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
@@ -52,6 +55,14 @@ class SessionWatch:
         """The session, and its V."""
         state = self._V if self.view.running else "waits for its members"
         return f"session {self.view.session}" + (f"; {state}" if state else "")
+
+    @property
+    def alarms(self) -> list[tuple[str, LifeAlarm]]:
+        """The sites that hold, are stopped or in fault, each with its alarm, while they run."""
+        view = self.view
+        running = {name: site for name, site in view.sites.items() if not view.silent(site)}
+        found = ((name, site.find_alarm(view.session, name)) for name, site in running.items())
+        return [(name, alarm) for name, alarm in found if alarm is not None]
 
     def rows(self) -> list[list[str]]:
         """Returns a line of `HEADS` for each site."""
@@ -105,11 +116,12 @@ def watch_session(
 
 
 def _show(watch: SessionWatch, console: Console, live: Live | None) -> None:
-    rows = watch.rows()
+    rows, alarms = watch.rows(), watch.alarms
     if live is not None:
-        live.update(_tabulate(watch.title, rows), refresh=True)
+        live.update(Group(*frame_alarms(alarms), _tabulate(watch.title, rows)), refresh=True)
         return
-    for line in [watch.title, *(describe_row(row) for row in rows)]:
+    shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
+    for line in [watch.title, *shouted, *(describe_row(row) for row in rows)]:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -118,6 +130,18 @@ def describe_row(row: Sequence[str]) -> str:
     name, time, mode, angles, apart, torque, ages, held, late = row
     parts = [f"{name} {time} {mode}", angles, f"|e| {apart}", f"torque {torque}", f"age {ages}"]
     return "; ".join([*parts, *([f"hand {held}"] if held else []), f"late {late}"])
+
+
+def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
+    """Returns a block for each alarm: red, or yellow of a site that holds and goes on by itself."""
+    blocks = []
+    for name, (word, reason, advice) in alarms:
+        colour = "red" if word in ("FAULT", "STOPPED") else "yellow"
+        text = Text.assemble(
+            (f" {name} {word} ", f"bold reverse {colour}"), f"  {reason}\n", (advice, "bold")
+        )
+        blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
+    return blocks
 
 
 def _tabulate(title: str, rows: Sequence[Sequence[str]]) -> Table:

@@ -17,6 +17,7 @@ from trilat_net.core.ticks import (
     TickInput,
     TickRecord,
     describe_mode,
+    find_alarm,
     find_life_reason,
     tick_ns,
 )
@@ -147,6 +148,7 @@ class RunningSite:
         self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
         self._status_s = self._told_s = 0
+        self._held_s = -1
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
@@ -324,3 +326,18 @@ class RunningSite:
             self._mode = output.mode
             glides = self._parts.setup.on_stale.action is StaleAction.GLIDE
             self._publisher.publish("mode", describe_mode(name, output, glides=glides), **at)
+            self._raise_alarm(output)
+
+    def _raise_alarm(self, output: TickRecord) -> None:
+        """Says that the arm is stopped, or at most once a second that it holds; why, and what to do."""
+        session, mode = self._parts.options.session, output.mode
+        second = output.t_ns // NS_PER_S
+        if mode is Mode.HOLD and second <= self._held_s:
+            return
+        self._held_s = second if mode is Mode.HOLD else self._held_s
+        shared, glides = len(output.q_des), self._parts.setup.on_stale.action is StaleAction.GLIDE
+        alarm = (
+            find_alarm(session, self._parts.name, mode.name.lower(), output.mem, shared) if glides else None
+        )
+        if alarm is not None:
+            self._parts.say(f"*** {alarm}")

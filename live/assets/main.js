@@ -73,7 +73,9 @@ function take(frame) {
   }
   const silent = parts.names.filter((name) => frame.sites[name].silent);
   const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
-  if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
+  const stopped = alarms(frame);
+  if (stopped.length) state(stopped.join(", "), "bad");
+  else if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
   else if (frame.ended) state("ended");
   else if (silent.length) state(`${silent.join(", ")} silent`, "bad");
   else state("running", "good");
@@ -89,6 +91,26 @@ function take(frame) {
   const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";
   const missing = parts.names.reduce((sum, name) => sum + frame.sites[name].missing, 0);
   $("counts").textContent = `${pages} · loops late by at most ${late} µs · ${missing} records missing${refused}`;
+}
+
+let raised = "";
+// What nobody may overlook: of each arm that holds, is stopped or in fault the mode, why, and what to do.
+function alarms(frame) {
+  const list = parts.names.map((name) => [name, frame.sites[name].alarm]).filter(([, alarm]) => alarm);
+  const text = JSON.stringify(list);
+  if (text !== raised) {
+    raised = text;
+    $("alarms").replaceChildren(...list.map(([name, { word, reason, advice }]) => {
+      const block = document.createElement("div");
+      const [what, why, act] = ["strong", "span", "code"].map((tag) => block.appendChild(document.createElement(tag)));
+      block.className = ["FAULT", "STOPPED"].includes(word) ? "raised" : "raised mild";
+      what.textContent = `${name} ${word}`;
+      why.textContent = reason;
+      act.textContent = advice;
+      return block;
+    }));
+  }
+  return list.map(([name, { word }]) => `${name} ${word}`);
 }
 
 const LOUD = ["lost", "left", "unheard", "diverged", "failed", "refused", "clock fault"];

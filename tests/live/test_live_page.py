@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import signal
 
 import numpy as np
@@ -234,3 +235,33 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
         shows(first, "trilat.takesPart")
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
+
+
+@pytest.mark.long
+def test_an_arm_that_is_stopped_or_whose_peer_is_gone_cannot_be_overlooked(stage: Stage) -> None:
+    glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
+    running = live(stage, "two_sites", "--duration", "60", *glide)
+    with browser_page(page_address(running)) as page:
+        shows(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
+        assert page.locator("#alarms .raised").count() == 0
+        ways = connections(re.findall(r"tcp/127\.0\.0\.1:\d+", running.text())[:2])
+        name = page.evaluate("trilat.hello.session")
+        stop = stage.start("stop", "stop", "--session", name, "s", *ways)
+        assert stop.code() == 0, stop
+        page.wait_for_selector("#alarms .raised")
+        words = page.inner_text("#alarms .raised")
+        assert [part in words for part in ("s STOPPED", "ordered to", f"trilat enable --session {name} s")]
+        box = page.locator("#alarms .raised").bounding_box()
+        assert box is not None
+        assert box["height"] > 50.0
+        assert box["y"] < 300.0
+        assert page.inner_text("#state") == "s STOPPED"
+        if "TRILAT_PICTURES" in os.environ:
+            page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
+        enable = stage.start("enable", "enable", "--session", name, "s", *ways)
+        assert enable.code() == 0, enable
+        shows(page, "trilat.frame.sites.s.mode === 'run' && !document.querySelector('#alarms .raised')")
+        assert "takes in" in page.inner_text("#event-list")
+    running.signal(signal.SIGINT)
+    assert running.code(180.0) == 0, running
+    assert "*** s STOPPED" in running.text()

@@ -2,11 +2,16 @@
 
 from types import SimpleNamespace
 
+import pytest
+
 import trilat_net
 from tests.analysis import logs
+from tests.core.test_safeguards import stopped_log
 from trilat_net.analysis.health import summarise_clock
+from trilat_net.core.ticks import LifeReason, find_alarm
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.reporting import summary_text
+from trilat_net.reporting.page_tables import render_alarms
 from trilat_net.reporting.summary_text import (
     MOST_LINE_CHARACTERS,
     format_clock_lines,
@@ -37,6 +42,38 @@ def test_what_happened_is_told_once():
     (link,) = (line for line in lines if line.startswith("link b->a"))
     assert "loss 20 % in bursts of 5" in link
     assert "in a row" in link
+
+
+def test_an_arm_that_was_stopped_is_told_first_and_in_large():
+    log = stopped_log()
+    assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to"
+    assert "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to" in render_alarms(log)
+    assert render_alarms(logs.simulated("two_sites")) == ""
+
+
+@pytest.mark.parametrize(
+    ("mode", "reason", "advice"),
+    [
+        ("fault", LifeReason.LIMIT_Q, "back within its limits, then trilat reset --session x s"),
+        ("fault", LifeReason.OVERRUN, "trilat reset --session x s"),
+        ("stopped", LifeReason.STOP, "trilat enable --session x s"),
+        ("stopped", LifeReason.RELEASED, "hold the switch"),
+        ("hold", LifeReason.PEER_SILENT, "goes on by itself once all its peers are heard"),
+        ("hold", LifeReason.ARM_SILENT, "goes on by itself once its arm is heard"),
+        ("waiting", LifeReason.ALIGN_LIMIT, "bring the arms closer together"),
+        ("waiting", LifeReason.START, None),
+        ("run", LifeReason.ALIGNED, None),
+    ],
+)
+def test_an_alarm_says_what_to_do(mode, reason, advice):
+    alarm = find_alarm("x", "s", mode, [0.0, 0.0, 0.0, 0.0, 0.0, float(reason)], 2)
+    assert (alarm is None) == (advice is None)
+    assert alarm is None or alarm.advice.endswith(advice)
+
+
+@pytest.mark.parametrize("mem", [[], [0.0] * 5, [0.0] * 5 + [1e9], [0.0] * 5 + [-1.0]])
+def test_a_record_of_a_stranger_raises_no_alarm(mem):
+    assert find_alarm("x", "s", "fault", mem, 2) is None
 
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):

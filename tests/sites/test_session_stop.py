@@ -1,11 +1,16 @@
 """A session that is ended in order, and watched in a terminal meanwhile."""
 
+import io
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
-from live.terminal_watch import HEADS, SessionWatch, describe_row
+from live.session_frames import SessionFrames, show_event
+from live.terminal_watch import HEADS, SessionWatch, describe_row, frame_alarms
 from sites.session_stop import order_sites, stop_session
+from trilat_net.core.ticks import LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.net.bus import Bus, LocalNetwork
@@ -66,9 +71,34 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
             clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
             said.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, sites, name))
 
+    raised: list[tuple[str, LifeAlarm]] = []
+    frames: list[dict[str, Any]] = []
+    screen = io.StringIO()
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        watch = SessionWatch(bus, clock, SESSION)
+        pages, console = SessionFrames(watch.view), Console(file=screen, width=100)
+        while not watch.view.ended:
+            watch.update()
+            frames.extend([frame] if (frame := pages.make()) else [])
+            if watch.alarms and watch.alarms != raised[-1:]:
+                raised.extend(watch.alarms)
+                console.print(*frame_alarms(watch.alarms))
+            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+        shown = [show_event(event) for event in watch.view.events.since(0, 400)]
+        assert [one["change"] for one in shown if one["kind"] == "change"] == [None] * 2
+
     session.stranger(order)
+    session.stranger(look)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
+    stop = LifeAlarm("STOPPED", "it was ordered to", f"trilat enable --session {SESSION} s")
+    assert ("s", stop) in raised
+    assert stop._asdict() in [frame["sites"]["s"]["alarm"] for frame in frames]
+    assert frames[-1]["sites"]["s"]["alarm"] is None
+    assert "s STOPPED" in screen.getvalue()
+    assert stop.advice in screen.getvalue()
+    assert any(f"s: *** {stop}" in line for line in session.said)
     assert [accepted for accepted, _ in said] == [True, False, False, True]
     assert said[1][1] == "s is in stopped; reset is for a site in fault"
     assert said[2][1].startswith("m is in ")

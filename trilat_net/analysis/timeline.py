@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from ..core.session_life import HELD_OVERRUN_TICKS
+from ..core.ticks import find_alarm
 from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
@@ -113,6 +114,33 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
             found.append(ModeInterval(mode, times[first], times[last]))
         first = last
     return found
+
+
+class RaisedAlarm(NamedTuple):
+    """A time in which a site held, was stopped, or was in fault, under the rule `glide`."""
+
+    site: str
+    word: str
+    reason: str
+    from_s: float
+    to_s: float
+
+    def __str__(self) -> str:
+        return f"{self.site} {self.word} {self.from_s:.3f}-{self.to_s:.3f} s: {self.reason}"
+
+
+def list_alarms(log: Log) -> list[RaisedAlarm]:
+    """Returns the alarms of all sites, in the order of their beginnings."""
+    found = []
+    for site in log.sites:
+        part = log[site]
+        glides = log.scenario.sites[site].on_stale.action == "glide"
+        for mode, from_s, to_s in find_mode_intervals(part) if glides else ():
+            state = part.states[int(np.searchsorted(part.t_s, from_s))]
+            alarm = find_alarm(log.scenario.name, site, mode, state.mem, len(state.q_des))
+            if alarm is not None:
+                found.append(RaisedAlarm(site, alarm.word, alarm.reason, from_s, to_s))
+    return sorted(found, key=lambda one: one.from_s)
 
 
 def diverged_at_s(part: SiteLog) -> float | None:

@@ -285,6 +285,53 @@ def find_life_reason(output: TickRecord) -> LifeReason:
     return LifeReason(int(output.mem[2 * len(output.q_des) + 1]))
 
 
+class LifeAlarm(NamedTuple):
+    """A mode of a site that nobody may overlook.
+
+    Attributes:
+        word: the mode, in capitals.
+        reason: why.
+        advice: what to do.
+    """
+
+    word: str
+    reason: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.reason}; {self.advice}"
+
+
+_REMEDIES = {
+    LifeReason.LIMIT_Q: "bring the joint back within its limits, then ",
+    LifeReason.ARM_SILENT: "let the program of the arm send again, then ",
+}
+_ONCE_HEARD = "it goes on by itself once all its peers are heard"
+
+
+def find_alarm(session: str, site: str, mode: str, mem: Sequence[float], shared: int) -> LifeAlarm | None:
+    """Returns the alarm of a site under the rule `glide`, by a record with `shared` coordinates; or None."""
+    try:
+        reason = LifeReason(int(mem[2 * shared + 1]))
+    except (IndexError, ValueError, OverflowError):  # of another rule, or a stranger's
+        return None
+    if mode not in ("fault", "stopped", "hold") and (mode, reason) != ("waiting", LifeReason.ALIGN_LIMIT):
+        return None
+    if mode == "fault":
+        advice = f"{_REMEDIES.get(reason, '')}trilat reset --session {session} {site}"
+    elif mode == "stopped":
+        advice = f"trilat enable --session {session} {site}"
+    else:
+        advice = _ONCE_HEARD
+    advice = {
+        (mode, LifeReason.RELEASED): "hold the switch",
+        ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
+        ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+        ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+    }.get((mode, reason), advice)
+    return LifeAlarm(mode.upper(), _REASONS.get(reason, reason.name.lower().replace("_", " ")), advice)
+
+
 def describe_mode(site: str, output: TickRecord, *, glides: bool = False) -> str:
     """Returns the text of the event that a site changes its mode; one that `glides` says why."""
     doing = {

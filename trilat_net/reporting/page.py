@@ -118,7 +118,7 @@ def render_report(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
         about=page_tables.render_description(scenario),
-        verdicts=page_tables.render_check_lines(verdicts),
+        verdicts=page_tables.render_alarms(log) + page_tables.render_check_lines(verdicts),
         facts=page_tables.render_run_facts(log, facts),
         sites=page_tables.render_sites(log, facts),
         loops=page_tables.render_loops(log, facts),

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.json_values import JsonObject
 from ..analysis.site_signals import shared_unit
+from ..analysis.timeline import list_alarms
 from ..execution.log_checks import CheckLine
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario
@@ -19,6 +20,9 @@ from .style import typeset
 
 _MOST_MODES = 200
 """Intervals of a site that are listed."""
+_MOST_ALARMS = 8
+"""Alarms that are shown in large."""
+_WORST = ("FAULT", "STOPPED")
 _PREMISE_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
 _CERTIFICATE_NOTE = (
     "V of the theorem, with the weights that the shares ask for, and its energy balance: what is left of "
@@ -33,6 +37,20 @@ def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
         kind, mark = ("passed", "✓ ok") if line.passed else ("failed", "✗ failed")
         items += f'<li class="{kind}"><b>{mark}</b>{escape(line.label)}: {escape(line.text)}</li>'
     return f'<ul class="verdicts">{items}</ul>' if items else ""
+
+
+def render_alarms(log: Log) -> str:
+    """Returns the times in which sites were in fault, stopped or held, in large; "" if none was."""
+    found = list_alarms(log)
+    worst = [one for one in found if one.word in _WORST] or found
+    more = len(found) - len(worst[:_MOST_ALARMS])
+    items = "".join(
+        f'<li class="{"" if one.word in _WORST else "mild"}"><strong>{escape(one.site)} {one.word}</strong>'
+        f"{one.from_s:.3f} s to {one.to_s:.3f} s: {escape(one.reason)}</li>"
+        for one in worst[:_MOST_ALARMS]
+    )
+    rest = f"<li class='mild'>and {more} more: see the table of modes</li>" if more else ""
+    return f'<ul class="alarms">{items}{rest}</ul>' if items else ""
 
 
 def render_description(scenario: Scenario) -> str:

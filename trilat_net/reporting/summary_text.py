@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from ..analysis.health import ClockSummary, summarise_clock
 from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
-from ..analysis.timeline import StatedModel, find_mode_intervals, list_changes
+from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..log.log_reader import Log
 
 MOST_LINES = 12
@@ -26,6 +26,7 @@ def format_run_lines(log: Log) -> list[str]:
         LogError: a record names a change that is none.
     """
     return [
+        *_first([f"*** {alarm}" for alarm in list_alarms(log)]),
         *format_outside_lines(log),
         *format_link_lines(log),
         *format_change_lines(log),
