@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account
+from trilat_net.log.accounting import LAST, Account
 from trilat_net.log.log_writer import LogParts, LogWriter
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -163,11 +163,19 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Notes another start of a site, if a message of a site says that it admits it."""
-        if not isinstance(event, Event) or event.kind != "admit":
+        """Notes another start of a site that a site admits, and how much that heard of the one before."""
+        if (
+            not isinstance(event, Event)
+            or event.kind not in ("admit", LAST)
+            or event.about not in self._sites
+        ):
             return
         boot = event.boots.get(event.about)
-        if boot is None or event.about not in self._sites or boot == self._boots.get(event.about):
+        if boot == self._boots.get(event.about):
+            if event.kind == LAST:
+                self._sites[event.about].hear_of_start_before(event.ticks)
+            return
+        if boot is None or event.kind == LAST:
             return
         if self._scenario.sites_may_return and len(self._confirmed) < STARTS_KEPT:
             self._confirmed.add(boot)

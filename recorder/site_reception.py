@@ -8,7 +8,7 @@ scenario has ticks; of events a log takes so many bytes, and the first word of a
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
-from trilat_net.log.accounting import Account
+from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
 from trilat_net.net.message_numbers import count_messages, number_message, skipped_numbers
@@ -67,6 +67,7 @@ class SiteReception:
         if before is not None:
             self.accounts = {**before.accounts, topics.EVENT: Account()}
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
+        self._gaps = {channel: StartGap(self.accounts[channel]) for channel in (topics.STATE, topics.LINK)}
         self.made: int | None = None
         self.heard_ns: int | None = None
         self._boot = boot
@@ -138,6 +139,11 @@ class SiteReception:
         """Counts the messages of a channel that exist at least; no more than the scenario allows."""
         self.accounts[channel].expect(min(made, self._most[channel]))
 
+    def hear_of_start_before(self, ticks: int) -> None:
+        """Counts what the start before published at least, of which another site heard so many ticks."""
+        for channel, gap in self._gaps.items():
+            gap.hear_of(number_message(channel, ticks, self._rate_hz))
+
     def _imply(self, content: State | LinkStats | Event) -> None:
         """Counts the messages that must exist because this one does, and those that never did."""
         if isinstance(content, State) and (skipped := count_skipped_ticks(content.cmd)):
@@ -148,9 +154,9 @@ class SiteReception:
             self.expect(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "join":
             made = 0 if self._before is None or self._before.made is None else self._before.made
-            for channel in (topics.STATE, topics.LINK):
+            for channel, gap in self._gaps.items():
                 numbers = (count_messages(channel, ticks, self._rate_hz) for ticks in (content.ticks, made))
-                self.accounts[channel].begin_anew(*numbers)
+                gap.begin_anew(*numbers)
         elif isinstance(content, Event) and content.kind == "end":
             self.made = content.ticks
             for channel in (topics.STATE, topics.LINK):

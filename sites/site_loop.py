@@ -60,6 +60,7 @@ class PeerInbox:
         self._peers, self._rings, self._rates = peers, rings, rates
         self._boots, self._monitors, self._dropped = list(boots), monitors, dropped
         self._last = [first_tick_at(from_ns, rate_hz) - 1 for rate_hz in rates]
+        self._passed_over = list(self._last)
         self._newest: list[PeerSample | None] = [None] * len(peers)
         if from_ns:
             self.drain(from_ns)  # what came while it waited must not burden the first tick
@@ -68,6 +69,12 @@ class PeerInbox:
         """Takes from now on the samples of another start of a peer, which begins at a tick of its own."""
         self._boots[index], self._newest[index] = boot, None
         self._last[index] = max(self._last[index], first - 1)
+        self._passed_over[index] = self._last[index]
+
+    def newest_tick(self, index: int) -> int | None:
+        """Returns the newest tick of a peer's start of which a sample came; None without any."""
+        newest = self._last[index]
+        return newest if newest > self._passed_over[index] else None
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS."""
@@ -109,13 +116,14 @@ class PeerInbox:
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
         """True if a peer's arm can be where a sample says, and as fast, after the newest one so far."""
         limits, newest = self._links[index].speed_limit, self._newest[index]
-        if not all(abs(speed) <= limit for speed, limit in zip(sample.qd, limits, strict=True)):
-            return False
+        for speed, limit in zip(sample.qd, limits, strict=True):
+            if not abs(speed) <= limit:
+                return False
         if newest is not None:
             passed_s = abs(sample.tick - newest.tick) / self._rates[index]
-            ways = zip(sample.q, newest.q, limits, strict=True)
-            if not all(abs(a - b) <= limit * passed_s + STEP_MARGIN_RAD for a, b, limit in ways):
-                return False
+            for here, there, limit in zip(sample.q, newest.q, limits, strict=True):
+                if not abs(here - there) <= limit * passed_s + STEP_MARGIN_RAD:
+                    return False
         if newest is None or sample.tick > newest.tick:
             self._newest[index] = sample
         return True

@@ -26,6 +26,7 @@ from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
 from trilat_net.net.membership import Epoch, EventPublisher, LateSites, describe_member
+from trilat_net.net.messages import Event
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
@@ -293,6 +294,7 @@ class RunningSite:
             index, rate_hz = parts.site.peers.index(event.member), parts.scenario.sites[event.member].rate_hz
             bound_ns = None if event.clock == parts.clock.identity() else event.bound_ns
             joins = (tick_ns(event.ticks, rate_hz), event.epoch_mono_ns, bound_ns)
+            self._tell_last(index, event, t_ns)
             self._publish_clocks(self._timing.admit(index, *joins), t_ns)
             self._inbox.admit(index, event.boot, event.ticks)
             parts.say(f"{event.member} joins at t = {joins[0] * 1e-9:.3f} s")
@@ -300,6 +302,14 @@ class RunningSite:
         patience_s = parts.options.leave_timeout_s
         since_ns = min((since_ns for since_ns, _ in monitor.away.values()), default=t_ns)
         self._given_up = patience_s is not None and t_ns - since_ns > patience_s * NS_PER_S
+
+    def _tell_last(self, index: int, coming: Event, t_ns: int) -> None:
+        """Publishes how far the start of a peer was heard that ends now: it may not have been able to."""
+        newest = self._inbox.newest_tick(index)
+        if newest is not None:
+            text = f"of the start of {coming.member} before came samples up to tick {newest}"
+            about = {"about": coming.member, "boots": {coming.member: coming.boot}, "ticks": newest + 1}
+            self._publisher.publish("last", text, t_ns=t_ns, **about)
 
     def _describe_status(self, output: TickRecord) -> str:
         """Returns how the site does, in a line."""

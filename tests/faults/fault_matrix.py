@@ -153,8 +153,9 @@ ROWS = (
     Row(
         "F18",
         "payloads are corrupted",
-        "what is or can be no sample is dropped and counted; what was fed otherwise shows in the log",
-        ("corrupt",),
+        "on its way a flipped bit ends the connection, which is made again; what a member sends wrong is "
+        "dropped and counted, or shows in the log",
+        ("corrupt", "nonsense"),
         (SITES + "test_loop.py::test_strangers_and_their_garbage_change_no_bit_and_are_counted",),
     ),
     Row(
@@ -176,7 +177,7 @@ ROWS = (
         "F21",
         "numbers that are not finite, or huge",
         "dropped; at the site itself a fault in the same tick; nothing of it is published",
-        ("corrupt",),
+        ("nonsense",),
         (
             _ARM + "a_glitch_of_an_encoder_is_no_measurement_and_repeated_it_is_silence",
             _GUARD + "a_passed_limit_is_a_fault_until_it_is_reset",

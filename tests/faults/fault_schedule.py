@@ -45,6 +45,11 @@ def _a_way(rng: Random) -> tuple[str, ...]:
     return tuple(rng.sample(MEMBERS, 2))
 
 
+def _what_a_site_sends(rng: Random) -> tuple[str, ...]:
+    (site,) = _a_site(rng)
+    return site, rng.choice([name for name in MEMBERS if name != site])
+
+
 def _nobody(_rng: Random) -> tuple[str, ...]:
     return ()
 
@@ -68,7 +73,8 @@ KINDS = {
     "jitter": Kind(1.5, _a_way, (0.001, 0.06)),  # s
     "loss": Kind(1.5, _a_way, (0.02, 0.9)),
     "duplicate": Kind(1.0, _a_way, (0.05, 1.0)),
-    "corrupt": Kind(1.0, _a_way, (0.02, 1.0)),
+    "corrupt": Kind(1.0, _a_way),  # a bit flips, which ends the connection
+    "nonsense": Kind(1.0, _what_a_site_sends, (0.02, 1.0)),  # a site sends it, with bits that are wrong
     "replay": Kind(1.0, _a_way),  # old messages once more
     "stranger": Kind(1.0, _a_site),  # in the name of a site, of another start
     "wall clock": Kind(1.0, _a_site, (-3600.0, 3600.0)),  # s

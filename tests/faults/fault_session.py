@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from random import Random
@@ -30,7 +30,8 @@ from .faulty_network import FaultyNetwork
 
 NEVER_NS = 2_000 * 10**9
 """Of a start whose time is known once the session begins."""
-LINK_S = 0.03
+LINK_S, RECONNECT_S, LOOKS_AGAIN_S = 0.03, 0.1, 0.25
+"""Delay of the links; a connection that has ended is made again no sooner; an operator comes twice."""
 KEYS: dict[str, Any] = {
     "rate_hz": 1000,
     "duration_s": LENGTH_S,
@@ -73,7 +74,6 @@ class FaultSession(Session):
 
     faults: Sequence[Fault] = ()
     seed: int = 0
-    published: Published = field(default_factory=Published)
     epoch_ns: int = 0
     plans: list[tuple[Fault, RelayClock, Interrupt, RelayClock]] = field(default_factory=list)
     """Sites that end before their time: the fault, clock and signals, and the clock of the next start."""
@@ -89,6 +89,16 @@ class FaultSession(Session):
     def join(self, name: str) -> Bus:
         """See `Session`."""
         return self.network.join_as(name)
+
+    def live(self, name: str, clock: RelayClock, *parts: Any, **options: Any) -> int:
+        """See `Session`; the next start of a site begins no sooner than this one has ended."""
+        try:
+            return super().live(name, clock, *parts, **options)
+        finally:
+            for fault, ending, _, after in self.plans:
+                if ending is clock:
+                    planned_ns = self._at(fault.at_s + max(0.05, fault.for_s))
+                    after.begins(max(planned_ns, clock.monotonic_ns()))
 
     def prepare(self) -> None:
         """Adds the members; the faults begin to count when the session does."""
@@ -126,14 +136,14 @@ class FaultSession(Session):
 
     def _begin(self) -> None:
         """Tick 0 is known: sets the time of every fault."""
-        for fault, clock, interrupt, after in self.plans:
+        for fault, clock, interrupt, _ in self.plans:
             at_ns = self._at(fault.at_s)
             if fault.kind == "kill":
                 clock.dies_ns = at_ns
             else:
                 clock.at(at_ns, lambda interrupt=interrupt: setattr(interrupt, "number", 15))
-            after.begins(self._at(fault.at_s + max(0.05, fault.for_s)))
-        self.relay.happens(self._at(HEALED_S), self._mend)
+        for late_s in (0.0, LOOKS_AGAIN_S):
+            self.relay.happens(self._at(HEALED_S + late_s), self._let_go)
         for fault in self.faults:
             act = getattr(self, "_" + fault.kind.replace(" ", "_"), None)
             if act is not None:
@@ -148,10 +158,14 @@ class FaultSession(Session):
     def _freeze(self, fault: Fault) -> None:
         self.clocks[fault.of[0]].stall(self._at(fault.at_s), round(fault.for_s * 1e9))
 
-    def _cut_ways(self, fault: Fault, ways: Sequence[tuple[str, str]]) -> None:
+    def _cut_ways(self, fault: Fault, ways: Sequence[tuple[str, ...]]) -> None:
         for way in ways:
             self.network.cut(*way)
-        self._later(fault, lambda: [self.network.mend(*way) for way in ways])
+        self._later(fault, lambda: self._mend_ways(ways))
+
+    def _mend_ways(self, ways: Sequence[tuple[str, ...]]) -> None:
+        for way in ways:
+            self.network.mend(*way)
 
     def _cut_one_way(self, fault: Fault) -> None:
         self._cut_ways(fault, [fault.of])
@@ -180,7 +194,12 @@ class FaultSession(Session):
         self._set_way(fault, "doubled", fault.size)
 
     def _corrupt(self, fault: Fault) -> None:
-        self._set_way(fault, "corrupted", fault.size)
+        self.network.disconnect(*fault.of)
+        again_s = fault.at_s + max(RECONNECT_S, fault.for_s)
+        self.relay.happens(self._at(again_s), lambda: self._mend_ways([fault.of, fault.of[::-1]]))
+
+    def _nonsense(self, fault: Fault) -> None:
+        self._set_way(fault, "wrong", fault.size)
 
     def _publish(self, key: str, payloads: Sequence[bytes]) -> None:
         bus = self.network.join_as("stranger")
@@ -218,8 +237,8 @@ class FaultSession(Session):
         (site,) = fault.of
         self._ask(site, ChangeRequest(order="stop"))
 
-    def _mend(self) -> None:
-        """What was latched is let go, as an operator does who has looked."""
+    def _let_go(self) -> None:
+        """What was latched is let go, as an operator does who looks, and looks again."""
         for site in SITES:
             for order in ("reset", "enable"):
                 self._ask(site, ChangeRequest(order=order))
@@ -234,9 +253,16 @@ class FaultSession(Session):
             yield from decode(payload, LinkStats).dropped
 
     def play(self) -> None:
-        """See `Session`; starts are numbered by the seed."""
+        """See `Session`; starts are numbered by the seed.
+
+        Rehearsals, which leave no trace, are short, and memories hold all that these sessions make, no more.
+        """
         boots = iter(lambda: self._boots.getrandbits(63) | 1 << 40, 0)
-        patches = [mock.patch("sites.site_parts.new_boot", side_effect=boots)]
+        patches = [
+            mock.patch("sites.site_parts.new_boot", side_effect=boots),
+            mock.patch("sites.site_parts.WARM_UP_TICKS", 2),
+            mock.patch("sites.retransmit_buffer.KEPT_S", round(LENGTH_S)),
+        ]
         for disk in (SmallDisk(int(fault.size)) for fault in self.faults if fault.kind == "full disk"):
             opened = partial(_file_on, disk)
             patches.append(mock.patch("trilat_net.log.log_writer.LogFile", opened))
@@ -244,14 +270,20 @@ class FaultSession(Session):
             for patch in patches:
                 stack.enter_context(patch)
             super().play()
+
+    @cached_property
+    def published(self) -> Published:
+        """What the sites published."""
+        published = Published()
         for name, payloads in self._payloads.items():
             for payload in payloads:
-                self.published.states[name] += [decode(one, State) for one in split_states(payload)]
+                published.states[name] += [decode(one, State) for one in split_states(payload)]
         for payload in self._events:
             try:
-                self.published.events.append(decode(payload, Event))
+                published.events.append(decode(payload, Event))
             except WireError:
                 continue
+        return published
 
 
 def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:

@@ -2,7 +2,9 @@
 
 A way leads from one member to another. While it is cut, what is sent is kept, as by a transport that sends
 again, and comes in one burst when it is mended soon; a cut as long as a lease ends the connection: what was
-kept is gone, and each side sees the other's liveliness token disappear until the way is mended.
+kept is gone, and each side sees the other's liveliness token disappear until the way is mended. A bit that
+flips on its way ends the connection at once: TLS sees it, and hands nothing on
+(tests/net/test_member_keys.py). What a member itself sends wrong comes as it was sent.
 """
 
 from collections import deque
@@ -30,9 +32,11 @@ class Way:
         ended: True once a lease has passed since then.
         delay_ns: every message takes so long.
         jitter_ns: and up to so much longer, so that messages overtake each other.
-        loss, doubled, corrupted: shares of the messages of sites to which that happens.
+        loss, doubled, wrong: shares of the messages of sites to which that happens; wrong ones have a bit of
+            another value.
         tokens: liveliness tokens of the sender that the receiver knows, while the way is cut.
         kept: what was sent since the way was cut.
+        touched: True once anything of this was ever set.
     """
 
     cut_ns: int | None = None
@@ -41,9 +45,10 @@ class Way:
     jitter_ns: int = 0
     loss: float = 0.0
     doubled: float = 0.0
-    corrupted: float = 0.0
+    wrong: float = 0.0
     tokens: frozenset[str] = frozenset()
     kept: deque[Callable[[], None]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    touched: bool = False
 
 
 class FaultyNetwork(LocalNetwork):
@@ -64,16 +69,31 @@ class FaultyNetwork(LocalNetwork):
         return member
 
     def way(self, sender: str, receiver: str) -> Way:
-        """The way from one member to another, whoever runs under these names."""
-        return self._ways.setdefault((sender, receiver), Way())
+        """The way from one member to another, whoever runs under these names, of one who will set it."""
+        way = self._way(sender, receiver)
+        way.touched = True
+        return way
+
+    def _way(self, sender: str, receiver: str) -> Way:
+        if (sender, receiver) not in self._ways:
+            self._ways[sender, receiver] = Way()
+        return self._ways[sender, receiver]
 
     def open(self, sender: str, receiver: str) -> bool:
         """True if messages pass."""
-        return self.way(sender, receiver).cut_ns is None
+        return self._way(sender, receiver).cut_ns is None
 
-    def carry(self, sender: str, receiver: str, key: str, payload: bytes, sink: Deliver) -> None:
+    def find_takers(self, sender: LocalBus, name: str, key: str) -> Iterator[tuple[Way, Deliver]]:
+        """Who takes what a member sends under a key, and over which way."""
+        for member in self.members:
+            if member is not sender:
+                for expression, sink in member._sinks:
+                    if matches_key(expression, key):
+                        yield self._way(name, _name(member)), sink
+
+    def carry(self, way: Way, key: str, payload: bytes, sink: Deliver) -> None:
         """Takes a message over a way, or does to it what the way does."""
-        way, chance = self.way(sender, receiver), self._chance
+        chance = self._chance
         if way.cut_ns is not None:
             if not way.ended:
                 way.kept.append(lambda: sink(key, payload))
@@ -81,7 +101,7 @@ class FaultyNetwork(LocalNetwork):
         often = key.endswith(("/sample", "/state", "/link"))  # the others are sent again by the transport
         if often and way.loss and chance.random() < way.loss:
             return
-        if often and way.corrupted and chance.random() < way.corrupted:
+        if often and way.wrong and chance.random() < way.wrong:
             place = chance.randrange(len(payload))
             flipped = bytes([payload[place] ^ (1 << chance.randrange(8))])
             payload = payload[:place] + flipped + payload[place + 1 :]
@@ -102,13 +122,22 @@ class FaultyNetwork(LocalNetwork):
         way.tokens = self._tokens_of(sender)
 
         def end() -> None:
-            if way.cut_ns == since_ns:
-                way.ended = True
-                way.kept.clear()
-                self._tell_presence(way.tokens, receiver, False)
-                way.tokens = frozenset()
+            if way.cut_ns == since_ns and not way.ended:
+                self._end(way, receiver)
 
         self._relay.happens(since_ns + LEASE_NS, end)
+
+    def disconnect(self, one: str, other: str) -> None:
+        """Ends the connection of two members at once; it is made again where their ways are mended."""
+        for sender, receiver in ((one, other), (other, one)):
+            self.cut(sender, receiver)
+            self._end(self.way(sender, receiver), receiver)
+
+    def _end(self, way: Way, receiver: str) -> None:
+        way.ended = True
+        way.kept.clear()
+        self._tell_presence(way.tokens, receiver, False)
+        way.tokens = frozenset()
 
     def mend(self, sender: str, receiver: str) -> None:
         """Everything passes again, and first what was kept."""
@@ -167,21 +196,19 @@ class FaultyBus(LocalBus):
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
         """See `Bus`."""
 
-        takers: list[tuple[str, Deliver]] = []
+        takers: list[tuple[Way, Deliver]] = []
         known = -1
 
         def publish(payload: bytes) -> None:
             nonlocal known
             if known != self._faulty.changes:  # who takes a key is looked up once
                 known = self._faulty.changes
-                takers[:] = [
-                    (_name(member), sink)
-                    for member in self._faulty.members
-                    for expression, sink in member._sinks
-                    if member is not self and matches_key(expression, key)
-                ]
-            for name, sink in takers:
-                self._faulty.carry(self.name, name, key, payload, sink)
+                takers[:] = self._faulty.find_takers(self, self.name, key)
+            for way, sink in takers:
+                if way.touched:
+                    self._faulty.carry(way, key, payload, sink)
+                else:
+                    sink(key, payload)
 
         return publish
 

@@ -6,6 +6,7 @@ Each looks at what the sites published, on a way that no fault touches, or at th
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby, pairwise
 
+import msgspec
 import numpy as np
 
 from trilat_net.analysis.arm_rows import inertia_product_rows
@@ -55,16 +56,16 @@ def check_edges(session: FaultSession) -> Iterator[str]:
 def check_limits(session: FaultSession) -> Iterator[str]:
     """I2: what is published is finite and within the limits."""
     for name, states in session.published.states.items():
-        tau_limit, qd_limit = (
-            session.scenario.setup(name).tau_limit_nm,
-            session.scenario.setup(name).qd_limit_rad_s,
-        )
-        for state in states:
-            numbers = np.array([*state.q, *state.qd, *state.tau, *state.q_des, *state.qd_des])
-            if not np.isfinite(numbers).all():
-                yield f"{name} publishes what is not finite at tick {state.tick}"
-            if (np.abs(state.tau) > tau_limit).any() or (np.abs(state.qd) > qd_limit).any():
-                yield f"{name} is beyond its limits at tick {state.tick}"
+        setup = session.scenario.setup(name)
+        keys = ("q", "qd", "tau", "q_des", "qd_des")
+        rows = {key: np.array([getattr(state, key) for state in states]) for key in keys}
+        finite = np.isfinite(np.hstack(list(rows.values()))).all(axis=1)
+        within = (np.abs(rows["tau"]) <= setup.tau_limit_nm).all(axis=1)
+        within &= (np.abs(rows["qd"]) <= setup.qd_limit_rad_s).all(axis=1)
+        for row in np.flatnonzero(~finite):
+            yield f"{name} publishes what is not finite at tick {states[row].tick}"
+        for row in np.flatnonzero(~within):
+            yield f"{name} is beyond its limits at tick {states[row].tick}"
 
 
 def count_silence(stretch: Sequence[State]) -> Iterator[tuple[State, int]]:
@@ -184,18 +185,59 @@ def check_log(session: FaultSession) -> Iterator[str]:
     except TrilatError as error:
         yield f"the log cannot be read: {error}"
         return
-    changed = any(fault.kind == "corrupt" and "recorder" not in fault.of for fault in session.faults)
-    if found.differing and not changed:  # a site that took in other numbers than were sent is found out
+    fed = {fault.of[1] for fault in session.faults if fault.kind == "nonsense"}
+    altered = {
+        name: find_altered(states, log[name].states) for name, states in session.published.states.items()
+    }
+    if found.differing and not fed:
         yield f"{found.differing} records differ when they are executed again"
+    if any(altered.values()):
+        if "recorder" not in fed:
+            yield f"records in the log are not as they were published: {altered}"
+        elif not found.differing:
+            yield f"nobody finds records that came otherwise than they were made: {altered}"
+        return
     touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)
-    for name, states in session.published.states.items():
-        ticks = {state.tick for state in states}
-        there = set(log[name].tick.tolist()) if len(log[name]) else set()
-        if there - ticks:
-            yield f"{name}: {len(there - ticks)} records in the log that nobody published"
-        lost = len(ticks - there)
+    for name in session.published.states:
+        lost = len(find_heard(session.published, name) - set(log[name].tick.tolist()))
         if lost > log.missing(name) or (lost and not touched):
             yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
+
+
+def find_heard(published: Published, name: str) -> set[int]:
+    """The ticks of a site's records that are known of: of a start that was killed up to the newest that came
+    to a site which is there when the next one begins.
+
+    What nobody heard of before its sender was killed is as if it had never been.
+    """
+    starts = list(stretches(published.states[name]))
+    heard = {state.tick for state in starts[-1]}
+    for start, following in pairwise(starts):
+        came = [start[0].tick - 1]
+        for other, states in published.states.items():
+            place = [peer for peer in published.states if peer != other].index(name) if other != name else -1
+            for stretch in stretches(states) if other != name else ():
+                if stretch[-1].tick >= following[0].tick:
+                    came += [tick for state in stretch for peer, tick, _ in state.rx if peer == place]
+        newest = max(tick for tick in came if tick <= start[-1].tick)
+        heard |= {state.tick for state in start if state.tick <= newest}
+    return heard
+
+
+TELEMETRY = {"late_us": 0, "busy_us": 0, "sent_ns": 0, "echo": []}
+"""What no execution can give again, and nobody computes with."""
+
+
+def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int]:
+    """The ticks of records in a log that were not published so, telemetry aside."""
+    made = {state.tick: state for state in published}
+    others = [state for state in there if made.get(state.tick) != state]
+    same = msgspec.structs.replace
+    return [
+        state.tick
+        for state in others
+        if state.tick not in made or same(state, **TELEMETRY) != same(made[state.tick], **TELEMETRY)
+    ]
 
 
 Invariant = Callable[[FaultSession], Iterator[str]]

@@ -1,9 +1,11 @@
 """One seed judged: its session is run, and again, and every invariant is looked at."""
 
+import gc
 import hashlib
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -43,17 +45,29 @@ def judge_seed(seed: int, *, again: bool = True) -> Judged:
 def judge_faults(faults: Sequence[Fault], seed: int = 0, *, again: bool = False) -> Judged:
     """Judges some faults; chance in the network comes from the seed."""
     undisturbed_nm = find_undisturbed_step()
-    with tempfile.TemporaryDirectory() as folder:
-        session = run_faults(faults, Path(folder), seed)
-        found = {name: list(check(session)) for name, check in INVARIANTS.items()}
-        found[TORQUE] = list(check_torque(session, undisturbed_nm))
-        digest = digest_session(session)
-    if again:
+    with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
-            if digest_session(run_faults(faults, Path(folder), seed)) != digest:
-                found[AGAIN] = ["the same seed publishes or records other bytes"]
-    violations = {name: texts for name, texts in found.items() if texts}
-    return Judged(faults, violations, count_visited(session), list(find_holds(session)))
+            session = run_faults(faults, Path(folder), seed)
+            found = {name: list(check(session)) for name, check in INVARIANTS.items()}
+            found[TORQUE] = list(check_torque(session, undisturbed_nm))
+            digest = digest_session(session)
+        if again:
+            with tempfile.TemporaryDirectory() as folder:
+                if digest_session(run_faults(faults, Path(folder), seed)) != digest:
+                    found[AGAIN] = ["the same seed publishes or records other bytes"]
+        violations = {name: texts for name, texts in found.items() if texts}
+        return Judged(faults, violations, count_visited(session), list(find_holds(session)))
+
+
+@contextmanager
+def collector_at_rest() -> Iterator[None]:
+    """As in a live site the collector of garbage does not run; then it looks at all at once."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.collect()
 
 
 @cache

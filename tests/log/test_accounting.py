@@ -1,14 +1,14 @@
 """Accounts and ranges, against the set of numbers that came."""
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.log import accounting
-from trilat_net.log.accounting import Account
+from trilat_net.log.accounting import Account, StartGap
 
 streams = st.lists(st.integers(0, 60), max_size=80)
 
@@ -141,3 +141,25 @@ def test_what_lies_between_two_starts_is_not_made_and_not_missing(
         assert account.expected == account.received + account.missing == 13 - unmade
         account.begin_anew(10, made)  # said twice, it counts once
         assert account.unmade == unmade
+
+
+@pytest.mark.parametrize("order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join)
+def test_what_others_heard_of_a_killed_start_is_missing_in_whatever_order_it_is_learnt(
+    order: Sequence[str],
+) -> None:
+    """0 to 4 came; others heard of 5 and 6; the next start begins with 10."""
+    account = Account()
+    for number in range(5):
+        account.take(number)
+    gap = StartGap(account)
+    for told in order:
+        if told == "join":
+            gap.begin_anew(10, 0)
+        elif told == "records":
+            for number in range(10, 13):
+                account.take(number)
+        else:
+            gap.hear_of(int(told[-1]))
+    gap.begin_anew(10, 0)
+    assert (account.gaps, account.missing, account.unmade) == ([[5, 6]], 2, 3)
+    assert account.expected == account.received + account.missing == 10

@@ -179,10 +179,12 @@ def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: 
     session.recorder(at_ns=7 * S)
     log = session.run()
     ((first, _),) = log.starts["m"]
-    assert log.absences["m"] == [(0, first - 1)]  # the memory of the first start went with it
+    ((away, last),) = log.absences["m"]
+    assert (away, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
+    assert log.missing("m") == away  # the memory of the first start went with it; the other site heard all
     assert len(log["s"]) == 1600
-    assert log.missing("m") == log.missing("s") == 0
-    assert check_log([session.path]).passed
+    assert log.missing("s") == 0
+    assert "agree with what is there" in [finding.text for finding in check_log([session.path]).findings]
 
 
 def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_path: Path) -> None:
@@ -195,7 +197,12 @@ def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_pa
     used = log["s"].used["m"][log["s"].mode == "hold"]
     assert not set(used.tolist()) & set(log["m"].tick.tolist())
     result = verify(log)
-    assert (result.differing, result.gaps) == (0, [])
+    lost = sorted(set(used.tolist()) - set(log["m"].tick.tolist()))
+    ((site, first, last),) = result.gaps
+    assert (site, last) == ("m", lost[-1])
+    assert first == log["m"].tick[log["m"].tick < last].max() + 1
+    assert log.missing("m") == last + 1 - first
+    assert result.differing == 0
     assert 0 < result.unjudged <= 3 + 4
 
 
@@ -273,6 +280,20 @@ def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(tm
     assert [last + 1 for _, last in log.absences["m"]] == [log.starts["m"][-1][0]]
     assert verify(log).passed
     assert check_log([session.path]).passed
+
+
+def test_a_site_that_comes_back_does_not_wait_for_one_that_leaves_meanwhile(tmp_path: Path) -> None:
+    session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
+    session.clocks["m1"].dies_ns = 3 * S
+    session.site("m1", at_ns=4 * S)
+    session.clocks["s"].dies_ns = 4 * S + 2_000_000  # its token was seen, and it has answered nothing
+    log = session.run()
+    (coming,) = (event for event in log.events if event.kind == "coming")
+    (gone_ns,) = (
+        event.t_ns for event in log.events if (event.member, event.kind, event.about) == ("m2", "lost", "s")
+    )
+    assert coming.t_ns - gone_ns < 200_000_000
+    assert log.starts.keys() == {"m1"}
 
 
 def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: Path) -> None:

@@ -48,6 +48,16 @@ class RangeSet:
             self._lasts.append(last)
         self._drop_lowest()
 
+    def insert(self, first: int, last: int) -> None:
+        """Adds numbers that are not in it, wherever they belong."""
+        place = bisect_right(self._firsts, first)
+        if place and self._lasts[place - 1] == first - 1:
+            self._lasts[place - 1] = last
+        else:
+            self._firsts.insert(place, first)
+            self._lasts.insert(place, last)
+        self._drop_lowest()
+
     def remove(self, number: int, last: int | None = None) -> bool:
         """Removes one number, or those up to the last one of a range; returns False if it is not in."""
         place = bisect_right(self._firsts, number) - 1
@@ -141,16 +151,24 @@ class Account:
             self._gaps.append(self.last + 1, made - 1)
             self.last = made - 1
 
-    def begin_anew(self, first: int, made: int = 0) -> None:
+    def begin_anew(self, first: int, made: int = 0) -> int:
         """Takes the gap just below a number for not made: another start of the sender begins with it.
 
-        The start before had `made` as many messages at least; what is missing of those stays missing.
+        The start before had `made` as many messages at least; what is missing of those stays missing. Returns
+        the lowest number of those not made, the given one without any.
         """
         self.expect(first)
         gap = self._gaps.find(first - 1)
-        if gap is not None and (begin := max(gap[0], made)) < first:
-            self._gaps.remove(begin, first - 1)
-            self.unmade += first - begin
+        if gap is None or (begin := max(gap[0], made)) >= first:
+            return first
+        self._gaps.remove(begin, first - 1)
+        self.unmade += first - begin
+        return begin
+
+    def restore(self, first: int, last: int) -> None:
+        """Counts as missing what was taken for not made."""
+        self._gaps.insert(first, last)
+        self.unmade -= last + 1 - first
 
     def give_up(self, below: int) -> None:
         """Marks what is missing below a number as lost for good; if it comes all the same, it counts."""
@@ -212,6 +230,32 @@ class Account:
         return self._gaps.remove(number)
 
 
+class StartGap:
+    """What one channel lacks between two starts of its sender, in whatever order others tell of it.
+
+    The start before may have been killed, and has then not stated what it made: it made at least what others
+    have heard of.
+    """
+
+    def __init__(self, account: Account) -> None:
+        self._account, self._heard = account, 0
+        self._begin = self._first = -1  # of what was not made, and of the later start
+
+    def begin_anew(self, first: int, made: int) -> None:
+        """The later start begins with a number; the one before stated how many messages it made, or 0."""
+        if self._first < 0:
+            self._first, made = first, max(made, min(self._heard, first))
+            self._begin = self._account.begin_anew(first, made)
+
+    def hear_of(self, made: int) -> None:
+        """Somebody knows of so many messages of the start before."""
+        self._heard = max(self._heard, made)
+        made = min(made, self._first)
+        if made > self._begin >= 0:
+            self._account.restore(self._begin, made - 1)
+            self._begin = made
+
+
 def parse_counts(account: str) -> dict[str, int]:
     """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
@@ -256,8 +300,8 @@ def _percent(share: float) -> str:
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
-OVERRUN = "overrun"
-"""The kind of the events that say which ticks a site did not make."""
+OVERRUN, LAST = "overrun", "last"
+"""Kinds of events: of ticks that a site did not make, and how many others know of a start that is gone."""
 MAX_STARTS = 64
 """Starts of a member whose events are counted apart."""
 EVENTS_NUMBERED_SINCE = 3
@@ -290,6 +334,7 @@ class SessionAccounts:
         self._accounts: dict[str, Account] = {}
         self._starts: dict[str, dict[int, Account]] = {}  # of events, by boot: each counts from 0
         self._bases: dict[str, int] = {}
+        self._start_gaps: dict[tuple[str, int], StartGap] = {}
 
     def _topic(self, member: str, channel: str) -> str:
         return "/" + topics.key(self._session, member, channel)
@@ -330,9 +375,14 @@ class SessionAccounts:
                 self.expect(event.member, event.ticks)
                 self._ends[event.member] = event.ticks
             elif event.kind == "join":
-                self.begin_anew(event.member, event.ticks, self._ends.pop(event.member, 0))
+                self._begin_anew(event, self._ends.pop(event.member, 0))
             elif event.kind == OVERRUN:
                 self._leave_out(event)
+            elif event.kind == LAST and event.about in self._rates_hz:
+                for channel, gap in self._find_start_gaps(event.about, event.boots.get(event.about, 0)):
+                    base = self._bases.get(self._topic(event.about, channel), 0)
+                    heard = number_message(channel, event.ticks, self._rates_hz[event.about])
+                    gap.hear_of(heard - base)
 
     def _leave_out(self, event: Event) -> None:
         """Takes ticks that a site says it did not make, as "first-last first-last", for not made."""
@@ -357,14 +407,21 @@ class SessionAccounts:
         except WireError:
             return None
 
-    def begin_anew(self, site: str, first: int, made: int) -> None:
-        """Takes what a site did not make between the ticks of one start and the first one of the next."""
+    def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
+        """Yields what lies before a start of a site, by channel."""
         for channel in (topics.STATE, topics.LINK):
-            topic, rate_hz = self._topic(site, channel), self._rates_hz[site]
-            if topic in self._accounts:
-                base = self._bases.get(topic, 0)
-                numbers = (count_messages(channel, ticks, rate_hz) - base for ticks in (first, made))
-                self._accounts[topic].begin_anew(*numbers)
+            topic = self._topic(site, channel)
+            known = (topic, boot) in self._start_gaps
+            if topic in self._accounts and (
+                known or len(self._start_gaps) < MAX_STARTS * len(self._rates_hz)
+            ):
+                yield channel, self._start_gaps.setdefault((topic, boot), StartGap(self._accounts[topic]))
+
+    def _begin_anew(self, join: Event, made: int) -> None:
+        """Takes what a site did not make between the ticks of one start and the first one of the next."""
+        for channel, gap in self._find_start_gaps(join.member, join.boot):
+            base, rate_hz = self._bases.get(self._topic(join.member, channel), 0), self._rates_hz[join.member]
+            gap.begin_anew(*(count_messages(channel, ticks, rate_hz) - base for ticks in (join.ticks, made)))
 
     def expect(self, site: str, ticks: int) -> None:
         """Counts as missing what a site published in so many ticks and is not there."""

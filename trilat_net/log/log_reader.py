@@ -34,7 +34,7 @@ from ..net.wire import decode
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
 from ..scenario.operators import find_live_hand
-from .accounting import SessionAccounts
+from .accounting import LAST, SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
     SITE_TABLE_KINDS,
@@ -202,9 +202,9 @@ class Log:
             for topic, numbers in sequences.items():
                 for number in numbers:
                     accounts.take(topic, number)
-            for event in self.events:
-                if event.member == name and event.n >= 0:
-                    accounts.take_event(self._topic(name, topics.EVENT), event.n, event)
+        for event in self.events:
+            if event.member in self.sites and event.n >= 0:
+                accounts.take_event(self._topic(event.member, topics.EVENT), event.n, event)
         for name, ticks in self._stated_ticks.items():
             accounts.expect(name, ticks)
         return {**accounts.texts(), **written}
@@ -234,7 +234,8 @@ class Log:
     def absences(self) -> dict[str, list[tuple[int, int]]]:
         """Per site the ticks before each of these starts that were not made, as (first, last).
 
-        They begin after those of which there are records, or that the start before stated at its end.
+        They begin after those of which there are records, that the start before stated at its end, or that
+        others heard of.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
@@ -242,8 +243,9 @@ class Log:
         ends = [event.ticks - 1 for event in self.events if event.kind == "end" and event.member == site]
         made = np.array([*self[site].tick.tolist(), *ends], dtype=np.int64)
         found: list[tuple[int, int]] = []
-        for first, _ in starts:
-            begin = int(made[made < first].max(initial=-1)) + 1
+        for first, boot in starts:
+            heard = [e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot]
+            begin = max(int(made[made < first].max(initial=-1)) + 1, min(first, max(heard, default=0)))
             if found and begin == found[-1][0]:  # the start in between made no tick
                 found.pop()
             if begin < first:

@@ -32,7 +32,7 @@ from ..net.messages import (
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
-from .accounting import Account, parse_counts
+from .accounting import LAST, Account, parse_counts
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import CheckFinding, McapCheck, ProblemList
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -126,6 +126,7 @@ class ChannelCheck:
         first, last: number and publish time of the messages with the lowest and the highest number.
         ends: by boot how many ticks the member made, of those that have stated it.
         joins: by boot the first tick, of those that joined the running session.
+        heard: by site and boot, how many ticks of the start before the member heard of.
         skips: by boot the stretches of ticks that its records leave out: the tick after each, how many.
     """
 
@@ -145,6 +146,7 @@ class ChannelCheck:
         self.last: tuple[int, int] | None = None
         self.ends: dict[int, int] = {}
         self.joins: dict[int, int] = {}
+        self.heard: dict[tuple[str, int], int] = {}
         self.skips: dict[int, list[tuple[int, int]]] = defaultdict(list)
         self._epoch_ns, self._version, self._problems = epoch_ns, version, problems
         self._in_file: dict[int, Account] = self.accounts
@@ -180,6 +182,15 @@ class ChannelCheck:
                 account.expect(count_messages(self.kind, min(stated, most), self.rate_hz))
             if 0 < first <= most:
                 account.begin_anew(count_messages(self.kind, first, self.rate_hz))
+
+    def hear_of(self, others: "ChannelCheck", joins: Mapping[int, int]) -> None:
+        """Counts as missing what starts of the member sent that another member heard of, and is not there."""
+        for (site, boot), ticks in others.heard.items():
+            first = joins.get(boot, 0)
+            before = [(joins.get(one, 0), one) for one in self.accounts if joins.get(one, 0) < first]
+            if site == self.member and first:
+                heard = number_message(self.kind, min(ticks, first), self.rate_hz)
+                self.accounts[max(before, default=(0, 0))[1]].expect(heard)
 
     def leave_out(self, records: "ChannelCheck") -> None:
         """Counts nothing as missing of ticks of which the member's records say that it did not make them."""
@@ -244,6 +255,9 @@ class ChannelCheck:
                 stated = {"end": self.ends, "join": self.joins}.get(message.kind, {})
                 if message.boot in stated or len(stated) < MAX_BOOTS:
                     stated[message.boot] = message.ticks
+                of_start = message.about, message.boots.get(message.about, 0)
+                if message.kind == LAST and (of_start in self.heard or len(self.heard) < MAX_BOOTS):
+                    self.heard[of_start] = max(message.ticks, self.heard.get(of_start, 0))
                 # a recorder's own events are stamped as it hears them; before the epoch there is no time
                 stamped = message.t_ns >= 0 and message.member != topics.RECORDER
                 event_ns = message.t_ns if stamped else None
@@ -414,6 +428,8 @@ class SessionCheck:
             if check.kind in (topics.STATE, topics.LINK) and check.member in told:
                 most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
                 check.expect(told[check.member], most)
+                for events in told.values():
+                    check.hear_of(events, told[check.member].joins)
                 if check.member in records:
                     check.leave_out(records[check.member])
         yield self._check_sequence()

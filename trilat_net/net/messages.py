@@ -197,8 +197,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boot: the sender's process start.
         kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
             "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand",
-            "mark"; where sites come and go "left", "coming", "admit", "join", "unheard", "heard"; of a site
-            that does not go to its peers "waiting", of ticks that it did not make "overrun".
+            "mark"; where sites come and go "left", "coming", "admit", "last", "join", "unheard", "heard";
+            of a site that does not go to its peers "waiting", of ticks that it did not make "overrun".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
@@ -208,7 +208,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         boots: members of the session and their boots.
         about: the member that it concerns; of "end" whose end it was, "" if it was planned or asked for.
         ticks: how many ticks; of "clock" the tick from which on it holds; of "coming", "admit" and "join" the
-            first tick of the site that comes.
+            first tick of the site that comes; of "last" how many the start before it made at least.
         command: the change that was taken in, as the record of tick `ticks` names it.
         clocks: per member the identity of its clock.
         epochs: per member the epoch on its own clock.
