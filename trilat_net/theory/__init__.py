@@ -14,8 +14,9 @@ Definitions, equations and sources are in docs/linear.md and docs/ports.md.
 from .equilibrium import find_equilibrium
 from .linear_analysis import LinearAnalysis, analyse_linear_loop
 from .linear_edge import (
+    GrowthColumn,
     LinearEdge,
-    compute_growth_rates,
+    compute_growth_column,
     find_linear_edge,
     find_root_crossings,
     iterate_linear_edges,
@@ -26,11 +27,12 @@ from .operating_point import Equilibrium
 __all__ = [
     "DelayedTerm",
     "Equilibrium",
+    "GrowthColumn",
     "LinearAnalysis",
     "LinearEdge",
     "LinearLoop",
     "analyse_linear_loop",
-    "compute_growth_rates",
+    "compute_growth_column",
     "find_equilibrium",
     "find_linear_edge",
     "find_root_crossings",

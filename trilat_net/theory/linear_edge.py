@@ -6,6 +6,7 @@ equilibrium is found once and followed along the key.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -186,27 +187,46 @@ class _GrowthRate:
         return LinearEdge(self._key, 0.5 * (low + high), omega, at_low > 0.0)
 
 
-def compute_growth_rates(scenarios: Sequence[Scenario]) -> tuple[list[float], list[str]]:
-    """Returns the real parts of the rightmost roots of neighbouring scenarios, 1/s, and remarks on them.
+class GrowthColumn(NamedTuple):
+    """How fast a loop grows over the values of a key.
 
-    The equilibrium is followed from one scenario to the next. A real part is NaN if there is no linear loop
-    and -infinity if nothing moves; each remark comes once.
+    Attributes:
+        growth_per_s: per value the real part of the rightmost root; NaN if there is no linear loop, and
+            -infinity if nothing moves.
+        edges: by the place of the value below it, each value at which the loop becomes stable or unstable.
+        remarks: what is to be known of it, each once.
+    """
+
+    growth_per_s: list[float]
+    edges: dict[int, float]
+    remarks: list[str]
+
+
+def compute_growth_column(scenarios: Sequence[Scenario], key: str, values: Sequence[float]) -> GrowthColumn:
+    """Returns the growth of scenarios that differ in a key alone, by its rising values.
+
+    The equilibrium is followed from one scenario to the next. An edge is missing where that next to it is
+    none of the values in between.
     """
     rest: Equilibrium | None = None
-    growth_per_s: list[float] = []
-    remarks: dict[str, None] = {}
-    for scenario in scenarios:
+    found = GrowthColumn([], {}, [])
+    for n, scenario in enumerate(scenarios):
         try:
             rest, remark = _assume_equilibrium(scenario, rest)
             conditions = derive_operating_conditions(scenario)
             root = find_rightmost_root(conditions, rest, sampled=conditions.held)
-            growth_per_s.append(-np.inf if root is None else root.s.real)
+            found.growth_per_s.append(-np.inf if root is None else root.s.real)
+            before, now = found.growth_per_s[-2:] if n else [np.nan, np.nan]
+            if np.isfinite([before, now]).all() and (before > 0.0) != (now > 0.0):
+                with suppress(ScenarioError, ValueError):  # of both ends the same sign
+                    ends = (values[n - 1], before), (values[n], now)
+                    found.edges[n - 1] = _GrowthRate(scenario, key, rest, None).close_edge(*ends).value
         except ScenarioError as error:
             remark = f"no linear analysis: {error.problem}"
-            growth_per_s.append(float("nan"))
-        if remark:
-            remarks[remark] = None
-    return growth_per_s, list(remarks)
+            found.growth_per_s.append(float("nan"))
+        if remark and remark not in found.remarks:
+            found.remarks.append(remark)
+    return found
 
 
 def find_root_crossings(

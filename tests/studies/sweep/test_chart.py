@@ -25,7 +25,7 @@ from trilat_net.studies.sweep.stability_map import (
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.theory import compute_growth_rates
+from trilat_net.theory import GrowthColumn, compute_growth_column, find_linear_edge
 
 from .maps import KEYS, rows
 
@@ -63,11 +63,30 @@ def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
     at = PanelScenarios(plan_sweep("p_d_margin").written, (), *KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
+    scenarios = [at.scenario(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
-        [compute_growth_rates([at.scenario(100.0, d) for d in damping.values])] * 2
+        [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
     )
     assert line is not None
     assert line.crossings(0, damping) == [pytest.approx(0.5, rel=0.02)]
+
+
+def test_a_coarse_map_has_the_line_of_the_linear_analysis_to_its_digits() -> None:
+    """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
+    at = PanelScenarios(plan_sweep("p_d_margin").written, (), *KEYS)
+    damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
+    scenarios = [at.scenario(100.0, d) for d in damping.values]
+    line, _ = trace_linear_analysis(
+        [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
+    )
+    edge = find_linear_edge(scenarios[0], "control.d", 0.2, 1.2)
+    assert line is not None
+    assert edge is not None
+    assert (
+        line.crossings(0, damping)
+        == [pytest.approx(edge.value, rel=1e-6)]
+        == [pytest.approx(0.4957, abs=1e-4)]
+    )
 
 
 def test_a_strip_has_no_lines() -> None:
@@ -166,36 +185,54 @@ def test_a_key_of_whole_numbers_has_no_point_between_them() -> None:
     assert find_criterion_edge(condition, 0.0, 7.0) is None
 
 
+def grows(growth_per_s: list[float], edges: dict[int, float] | None = None) -> GrowthColumn:
+    return GrowthColumn(growth_per_s, edges or {}, [])
+
+
 def test_the_linear_line_is_where_nothing_grows() -> None:
     """Real parts that are zero along y = 0.4 x: positive below, negative above."""
-    columns = [([0.4 * x - y for y in (0.0, 1.0, 2.0)], []) for x in (0.0, 1.0, 2.0, 3.0)]
-    line, remarks = trace_linear_analysis(columns)
+    side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
+    columns = [grows([0.4 * x - y for y in side.values]) for x in (0.0, 1.0, 2.0, 3.0)]
+    line, remarks = trace_linear_analysis(columns, side)
     assert line is not None
     assert not remarks
-    side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
     assert np.allclose([line.crossings(n, side)[0] for n in (1, 2, 3)], [0.4, 0.8, 1.2])
 
 
 def test_a_column_may_be_crossed_again_and_again() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0, 3.0), "y")
-    line, _ = trace_linear_analysis([([-1.0, 1.0, 3.0, -1.0], [])] * 2)
+    line, _ = trace_linear_analysis(
+        [grows([-1.0, 1.0, 3.0, -1.0]), grows([-1.0, 1.0, 1.0, -1.0], {0: 0.9})], side
+    )
     assert line is not None
     assert line.crossings(0, side) == [0.5, 2.75]
+    assert line.crossings(1, side) == pytest.approx([0.9, 2.5])
+
+
+@given(st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6), st.sampled_from([-1.0, 1.0]))
+def test_a_column_is_crossed_at_its_edges_however_near_they_are(shares: list[float], sign: float) -> None:
+    side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
+    edges = {n: n + share for n, share in enumerate(shares)}
+    column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
+    line, _ = trace_linear_analysis([column] * 2, side)
+    assert line is not None
+    assert line.crossings(0, side) == pytest.approx([*edges.values()], abs=1e-6)
 
 
 def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
-    line, _ = trace_linear_analysis([([-np.inf, 1.0, -1.0], []), ([np.nan, 1.0, -1.0], [])])
+    line, _ = trace_linear_analysis([grows([-np.inf, 1.0, -1.0]), grows([np.nan, 1.0, -1.0])], side)
     assert line is not None
     assert line.crossings(0, side) == line.crossings(1, side) == [1.5]
 
 
 def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> None:
     why = ["nobody knows the delay"]
-    line, remarks = trace_linear_analysis([([np.nan, np.nan], why), ([np.nan, np.nan], why)])
+    side = PlaneAxis("y", (0.0, 1.0), "y")
+    line, remarks = trace_linear_analysis([GrowthColumn([np.nan, np.nan], {}, why)] * 2, side)
     assert line is None
     assert remarks == why
-    assert trace_linear_analysis([([-1.0, -2.0], []), ([-1.0, -3.0], [])]) == (None, [])
+    assert trace_linear_analysis([grows([-1.0, -2.0]), grows([-1.0, -3.0])], side) == (None, [])
 
 
 GAIN = st.floats(0.1, 50.0)

@@ -41,7 +41,7 @@ def chart() -> StabilityMap:
 
 def test_the_folder_has_a_picture_a_vector_and_a_page(chart: StabilityMap, tmp_path: Path) -> None:
     paths = write_map(chart, tmp_path)
-    assert [path.name for path in paths] == ["map.png", "map.svg", "map.md"]
+    assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
     assert int.from_bytes(paths[0].read_bytes()[16:20], "big") == 1050  # 3.5 in, 300 pixels to the inch
     assert paths[1].read_text().startswith("<?xml")
 
@@ -123,7 +123,7 @@ def test_every_place_has_the_colour_of_its_verdict() -> None:
 def test_a_place_reaches_half_way_to_the_next() -> None:
     (mesh,) = meshes(figure(drawn()))[:1]
     corners = mesh.get_coordinates()
-    assert np.allclose(corners[0, :, 0], [-50, 50, 150, 250, 350, 450])
+    assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
     assert np.allclose(corners[:, 0, 1], [-0.05, 0.45, 0.95, 1.45, 1.95, 2.45])
 
 

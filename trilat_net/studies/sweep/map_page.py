@@ -1,4 +1,4 @@
-"""The figure and the page of a stability map: map.png, map.svg and map.md.
+"""The figure and the page of a stability map: map.png, map.svg, map.pdf and map.md.
 
 Invariant: the page holds only results, lines and commands, and equal results give equal bytes. A cell of the
 figure is coloured by its classes alone: with several seeds by the stable share of the decided runs, hatched
@@ -128,11 +128,10 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Th
 
 def _draw_line(axes: Axes, plane: MapPlane, line: TheoryLine) -> None:
     """Draws where a line is zero, out to the borders of the outermost cells."""
-    x, y = (
-        np.concatenate([ends[:1], places, ends[-1:]])
-        for ends, places in ((_bounds(plane.x), plane.x.places), (_bounds(plane.y), plane.y.places))
-    )
-    spare = np.ma.masked_invalid(_extended(_extended(line.spare).T).T)
+    ends = [np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y)]
+    kept = [np.diff(one, append=np.inf) > 0.0 for one in ends]  # a border at zero is a place itself
+    spare = np.ma.masked_invalid(_extended(_extended(line.spare).T).T[np.ix_(kept[1], kept[0])])
+    x, y = (one[there] for one, there in zip(ends, kept, strict=True))
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
     drawn = axes.contour(x, y, spare, [0.0], colors=look["color"], linewidths=look["linewidth"])
     halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
@@ -160,13 +159,16 @@ def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
 
 
 def _bounds(side: PlaneAxis) -> Array:
-    """Returns the borders of the cells of an axis: half way between its values, shape (n + 1,)."""
+    """Returns the borders of the cells of an axis: half way between its values, shape (n + 1,).
+
+    None is below zero unless a value is: there is no delay of -100 ms.
+    """
     places = side.places
     if len(places) == 1:
         return np.array([places[0] - 0.5, places[0] + 0.5])
     extended = _extended(places)
     bounds: Array = np.concatenate([extended[:1], 0.5 * (places[1:] + places[:-1]), extended[-1:]])
-    return bounds
+    return np.maximum(bounds, 0.0) if side.even and places[0] >= 0.0 else bounds
 
 
 def _scale(axes: Axes, plane: MapPlane) -> None:
@@ -250,10 +252,10 @@ def write_map(
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "md")]
-    for path in paths[:2]:
+    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
+    for path in paths[:-1]:
         style.write_figure(figure, path, _DPI)
-    write_whole(paths[2], build_map_page(chart, paths[0].name))
+    write_whole(paths[-1], build_map_page(chart, paths[0].name))
     return paths
 
 

@@ -4,13 +4,14 @@ Lines are those of closed-form stability criteria and of the dominant root of th
 marginal.
 
 Invariant: the runs come from the results and the lines from the plan alone; a line is the zero set of a
-quantity that theory gives at every grid point. A criterion applies only if all of its hypotheses hold, and
-its excess is positive where it is met. P+d counts as it is computed, from tick to tick; of the roots' line
-only those with scheme `digital` do.
+quantity that theory gives, found between any two places of a column of which just one is stable. A criterion
+applies only if all of its hypotheses hold, and its excess is positive where it is met. P+d counts as it is
+computed, from tick to tick; of the roots' line only those with scheme `digital` do.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
 from ...scenario.fields import is_number
 from ...scenario.law_conditions import COMMON_MOTION_SHARE, find_least_reversible
 from ...scenario.laws import Adaptive, ProportionalDamped
-from ...theory import compute_growth_rates
+from ...theory import GrowthColumn, compute_growth_column
 from ..commands import format_command, set_options
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .map_plane import MapPanel, MapPlane, PlaneAxis, build_plane
@@ -191,7 +192,8 @@ class TheoryLine(NamedTuple):
     Attributes:
         label: what the legend calls it; `text`: the same for plain text.
         about: where it is from.
-        spare: what is zero on it and positive where theory says stable, shape (y, x); NaN where it is silent.
+        spare: what is zero on it and positive where theory says stable, shape (y, x), and goes straight from
+            one value of a column to the next; NaN where it is silent.
         rank: how it is drawn: 0 is the first look, and so on.
     """
 
@@ -209,7 +211,7 @@ class TheoryLine(NamedTuple):
         return bool((np.isfinite(corners).all(axis=0) & (stable > 0) & (stable < len(corners))).any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Returns where it crosses a column, from below; between two places as if it went straight."""
+        """Returns where it crosses a column, from below."""
         places = zip(y.values, self.spare[:, column].tolist(), strict=True)
         return [
             low + (high - low) * a / (a - b)
@@ -220,27 +222,63 @@ class TheoryLine(NamedTuple):
 
 def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> TheoryLine | None:
     """Returns the line of the condition in closed form; None where there is none, or not within the map."""
-    found = [[evaluate_criterion(at(right, up)) for right in x.values] for up in y.values]
-    first = next((one for row in found for one in row if one is not None), None)
+    found = [[evaluate_criterion(at(right, up)) for up in y.values] for right in x.values]
+    first = next((one for column in found for one in column if one is not None), None)
     if first is None:
         return None
-    spare = np.array([[np.nan if one is None else one.excess for one in row] for row in found])
-    line = TheoryLine(first.symbol, first.text, first.source, spare, 0)
+    columns = []
+    for right, column in zip(x.values, found, strict=True):
+        excess = [np.nan if one is None else one.excess for one in column]
+        edges: dict[int, float] = {}
+        for n in _changes(excess):
+            edge = find_criterion_edge(partial(_criterion_at, at, right), *y.values[n : n + 2])
+            edges |= {} if edge is None else {n: edge}
+        columns.append(_straighten(y.values, excess, edges))
+    line = TheoryLine(first.symbol, first.text, first.source, np.array(columns).T, 0)
     return line if line.there else None
 
 
-def trace_linear_analysis(
-    columns: Sequence[tuple[list[float], list[str]]],
-) -> tuple[TheoryLine | None, list[str]]:
-    """Returns the line of the linear analysis, and what is to be known of it.
+def _criterion_at(at: ScenarioAt, right: float, up: float) -> StabilityCriterion | None:
+    return evaluate_criterion(at(right, up))
 
-    Args:
-        columns: per value of the x axis the real parts of the rightmost roots, 1/s, and remarks.
-    """
-    spare = -np.array([growths for growths, _ in columns]).T
-    remarks = list(dict.fromkeys(remark for _, some in columns for remark in some))
-    line = TheoryLine(LINEAR_ANALYSIS, LINEAR_ANALYSIS, _ABOUT, np.where(np.isinf(spare), np.nan, spare), 1)
+
+def trace_linear_analysis(
+    columns: Sequence[GrowthColumn], y: PlaneAxis
+) -> tuple[TheoryLine | None, list[str]]:
+    """Returns the line of the linear analysis from its columns, and what is to be known of it."""
+    spare = [
+        _straighten(y.values, [np.nan if np.isinf(s) else -s for s in one.growth_per_s], one.edges)
+        for one in columns
+    ]
+    remarks = list(dict.fromkeys(remark for one in columns for remark in one.remarks))
+    line = TheoryLine(LINEAR_ANALYSIS, LINEAR_ANALYSIS, _ABOUT, np.array(spare).T, 1)
     return line if line.there else None, remarks
+
+
+def _changes(spare: Sequence[float]) -> list[int]:
+    """Returns the places of a column after which it changes between stable and not."""
+    pairs = enumerate(pairwise(spare))
+    return [n for n, (a, b) in pairs if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)]
+
+
+def _straighten(values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]) -> Array:
+    """Returns what is zero at the edges of a column and goes straight between its values, shape (y,).
+
+    Far from an edge it is a step of the grid. An edge that is not given is where `spare` itself, if it went
+    straight, would be zero.
+    """
+    step = abs(values[-1] - values[0]) / (len(values) - 1)
+    straight: Array = np.where(np.isfinite(spare), np.where(np.array(spare) > 0.0, step, -step), np.nan)
+    done = -1
+    for n in _changes(spare):
+        low, high = values[n : n + 2]
+        share = (edges[n] - low) / (high - low) if n in edges else spare[n] / (spare[n] - spare[n + 1])
+        share = min(max(share, _ROUNDING), 1.0 - _ROUNDING)
+        if n > done:  # else it is given by the edge below it
+            straight[n] = np.copysign(share * (high - low), straight[n])
+        straight[n + 1] = straight[n] * (1.0 - 1.0 / share)
+        done = n + 1
+    return straight
 
 
 def find_criterion_edge(
@@ -317,29 +355,26 @@ def build_stability_map(
     remarks: dict[str, None] = {}
     if linearly:
         for some, columns in zip(lines, _columns(drawn, at, jobs, on, progress), strict=True):
-            line, why = trace_linear_analysis(columns)
+            line, why = trace_linear_analysis(columns, drawn.y)
             some.append(line)
             remarks |= dict.fromkeys(why)
     kept = tuple(tuple(line for line in some if line is not None) for some in lines)
     return StabilityMap(drawn, kept, tuple(remarks), commands, title)
 
 
-GrowthColumn = tuple[list[float], list[str]]
-
-
 def _columns(
     drawn: MapPlane, at: Sequence[PanelScenarios], jobs: int | None, on: Workers, progress: Progress
 ) -> Iterator[tuple[GrowthColumn, ...]]:
-    """Yields per panel the real parts of the rightmost roots, column by column."""
-    tasks = [(one, x, drawn.y.values) for one in at for x in drawn.x.values]
+    """Yields per panel how fast the loop grows, column by column."""
+    tasks = [(one, x, drawn.y) for one in at for x in drawn.x.values]
     with open_worker_pool(jobs, on, most=len(tasks)) as pool:
         found = iter(pool.map(_column, tasks, progress))
     return zip(*[found] * len(drawn.x.values), strict=True)
 
 
-def _column(task: tuple[PanelScenarios, float, tuple[float, ...]]) -> GrowthColumn:
-    at, x, values = task
-    return compute_growth_rates([at.scenario(x, y) for y in values])
+def _column(task: tuple[PanelScenarios, float, PlaneAxis]) -> GrowthColumn:
+    at, x, y = task
+    return compute_growth_column([at.scenario(x, up) for up in y.values], y.key, y.values)
 
 
 def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
