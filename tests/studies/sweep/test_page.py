@@ -124,7 +124,7 @@ def test_a_place_reaches_half_way_to_the_next() -> None:
     (mesh,) = meshes(figure(drawn()))[:1]
     corners = mesh.get_coordinates()
     assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
-    assert np.allclose(corners[:, 0, 1], [-0.05, 0.45, 0.95, 1.45, 1.95, 2.45])
+    assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
 
 
 def test_classes_are_apart_in_lightness() -> None:

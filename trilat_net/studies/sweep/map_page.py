@@ -128,20 +128,25 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Th
 
 def _draw_line(axes: Axes, plane: MapPlane, line: TheoryLine) -> None:
     """Draws where a line is zero, out to the borders of the outermost cells."""
-    ends = [np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y)]
-    kept = [np.diff(one, append=np.inf) > 0.0 for one in ends]  # a border at zero is a place itself
-    spare = np.ma.masked_invalid(_extended(_extended(line.spare).T).T[np.ix_(kept[1], kept[0])])
-    x, y = (one[there] for one, there in zip(ends, kept, strict=True))
+    x, y = (np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y))
+    spare = _extended(_extended(line.spare, y).T, x).T
+    inside = [np.diff(one, append=np.inf) > 0.0 for one in (y, x)]  # a border at zero is a place itself
+    shown = np.ma.masked_invalid(spare[np.ix_(*inside)])
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
-    drawn = axes.contour(x, y, spare, [0.0], colors=look["color"], linewidths=look["linewidth"])
+    drawn = axes.contour(
+        x[inside[1]], y[inside[0]], shown, [0.0], colors=look["color"], linewidths=look["linewidth"]
+    )
     halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
     drawn.set(linestyle=look["linestyle"], path_effects=halo)
 
 
-def _extended(rows: Array) -> Array:
-    """Returns a field with a row more at either end, half a step on."""
-    first, last = 1.5 * rows[0] - 0.5 * rows[1], 1.5 * rows[-1] - 0.5 * rows[-2]
-    extended: Array = np.concatenate([first[np.newaxis], rows, last[np.newaxis]])
+def _extended(rows: Array, places: Array) -> Array:
+    """Returns a field with a row more at either end, of which the places are the first and the last."""
+    before, after = (
+        rows[i] + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
+        for i, j, at, near, far in ((0, 1, 0, 1, 2), (-1, -2, -1, -2, -3))
+    )
+    extended: Array = np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
     return extended
 
 
@@ -166,8 +171,8 @@ def _bounds(side: PlaneAxis) -> Array:
     places = side.places
     if len(places) == 1:
         return np.array([places[0] - 0.5, places[0] + 0.5])
-    extended = _extended(places)
-    bounds: Array = np.concatenate([extended[:1], 0.5 * (places[1:] + places[:-1]), extended[-1:]])
+    ends = 1.5 * places[[0, -1]] - 0.5 * places[[1, -2]]
+    bounds: Array = np.concatenate([ends[:1], 0.5 * (places[1:] + places[:-1]), ends[1:]])
     return np.maximum(bounds, 0.0) if side.even and places[0] >= 0.0 else bounds
 
 
