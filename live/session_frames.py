@@ -18,6 +18,7 @@ from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
 from trilat_net.net.messages import Event, LinkStats
+from trilat_net.reporting.palette import order_palette
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
 
@@ -54,11 +55,12 @@ class ArmFrames:
 
     def describe(self) -> Json:
         """Returns what never changes."""
-        chain = self._model.chain
+        chain, places = self._model.chain, order_palette(self._scenario)
         start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[0]
         reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
         return {
             "role": self._spec.role,
+            "colour": places[self._scenario.names.index(self._site) % len(places)],
             "rate_hz": self._spec.rate_hz,
             "planar": chain is None,
             "up": None if chain is None else _rounded(upright_axes(chain)),

@@ -15,7 +15,7 @@ export function sizeOf(element) {
   return sizes.get(element);
 }
 export const WORDS_MS = 200; // nobody reads numbers that change more often, and each makes the browser lay out the page
-export const siteColour = (index) => css(`--site-${index % 6}`);
+export const siteColour = (about) => css(`--site-${about.colour}`);
 const FADE = 15;
 const SLOW_MS = 45;
 const SLOW_FRAMES = 40;
@@ -45,15 +45,15 @@ export function arrow(g, from, to, colour, width) {
 }
 
 class ArmCard {
-  constructor(parent, name, about, index) {
-    Object.assign(this, { name, about, index });
+  constructor(parent, name, about) {
+    Object.assign(this, { name, about });
     this.card = element(parent, "article", "card arm watched");
     this.card.tabIndex = 0;
     this.card.setAttribute("aria-label", `arm ${name}, ${about.role}`);
     this.canvas = element(this.card, "canvas");
     const head = element(this.card, "div", "head");
     const swatch = element(head, "span", "swatch");
-    swatch.style.background = `var(--site-${index % 6})`;
+    swatch.style.background = `var(--site-${about.colour})`;
     element(head, "b").textContent = name;
     element(head, "span", "soft").textContent = about.role;
     this.alarms = element(head, "span");
@@ -154,7 +154,7 @@ class ArmCard {
     const tip = site.points[site.points.length - 1];
     const at = this.project(tip);
     g.lineJoin = "round";
-    g.strokeStyle = siteColour(this.index);
+    g.strokeStyle = siteColour(this.about);
     g.lineWidth = 1.5 * ratio;
     const way = this.trail.map((point) => this.project(point));
     for (let n = 1; n < way.length; n += FADE) { // a few paths are drawn sooner than one for each step
@@ -201,7 +201,7 @@ class ArmCard {
 
 export class Arms {
   constructor(parent, hello, say) {
-    this.cards = Object.entries(hello.sites).map(([name, about], index) => new ArmCard(parent, name, about, index));
+    this.cards = Object.entries(hello.sites).map(([name, about]) => new ArmCard(parent, name, about));
     this.byName = Object.fromEntries(this.cards.map((card) => [card.name, card]));
     this.painter = new PlainPainter();
     this.scale = 10;

@@ -94,7 +94,7 @@ export class Network {
     for (const name of this.links) this.link(g, name, frame, width, height);
     this.sites.forEach((site, n) => {
       const [x, y] = this.place(n, width, height);
-      g.fillStyle = siteColour(n);
+      g.fillStyle = siteColour(this.hello.sites[site]);
       g.beginPath(); g.arc(x, y, 17, 0, 2 * Math.PI); g.fill();
       g.fillStyle = css("--card");
       g.font = "600 12px system-ui, sans-serif";
@@ -124,7 +124,7 @@ export class Network {
     const age = Math.max(link.age_ms / 1000, 0.001);
     const every = Math.max(0.02, age / 24); // a dot stands for the samples of at least 20 ms
     const loss = link.stated.loss || 0;
-    g.fillStyle = siteColour(from);
+    g.fillStyle = siteColour(this.hello.sites[this.sites[from]]);
     for (let stamp = Math.ceil((frame.t - age) / every) * every; stamp <= frame.t; stamp += every) {
       const x = (frame.t - stamp) / age;
       const luck = Math.abs(Math.sin(12.9898 * Math.round(stamp / every) + from + 3 * to) * 43758.5453) % 1;

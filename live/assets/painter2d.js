@@ -34,7 +34,7 @@ export class PlainPainter {
   }
 
   paint(card, site, g) {
-    const { canvas, about, index } = card;
+    const { canvas, about } = card;
     const unit = canvas.height / (2 * card.view.half);
     const thick = 0.075 * about.reach * unit;
     g.clearRect(0, 0, canvas.width, canvas.height);
@@ -50,7 +50,7 @@ export class PlainPainter {
     const [bx, by] = this.project(card, base);
     g.fillStyle = css("--ink");
     g.fillRect(bx - 0.8 * thick, by - 0.8 * thick, 1.6 * thick, 1.6 * thick);
-    this.line(card, g, site.points, siteColour(index), thick);
+    this.line(card, g, site.points, siteColour(about), thick);
     g.fillStyle = css("--card");
     for (const point of site.points) {
       g.beginPath(); g.arc(...this.project(card, point), 0.27 * thick, 0, 2 * Math.PI); g.fill();

@@ -94,8 +94,8 @@ class ArmScene {
   }
 
   colour() {
-    this.bodyColour.color.set(siteColour(this.card.index));
-    this.jointColour.color.set(css("--card")).lerp(new THREE.Color(siteColour(this.card.index)), 0.25);
+    this.bodyColour.color.set(siteColour(this.card.about));
+    this.jointColour.color.set(css("--card")).lerp(new THREE.Color(siteColour(this.card.about)), 0.25);
     this.baseColour.color.set(css("--soft"));
     this.ghostColour.color.set(css("--ink"));
     this.wallColour.color.set(css("--line"));

@@ -72,12 +72,12 @@ export class Plots {
     this.columns = hello.columns;
     const sites = Object.keys(hello.sites);
     const column = (name) => 1 + this.columns.indexOf(name);
-    const per = (kind, extra = {}) => sites.map((site, n) => ({ label: site, colour: `--site-${n % 6}`, from: column(`${site}.${kind}`), ...extra }));
+    const per = (kind, extra = {}) => sites.map((site) => ({ label: site, colour: `--site-${hello.sites[site].colour}`, from: column(`${site}.${kind}`), ...extra }));
     const unit = hello.sites[sites[0]].unit;
     const walled = sites.filter((site) => hello.sites[site].walls.length);
-    const walls = walled.map((site) => ({ label: `wall at ${site}`, colour: `--site-${sites.indexOf(site) % 6}`, dash: true, from: column(`${site}.wall`) }));
+    const walls = walled.map((site) => ({ label: `wall at ${site}`, colour: `--site-${hello.sites[site].colour}`, dash: true, from: column(`${site}.wall`) }));
     const links = Object.entries(hello.links).map(([name, [from, to]]) => ({
-      label: name.replace("->", "→"), colour: `--site-${sites.indexOf(from) % 6}`, dash: sites.indexOf(to) > sites.indexOf(from), from: column(`${name}.age`),
+      label: name.replace("->", "→"), colour: `--site-${hello.sites[from].colour}`, dash: sites.indexOf(to) > sites.indexOf(from), from: column(`${name}.age`),
     }));
     this.streams = [
       [new Plot(parent, "error |e|", unit, per("e")), per("e")],

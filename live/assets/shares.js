@@ -15,7 +15,7 @@ const element = (parent, tag, attributes = {}) => {
 
 export class Shares {
   constructor(svg, rows, hello, send, page) {
-    Object.assign(this, { svg, rows, send, page, sites: Object.keys(hello.sites), wanted: null, told: 0 });
+    Object.assign(this, { svg, rows, send, page, about: hello.sites, sites: Object.keys(hello.sites), wanted: null, told: 0 });
     this.triangle = this.sites.length === 3;
     svg.toggleAttribute("hidden", !this.triangle);
     if (!this.triangle) svg.style.display = "none";
@@ -31,10 +31,10 @@ export class Shares {
       const [x, y] = CORNERS[n];
       const text = element(svg, "text", { x: 1.09 * x, y: y + (y > 0 ? 18 : -8) });
       text.textContent = site;
-      text.style.fill = siteColour(n);
+      text.style.fill = siteColour(this.about[site]);
     });
     this.knobs = this.sites.map((site, n) => this.knob(`site-${n}`, 7, (at) => this.edge(n, at), `row of ${site}`));
-    this.knobs.forEach((knob, n) => { knob.mark.style.fill = siteColour(n); });
+    this.knobs.forEach((knob, n) => { knob.mark.style.fill = siteColour(this.about[this.sites[n]]); });
     this.all = this.knob("all", 9, (at) => this.inside(at), "all rows");
   }
 

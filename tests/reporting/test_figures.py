@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 
 import trilat_net
 from tests.analysis import logs
@@ -18,6 +19,8 @@ from trilat_net.reporting.figures import (
     sample_age,
     time_figure,
 )
+from trilat_net.reporting.palette import SITE_COLOURS, list_site_colours
+from trilat_net.scenario import load_scenario
 
 BACKGROUND = 0.6
 """What marks are drawn at or below, so that lines cover them."""
@@ -103,6 +106,32 @@ def test_estimates_show_the_sites_that_are_asked_for():
     assert [len(lines(axes)) for axes in figure.axes] == [1] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
     assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
+
+
+def test_distributions_reach_the_longest_age_and_a_rare_one_by_logarithm():
+    for few, even in ((20.0, True), (1.0, False)):
+        ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
+        x_ms = sample_age.delay_axis_ms([sample_age.DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)])
+        assert x_ms[-1] >= 3200.0
+        assert (x_ms[0] == 0.0) == even
+
+
+def test_ages_that_go_up_and_down_all_the_time_are_a_band():
+    seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
+    assert sample_age.is_unsteady(200.0 + 10.0 * swings)
+    assert not sample_age.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
+    axes = Figure().subplots()
+    style.plot_spread(axes, seconds, 200.0 + 10.0 * swings, color="#004488")
+    (band,), (median,) = axes.collections, axes.lines
+    assert band.get_datalim(axes.transData).intervaly.tolist() == [200.0, 240.0]
+    assert set(median.get_ydata()) == {220.0}
+
+
+def test_a_slave_has_the_same_colour_however_many_masters_there_are():
+    for name, slaves in (("two_sites", 1), ("paper", 2), ("training", 2)):
+        colours = list_site_colours(load_scenario(name))
+        assert len(set(colours)) == len(SITE_COLOURS)
+        assert colours[slaves] == SITE_COLOURS[2]
 
 
 def test_the_axis_of_ages_is_logarithmic_after_an_outage():

@@ -22,6 +22,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from . import style
 from .figures import arm_poses, loop_timing, sample_age
+from .palette import DARK_SITE_COLOURS, list_site_colours
 
 BUCKET_BUDGET = 48_000
 """Buckets of all columns together: what keeps a page near a megabyte, however many sites there are."""
@@ -56,7 +57,10 @@ class Charts:
         charts = [*self._motion(), *self._timing()]
         return {
             "end_s": recorded_end_s(self._log),
-            "colours": {"light": list(style.SITE_COLOURS), "dark": list(style.DARK_SITE_COLOURS)},
+            "colours": {
+                "light": list_site_colours(self._log.scenario),
+                "dark": list_site_colours(self._log.scenario, DARK_SITE_COLOURS),
+            },
             "tables": self._tables,
             "charts": charts,
             "changes": [

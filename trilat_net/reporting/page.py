@@ -25,6 +25,7 @@ from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.loop_timing import explain_missing_loop_times
 from .figures.registry import explain_absent_operator, write_report_figures
+from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 
 _PAGE_DPI = 110
 _ASSETS = resources.files("trilat_net.reporting") / "assets"
@@ -181,7 +182,7 @@ def _site_css(log: Log) -> str:
             f".fill-{n} {{ background: {palette[n % len(palette)]}; fill: {palette[n % len(palette)]}; }}\n"
             for n in range(len(log.sites))
         )
-        for palette in (style.SITE_COLOURS, style.DARK_SITE_COLOURS)
+        for palette in (list_site_colours(log.scenario, some) for some in (SITE_COLOURS, DARK_SITE_COLOURS))
     )
     return f"{light}@media screen and (prefers-color-scheme: dark) {{\n{dark}}}"
 

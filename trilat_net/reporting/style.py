@@ -1,7 +1,6 @@
 """Style of all figures: colours per site, line styles, axes, legends, and files that are equal byte for byte.
 
-The first three colours are the "high contrast" set of Paul Tol's notes on colour: safe for the colour blind
-and apart in lightness, also in grey print. Sites beyond the palette differ by dashes.
+Sites beyond the palette differ by dashes.
 
 Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold no date, and
 fonts are embedded as TrueType.
@@ -28,14 +27,12 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario.arms import TASK_AXES
 from .figure_size import REPORT_SIZE, FigureSize
+from .palette import SITE_COLOURS, list_site_colours
 
 AxesGrid = NDArray[np.object_]
 LegendEntries = Sequence[tuple[str, dict[str, Any]]]
 """Texts, each with the options of its line."""
 
-SITE_COLOURS = ("#004488", "#bb5566", "#ddaa33", "#000000", "#66a3d2", "#7a7a7a")
-DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3a3a3")
-"""The same sites on a dark page."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
 REFERENCE = "#333333"
 FAINT = "#8c8c8c"
@@ -111,7 +108,7 @@ def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesG
 
 def site_colour(log: Log, site: str) -> str:
     """Returns the colour of a site, the same in every figure."""
-    return SITE_COLOURS[log.sites.index(site) % len(SITE_COLOURS)]
+    return list_site_colours(log.scenario)[log.sites.index(site) % len(SITE_COLOURS)]
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
@@ -134,6 +131,23 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
     """Draws values over ticks and their times, s, each of shape (K,), decimated with all extremes."""
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
     axes.plot(trace.t_s, trace.values[:, 0], **options)
+
+
+SPREAD_BUCKETS = 120
+SPREAD: dict[str, Any] = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
+"""The line that stands for a spread in a legend."""
+
+
+def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws what is up and down all the time as a median within a band from the least to the largest."""
+    parts = [part for part in np.array_split(np.arange(len(values)), SPREAD_BUCKETS) if len(part)]
+    at_s = np.array([t_s[part].mean() for part in parts])
+    low, middle, high = (
+        np.array([found(values[part]) if np.isfinite(values[part]).any() else np.nan for part in parts])
+        for found in (np.nanmin, np.nanmedian, np.nanmax)
+    )
+    axes.fill_between(at_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0)
+    axes.plot(at_s, middle, **options)
 
 
 def set_time_axis(log: Log, row: Sequence[Axes]) -> None:

@@ -135,7 +135,7 @@ class PortAnalysis(NamedTuple):
     """The ports of a teleoperator, operators and environments off.
 
     Attributes:
-        sites: of the ports.
+        scenario: the teleoperator.
         band_hz: the analysed band, Hz.
         resolved_hz: the frequency up to which the grid follows the phase of the delays, Hz.
         verdict: of its roots: "stable", "unstable" or "at the edge".
@@ -154,7 +154,7 @@ class PortAnalysis(NamedTuple):
         axes: names of the ports' numbers in task space, whose ports are forces along them; {}: joints.
     """
 
-    sites: tuple[str, ...]
+    scenario: Scenario
     band_hz: tuple[float, float]
     resolved_hz: float
     verdict: str
@@ -169,6 +169,11 @@ class PortAnalysis(NamedTuple):
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
     axes: Mapping[int, str] = MappingProxyType({})
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """Of the ports."""
+        return self.scenario.names
 
     @property
     def kind(self) -> str:
@@ -217,7 +222,7 @@ def analyse_ports(
     w_rad_s = refine_frequencies(Y, build_frequency_grid(*band_hz, delay_s))
     Y = cache_response(Y, w_rad_s)
     return PortAnalysis(
-        sites=sites,
+        scenario=scenario,
         band_hz=band_hz,
         resolved_hz=find_resolved_hz(*band_hz, delay_s),
         verdict=compute_delay_spectrum(loop, 1).verdict,

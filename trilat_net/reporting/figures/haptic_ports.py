@@ -17,11 +17,12 @@ from ...theory.port_analysis import PortAnalysis
 from ...theory.port_transparency import Transparency
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from ..palette import SITE_COLOURS, list_site_colours
 
 _CLAMPED: tuple[int, tuple[float, float]] = (0, (4.0, 1.6))
 _FAILS: dict[str, Any] = {"color": "#cc3311", "alpha": 0.12, "linewidth": 0.0, "zorder": 0.3}
 _BAND: dict[str, Any] = {"color": style.FAINT, "alpha": 0.12, "linewidth": 0.0, "zorder": 0.2}
-_ALL: dict[str, Any] = {"color": style.SITE_COLOURS[0], "linewidth": 1.6}
+_ALL: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6}
 _PROOF: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.0, "linestyle": (0, (5, 1.5, 1, 1.5))}
 _MAX_SHOWN_PARAMETER = 2.5
 """Llewellyn's parameter is drawn up to here: values far above 1 do not differ in meaning."""
@@ -91,7 +92,7 @@ def _describe_ratios(transparency: Sequence[Transparency]) -> str:
 
 
 def _colour(ports: PortAnalysis, site: str) -> str:
-    return style.SITE_COLOURS[ports.sites.index(site) % len(style.SITE_COLOURS)]
+    return list_site_colours(ports.scenario)[ports.sites.index(site) % len(SITE_COLOURS)]
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
@@ -117,7 +118,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _joint_line(joint: int) -> dict[str, Any]:
-    colour = style.SITE_COLOURS[joint % len(style.SITE_COLOURS)]
+    colour = SITE_COLOURS[joint % len(SITE_COLOURS)]
     return {"color": colour, "linestyle": style.DASHES[joint % len(style.DASHES)], "linewidth": 1.0}
 
 

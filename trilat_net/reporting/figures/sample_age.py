@@ -22,6 +22,8 @@ from .time_figure import time_figure
 
 _POINTS = 400
 _TALL = 6.0
+_STEP_MS = 1.5
+"""A fall of an age by more is no sample more at a tick."""
 
 
 class DelayDistribution(NamedTuple):
@@ -39,11 +41,17 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
         grid = style.add_panels(plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         drawn: list[Array] = []
+        spread = False
         for site, row in zip(log.sites, grid, strict=True):
             for peer, age_ms, axes in zip(log[site].peers, sample_ages_ms(log, site).T, row, strict=True):
                 line = lines[f"{peer}->{site}"]
                 plot.mark(axes, [site], f"{peer}->{site}")
-                plot.trace(axes, site, age_ms, **style.site_line(log, peer, 1.4))
+                line_of = style.site_line(log, peer, 1.4)
+                if is_unsteady(age_ms):
+                    spread = True
+                    style.plot_spread(axes, log[site].t_s, age_ms, **line_of)
+                else:
+                    plot.trace(axes, site, age_ms, **line_of)
                 axes.plot(*line, **style.LIMIT_LINE)
                 _title_link(axes, peer, site)
                 if not np.any(np.isfinite(age_ms)):
@@ -54,7 +62,8 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         _age_axis(grid[0, 0], np.concatenate(drawn))
         known = any(np.any(np.isfinite(values)) for _, values in lines.values())
         stated = [("mean delay as stated", style.LIMIT_LINE)] if known else []
-        plot.finish(grid[-1], [*_senders(log), *stated], links=True)
+        bands = [("least to largest, with median", style.SPREAD)] if spread else []
+        plot.finish(grid[-1], [*_senders(log), *stated, *bands], links=True)
     return plot.figure
 
 
@@ -77,7 +86,10 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
             axes.set_ylabel("cumulative (%)")
         for axes in grid[-1]:
             axes.set_xlabel("delay or age (ms)")
-        grid[0, 0].set(ylim=(0.0, 104.0), xlim=(0.0, x_ms[-1]))
+        grid[0, 0].set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
+        if x_ms[0] > 0.0:
+            grid[0, 0].set_xscale("log")
+            grid[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         entries = [(f"age, {text}", options) for text, options in _senders(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
@@ -107,10 +119,13 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
 
 
 def delay_axis_ms(found: list[DelayDistribution]) -> Array:
-    """Returns the delays at which distributions are drawn, ms; those after an outage lie beyond."""
-    ends = [np.percentile(d.delay_ms, 99.5) for d in found if len(d.delay_ms)]
-    ends += [np.percentile(d.age_ms, 90.0) for d in found if len(d.age_ms)]
-    return np.linspace(0.0, 1.15 * max([*ends, 1.0]), _POINTS)
+    """Returns the delays at which distributions are drawn, ms, to the longest; by logarithm if it is rare."""
+    values = np.concatenate([part for d in found for part in (d.delay_ms, d.age_ms)] or [np.zeros(0)])
+    known = values[np.isfinite(values)]
+    end_ms = 1.05 * max(float(known.max(initial=0.0)), 1.0)
+    if not needs_log_axis(known):
+        return np.linspace(0.0, end_ms, _POINTS)
+    return np.geomspace(max(0.5 * float(np.percentile(known, 1.0)), 0.1), end_ms, _POINTS)
 
 
 def cumulative_percent(values: Array, limits: Array) -> Array:
@@ -134,6 +149,12 @@ def needs_log_axis(ages_ms: Array) -> bool:
     """True if a few ages, as after an outage, would press all others into a line at the bottom."""
     known = ages_ms[np.isfinite(ages_ms)]
     return len(known) > 0 and bool(known.max() > _TALL * np.percentile(known, 95.0))
+
+
+def is_unsteady(ages_ms: Array) -> bool:
+    """True if ages go up and down within what a pixel shows, so that a line would fill all between."""
+    falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
+    return len(falls) > style.SPREAD_BUCKETS
 
 
 def _age_axis(axes: Axes, values: Array) -> None:

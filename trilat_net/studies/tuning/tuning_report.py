@@ -22,6 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from ...analysis.json_values import JsonObject
 from ...files import write_whole
 from ...reporting import style
+from ...reporting.palette import SITE_COLOURS
 from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
 from .candidate import CandidateScore
@@ -268,7 +269,7 @@ def draw_front(tuned: TuningResult) -> Figure:
 def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
     place = list(SEARCH_SPACES).index(found.space.law)
-    colour, mark = style.SITE_COLOURS[place % len(style.SITE_COLOURS)], _MARKS[place % len(_MARKS)]
+    colour, mark = SITE_COLOURS[place % len(SITE_COLOURS)], _MARKS[place % len(_MARKS)]
     points = found.points
     settled = [point for point in points if point is not None]
     front = [point for place in found.front if (point := points[place]) is not None]
