@@ -10,9 +10,10 @@ from rich.console import Console
 from live.session_frames import SessionFrames, show_event
 from live.terminal_watch import HEADS, SessionWatch, describe_row, frame_alarms
 from sites.session_stop import order_sites, stop_session
-from trilat_net.core.ticks import LifeAlarm
+from trilat_net.core.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net.bus import Bus, LocalNetwork
 from trilat_net.net.clock import ManualClock
 from trilat_net.scenario import load_scenario
@@ -169,3 +170,23 @@ def test_who_watches_sees_a_site_come_back_and_stop_reaches_those_that_are_there
     assert ended["s"] == "killed"
     assert "s is gone since" in ended["m1"]
     assert verify(log).differing == 0
+
+
+@pytest.mark.long
+def test_a_master_that_is_killed_is_done_without_and_taken_back(tmp_path: Path) -> None:
+    """It dies 3 s after the beginning and is started again 4 s later; the others never hold."""
+    rule = {**GLIDES, "on_stale.on_lost": "degrade", "rate_hz": 200, "duration_s": 12.0}
+    session = Session.whole(load_scenario("paper", rule), tmp_path, ends={})
+    session.clocks["m1"].dies_ns = 4_000_000_000
+    session.site("m1", at_ns=8_000_000_000)
+    log = session.run()
+    assert [end for _, end in session.told] == ["killed", 0, 0, 0]
+    for name in ("m2", "s"):
+        reasons = [int(state.mem[5]) for state in log[name].states]
+        assert "hold" not in set(log[name].mode)
+        assert reasons.index(LifeReason.DROPPED) < reasons.index(LifeReason.RESTORED)
+        assert log[name].mode[-1] == "run"
+    assert log["m1"].mode[-1] == "run"
+    assert verify(log).differing == 0
+    fed = compare_with_virtual(log).fed
+    assert fed.identical == fed.records

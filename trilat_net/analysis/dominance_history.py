@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
@@ -49,7 +50,44 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """
     start, scripted = list_scripted_ramps(log.scenario, site)
     ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
-    return evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    planned = evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    lost = find_lost_peers(log, site, t_s)
+    return _share_out(planned, ~lost) if lost.any() else planned
+
+
+def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
+    """Returns which peers a site goes on without at some times, s, shape (K, P): see `core.lost_peers`."""
+    part, peers = log[site], len(log[site].peers)
+    lost = np.zeros((len(t_s), peers), dtype=bool)
+    if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
+        return lost
+    end = part.layout.life_memory(peers, degrades=True)
+    gone = np.array([row[end - peers : end] for row in part.mem]) != 0.0
+    rows = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right") - 1
+    lost[rows >= 0] = gone[rows[rows >= 0]]
+    return lost
+
+
+def list_losses(log: Log) -> list[str]:
+    """Returns the times in which a site went on without a peer, in words."""
+    found = []
+    for site in log.sites:
+        part = log[site]
+        lost = find_lost_peers(log, site, part.t_s).astype(int)
+        for j, peer in enumerate(part.peers):
+            edges = np.diff(np.concatenate([[0], lost[:, j], [0]]))
+            times = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz) if len(part) else part.t_s
+            for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+                found.append(f"{site} without {peer} {times[first]:.4g} to {times[last]:.4g} s")
+    return found
+
+
+def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> DominanceHistory:
+    """Returns the factors of the peers that are there, in proportion to the planned ones."""
+    alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
+    whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
+    rate = (rate * whole - alpha * whole_rate) / whole**2
+    return DominanceHistory(alpha / whole, rate, before / before.sum(axis=1, keepdims=True))
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .jit import leaf
+from .lost_peers import regroup
 from .site_setup import StaleAction
 from .ticks import Mode, tick_ns
 from .vectors import Array, Row, RowArray, put
@@ -202,8 +203,10 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
 
     While factors change, the derivative includes their rates.
     """
-    if site.ramps > 1:
+    if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
+    if site.degrades:
+        regroup(t_ns, site, links)
     put(site.q_followed, site.q_des)
     put(site.qd_followed, site.qd_des)
     for i in range(site.q_des.shape[0]):

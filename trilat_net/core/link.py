@@ -34,7 +34,8 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 
     They stand in scenario order. `used` is -1 until the first sample is released; until then q and qd are the
     peer's start pose, at rest (L7). It is `new` in the tick that released it, at `used_ns`; `tick` and
-    `age_s` are filled in for laws that look at their peers.
+    `age_s` are filled in for laws that look at their peers. `gone` is 0 of a peer that is there, -1 of one
+    that is lost, and of one that is heard again the time since when, ns: see `lost_peers`.
     """
     fields = [
         ("alpha", "f8"),
@@ -44,6 +45,8 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
         ("age_s", "f8"),
         *_sample_vectors(shared),
         ("key", "u8"),
+        *((name, "i8") for name in ("bit", "followed", "dispensable")),
+        ("gone", "f8"),
         *((name, "i8") for name in _CHANNEL),
         ("memory", "f8"),
         *((name, "i8") for name in LinkCounts._fields),

@@ -177,6 +177,9 @@ def _update_mode(t_ns: int, before_ns: int, site: Row, links: RowArray) -> None:
         _begin_aligning(t_ns, site, _PEERS_BACK)
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
         _hold(before_ns, site, _PEER_SILENT)
+    elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
+        _hold(before_ns, site, site.regrouped)
+        _begin_aligning(t_ns, site, site.regrouped)
     elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
         _enter(t_ns, _RUN, _ALIGNED, site)
 

@@ -25,6 +25,7 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 _SETTINGS = (
     *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
     *("theta_known", "needs_model", "remembered", "asked", "order", "skipped"),
+    *("degrades", "regrouped", "bit"),
 )
 _COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
@@ -308,6 +309,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     s.theta_known = setup.theta_known
     s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
     s.align_speed, s.align_limit = rule.align_speed, rule.align_limit
+    s.degrades, s.bit = rule.degrades, setup.bit
     if setup.chain is None:
         s.g, s.lengths = setup.g_m_s2, setup.lengths_m
     else:
@@ -354,6 +356,7 @@ def _build_links(links: Sequence[LinkSetup], spare: int, shared: int) -> tuple[R
     row: Row
     for row, models, link in zip(rows, all_models, links, strict=True):
         row.alpha, row.rate_hz, row.key = link.alpha, link.rate_hz, link.key
+        row.bit, row.followed, row.dispensable = link.bit, link.followed, link.dispensable
         row.used, row.foreseen = -1, -1
         row.q[: len(link.q0)] = link.q0
         row.outage_first, row.outage_count = outage_first, len(link.outages)

@@ -67,6 +67,7 @@ class StaleRule(NamedTuple):
         return_ns: duration of the return to the peers, ns.
         align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place m/s).
         align_limit: of GLIDE, the longest way that it goes by itself, rad (m).
+        degrades: of GLIDE, true: it goes on without a peer that is lost, see `lost_peers`.
     """
 
     action: StaleAction = StaleAction.USE
@@ -74,6 +75,7 @@ class StaleRule(NamedTuple):
     return_ns: int = 1
     align_speed: float = 1.0
     align_limit: float = math.inf
+    degrades: bool = False
 
 
 class MotionLimits(NamedTuple):
@@ -107,6 +109,9 @@ class LinkSetup(NamedTuple):
         channel: what the peer's law sends besides its motion.
         place: the site's place among the peers of its peer, in scenario order.
         speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; () for no one.
+        bit: of the peer in sets of sites.
+        followed: the set of sites that the peer follows.
+        dispensable: true: a site that degrades may go on without it.
     """
 
     peer: str
@@ -120,6 +125,9 @@ class LinkSetup(NamedTuple):
     channel: LawChannel = LawChannel()
     place: int = 0
     speed_limit: tuple[float, ...] = ()
+    bit: int = 0
+    followed: int = 0
+    dispensable: bool = False
 
 
 class Layout(NamedTuple):
@@ -174,9 +182,12 @@ class Layout(NamedTuple):
             name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
         }
 
-    def life_memory(self, peers: int) -> int:
-        """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`."""
-        return 2 * (self.shared + 1) + peers + self.joints
+    def life_memory(self, peers: int, *, degrades: bool = False) -> int:
+        """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`.
+
+        Of one that degrades the last of them are `gone` of its peers.
+        """
+        return 2 * (self.shared + 1) + peers + self.joints + peers * degrades
 
     @property
     def floats(self) -> int:
@@ -288,6 +299,7 @@ class SiteSetup(NamedTuple):
         channel: what the site's law sends to its peers.
         limits: further limits.
         damping: of a site that is stopped, per joint, N m s/rad.
+        bit: of the site in sets of sites.
     """
 
     name: str
@@ -312,6 +324,7 @@ class SiteSetup(NamedTuple):
     channel: LawChannel = LawChannel()
     limits: MotionLimits = MotionLimits()
     damping: Vector = (0.0,)
+    bit: int = 0
 
     @property
     def layout(self) -> Layout:

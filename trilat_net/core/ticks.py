@@ -76,6 +76,8 @@ class LifeReason(IntEnum):
     ARM_BACK = 14
     RELEASED = 15
     HELD = 16
+    DROPPED = 17
+    RESTORED = 18
 
 
 class LifeOrder(IntEnum):
@@ -277,6 +279,8 @@ _REASONS = {
     LifeReason.ARM_SILENT: "its arm is silent",
     LifeReason.RELEASED: "its dead-man switch is not held",
     LifeReason.HELD: "its dead-man switch is held",
+    LifeReason.DROPPED: "a lost peer has no share any more",
+    LifeReason.RESTORED: "a peer that was lost has its share again",
 }
 
 
@@ -344,7 +348,9 @@ def describe_mode(site: str, output: TickRecord, *, glides: bool = False) -> str
         Mode.STOPPED: "is STOPPED",
     }
     why = _REASONS.get(find_life_reason(output), "") if glides else "a peer is stale"
-    if output.mode in (Mode.RUN, Mode.RETURN) or (output.mode is Mode.BRAKE and not glides):
+    regrouped = glides and find_life_reason(output) in (LifeReason.DROPPED, LifeReason.RESTORED)
+    aligns = output.mode is Mode.RETURN and not regrouped
+    if aligns or output.mode is Mode.RUN or (output.mode is Mode.BRAKE and not glides):
         why = ""
     return f"{site} {doing[output.mode]}{': ' * bool(why)}{why} from t = {output.t_ns * 1e-9:.3f} s"
 

@@ -57,6 +57,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         silence_ms: of "glide", the time without a new sample in use after which a peer is silent, ms.
         align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; in task space m/s.
         align_limit_rad: of "glide", the longest way that it goes by itself, rad; in task space m.
+        on_lost: of "glide", "hold": holds while a peer is silent; "degrade": goes on without a master
+            that is, as long as the others reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -65,6 +67,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     silence_ms: Annotated[float, Meta(gt=0.0, le=1e4)] = 20.0
     align_speed_rad_s: Annotated[float, Meta(gt=0.0, le=1e3)] = 0.5
     align_limit_rad: Annotated[float, Meta(gt=0.0, le=1e3)] = 1.0
+    on_lost: Literal["hold", "degrade"] = "hold"
 
     @property
     def rule(self) -> StaleRule:
@@ -72,7 +75,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         if self.action == "glide":
             silence_ns = round(self.silence_ms * 1e6)
             limits = self.align_speed_rad_s, self.align_limit_rad
-            return StaleRule(StaleAction.GLIDE, silence_ns, 1, *limits)
+            return StaleRule(StaleAction.GLIDE, silence_ns, 1, *limits, self.on_lost == "degrade")
         return StaleRule(
             StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
         )
@@ -408,6 +411,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             channel=self.channel(site),
             limits=spec.limits.motion,
             damping=self._stopping_damping(site) if spec.on_stale.action == "glide" else (0.0,),
+            bit=1 << self.names.index(site),
         )
 
     def _stopping_damping(self, site: str) -> Array:
@@ -438,6 +442,9 @@ class Scenario(Frozen, frozen=True, dict=True):
             channel=self.channel(peer),
             place=self.peers(peer).index(site),
             speed_limit=self._speed_limit(peer) if self.sites[site].on_stale.action == "glide" else (),
+            bit=1 << self.names.index(peer),
+            followed=sum(1 << n for n, share in enumerate(self.alpha[self.names.index(peer)]) if share > 0.0),
+            dispensable=self.sites[peer].role == "master",
         )
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ from typing import get_args
 import msgspec
 import numpy as np
 
+from ..core.dominance import is_irreducible
 from ..errors import ScenarioError
 from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
@@ -174,6 +175,7 @@ _CHOICES = {
         (LinkBase, "order"),
         (TraceDelay, "at_end"),
         (OnStale, "action"),
+        (OnStale, "on_lost"),
     )
 }
 
@@ -421,6 +423,7 @@ def _normalise_change(change: Change) -> Change:
 
 def _check_stale_rules(scenario: Scenario) -> None:
     """Refuses a rule by which a site would always hold: the delay of its links alone exceeds its age."""
+    _check_lost(scenario)
     for name, site in scenario.sites.items():
         if site.on_stale.action == "glide":
             _check_glide(scenario, name)
@@ -451,6 +454,33 @@ def _check_glide(scenario: Scenario, name: str) -> None:
             f"must be at least {2e3 / slowest_hz:g} ms, two periods of {slowest_hz} Hz, "
             f"is {rule.silence_ms:g}",
             path=f"{path}.silence_ms",
+        )
+
+
+def _check_lost(scenario: Scenario) -> None:
+    """Refuses sites that would go on without a lost master, where that is not so of any."""
+    degrading = [name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"]
+    for name in degrading:
+        if scenario.sites[name].on_stale.action != "glide":
+            raise ScenarioError(
+                "degrade is of on_stale.action = 'glide' alone: only so does a reference not jump",
+                path=f"sites.{name}.on_stale.on_lost",
+            )
+    masters = [n for n, site in enumerate(scenario.sites.values()) if site.role == "master"]
+    alpha, names = scenario.alpha, scenario.names
+    able = [
+        name
+        for name in degrading
+        for n in masters
+        if alpha[(own := names.index(name)), n] > 0.0
+        and alpha[own].sum() > alpha[own, n]
+        and is_irreducible(np.delete(np.delete(alpha, n, 0), n, 1))
+    ]
+    if degrading and not able:
+        raise ScenarioError(
+            "no master can be lost: a site goes on without one only if it follows another one, and if those "
+            "that are left all reach each other (a chain of shares above 0 from each to each)",
+            path=f"sites.{degrading[0]}.on_stale.on_lost",
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
-from ...core.site_setup import Scheme
+from ...core.site_setup import Scheme, StaleAction
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario.imported_law import ImportedLaw
@@ -194,8 +194,9 @@ def _add_parts(energy: Array) -> Array:
 
 def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     part = log[name]
-    glides = log.scenario.sites[name].on_stale.action == "glide"
-    own = part.layout.life_memory(len(part.peers)) if glides else part.layout.shared + 1
+    rule = log.scenario.sites[name].on_stale.rule
+    life = part.layout.life_memory(len(part.peers), degrades=rule.degrades)
+    own = life if rule.action is StaleAction.GLIDE else part.layout.shared + 1
     mem = np.array([row[own:] for row in part.mem[:count]]).reshape(count, -1)
     memory, first = {}, 0
     for attribute in getattr(law, "remembers", ()):

@@ -15,6 +15,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import STOPPED_MODES, Bools, find_unlimited
+from ..dominance_history import list_losses
 from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
 from ..timeline import find_mode_intervals, recorded_end_s
@@ -110,7 +111,9 @@ def _check_dominance(log: Log, energies: Mapping[str, SiteEnergy]) -> Premise:
     names, alpha = log.scenario.names, log.scenario.alpha
     changing = [site for site, energy in energies.items() if not energy.motion.dominance.constant]
     if changing:
-        return Premise("shares", False, f"the shares of {_list(changing)} change")
+        lost = list_losses(log)
+        why = f": {_list(lost)}; those that are left follow each other" if lost else ""
+        return Premise("shares", False, f"the shares of {_list(changing)} change{why}")
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(alpha, Kd)
     if len(weights.groups) > 1:

@@ -56,6 +56,8 @@ class RunningEnergy:
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
         law = check_scenario_premises(scenario)[0]
         self.reason = "" if law.holds else law.text
+        if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
+            self.reason = self.reason or "shares change when a peer is lost: trilat certify tells V"
         self._scenario, self._windows = scenario, windows
         plans = {site: list_scripted_ramps(scenario, site) for site in windows}
         self._start = {site: start for site, (start, _) in plans.items()}

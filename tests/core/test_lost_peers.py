@@ -1,0 +1,112 @@
+"""`on_lost = "degrade"`: a lost master's share goes to the others, and comes back with it."""
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.core.test_safeguards import reasons
+from tests.virtual_runs import sampled, trajectories
+from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.dominance_history import list_losses, trace_dominance
+from trilat_net.core.lost_peers import BACK_NS
+from trilat_net.core.ticks import LifeReason
+from trilat_net.errors import ScenarioError
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, load_scenario
+
+RULE = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "on_stale.align_limit_rad": 2.0}
+
+
+def scenario(*cuts: str, **more: Any) -> Scenario:
+    """The paper's, with a delay of 100 ms; links that are cut lose what is stamped from 3 s to 4 s."""
+    outages = {f"links.{cut}.outages_s": [[3.0, 4.0]] for cut in cuts}
+    return load_scenario("paper", {**RULE, "duration_s": 6.0, "link.delay_ms": 100.0, **outages, **more})
+
+
+@functools.cache
+def master_lost() -> Log:
+    """m1 is not heard by anybody for a second."""
+    return trilat_net.simulate(scenario("m1->s", "m1->m2"))
+
+
+def test_what_a_lost_master_had_goes_to_the_others_and_comes_back_with_it() -> None:
+    """The last sample of before comes into use at 3.099 s, the first of after at 4.1 s."""
+    log = master_lost()
+    part, other = log["s"], log["m2"]
+    found = reasons(log, "s")[-4:]
+    assert found == [
+        ("return", LifeReason.DROPPED),
+        ("run", LifeReason.ALIGNED),
+        ("return", LifeReason.RESTORED),
+        ("run", LifeReason.ALIGNED),
+    ]
+    starts = np.flatnonzero((part.mode[1:] == "return") & (part.mode[:-1] == "run")) + 1
+    assert starts.tolist() == [3120, 4100 + BACK_NS // 1_000_000]
+    assert (part.q_des[3500:4350] == other.q[3400:4250]).all()  # m2 alone
+    shares = trace_dominance(log, "s", part.t_s).alpha
+    assert np.abs(shares.sum(axis=1) - 1.0).max() == 0.0
+    assert (shares[3500] == [0.0, 1.0]).all()
+    assert (shares[-1] == shares[0]).all()
+    assert "hold" not in {mode for site in log.sites for mode in log[site].mode}
+    assert set(log["m1"].mode[400:]) == {"run"}  # it hears everybody
+
+
+def test_the_reference_does_not_jump_when_a_master_is_lost_and_back() -> None:
+    part, h_s = master_lost()["s"], 1e-3
+    stale = slice(3099, 3120)  # what is in use stays meanwhile, and so does its rate
+    steps = np.diff(part.q_des, axis=0) - 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
+    steps[stale] = 0.0
+    assert np.abs(steps).max() <= 1e-6
+    assert np.abs(np.diff(part.qd_des, axis=0)).max() <= 0.03
+
+
+def test_it_is_executed_again_and_its_energies_close() -> None:
+    log = master_lost()
+    assert verify(log).identical == 18_000
+    assert compare_with_virtual(log).fed.identical == 18_000
+    plan = scenario("m1->s", "m1->m2")
+    ticks, fused = trajectories(plan), sampled(plan, (6.0,))[:, 0]
+    columns = plan.layout("s").columns()
+    for site, row in zip(ticks.sites.values(), fused, strict=True):
+        assert all((getattr(site, name)[-1] == row[columns[name]]).all() for name in ("q", "tau", "q_des"))
+    balance = compute_energy_balance(compute_site_energies(log))
+    assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
+    assert list_losses(log) == ["m2 without m1 3.12 to 4.35 s", "s without m1 3.12 to 4.35 s"]
+    (premise,) = (one for one in trilat_net.certify(log).premises if one.name == "shares")
+    assert "s without m1 3.12 to 4.35 s; those that are left follow each other" in premise.text
+
+
+def test_the_last_that_is_followed_and_a_slave_are_waited_for() -> None:
+    for cuts in (("m1->s", "m2->s"), ("s->m1", "s->m2")):
+        log = trilat_net.simulate(scenario(*cuts, duration_s=5.0))
+        for site in {cut.partition(">")[2] for cut in cuts}:
+            held = log[site].mode == "hold"
+            assert held[3120:4100].all()
+            assert log[site].mode[-1] == "run"
+        assert list_losses(log) == []
+
+
+def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
+    """m2 follows m1 alone: without m1 it follows nobody, and s would be led by an arm that stands still."""
+    chain = {"dominance.m2": {"m1": 1.0}, "dominance.m1": {"m2": 0.5, "s": 0.5}}
+    log = trilat_net.simulate(scenario("m1->s", duration_s=5.0, **chain))
+    assert (log["s"].mode[3120:4100] == "hold").all()
+    assert list_losses(log) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "words"),
+    [
+        ("two_sites", RULE, "no master can be lost"),
+        ("paper", {"on_stale.on_lost": "degrade"}, "is of on_stale.action = 'glide' alone"),
+        ("paper", {**RULE, "on_stale.on_lost": "drop"}, "'hold' or 'degrade'"),
+    ],
+)
+def test_a_rule_that_cannot_be_kept_is_refused(name: str, overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(name, overrides)
