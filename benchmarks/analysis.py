@@ -38,7 +38,7 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics
 lap("start")
 log = open_log(sys.argv[1])
 lap("opening")
-metrics_to_json(log, compute_log_metrics(log))
+metrics_to_json(compute_log_metrics(log))
 lap("metrics")
 certify(log)
 lap("certificate")

@@ -179,7 +179,7 @@ def test_strange_arrivals_end_nothing(change: object) -> None:
 
 
 def test_facts_are_plain_and_name_their_units() -> None:
-    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_json()
+    facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_dict()
     assert facts["mode"] == "open loop"
     assert facts["changes"] == [{"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}]
     site = facts["sites"]["s"]

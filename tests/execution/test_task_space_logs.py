@@ -83,6 +83,6 @@ def test_a_wall_is_felt_at_the_end_effector_as_shares_say() -> None:
     assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)
     assert pair.pushed_nm == pytest.approx(-log["s"].wrench[-500:, 0].mean(), rel=1e-2)
     assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(-pair.pushed_nm, rel=1e-2)
-    entry = next(one for one in metrics_to_json(log, metrics)["force_sharing"] if one["axis"] == "x")
+    entry = next(one for one in metrics_to_json(metrics)["force_sharing"] if one["axis"] == "x")
     assert entry["felt_n"] == pair.felt_nm
     assert "felt_nm" not in entry

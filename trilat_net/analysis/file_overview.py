@@ -6,6 +6,7 @@ the overview then holds the reason. Gaps are counted only on channels with conse
 
 from array import array
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ..log.log_reader import open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
 from ..net import topics
 from ..net.message_numbers import ticks_per_stats
+from ..results import Result
 from .health import describe_link_health, describe_session, describe_site_health, percentiles
 from .json_values import JsonObject
 
@@ -135,6 +137,26 @@ def _numbers(
     gaps = [[int(there[n] - steps[n] + 1), int(there[n] - 1)] for n in before]
     missing = int(there[-1]) + 1 - len(there) if len(there) else 0
     return {"missing": missing, "gaps": gaps, "duplicates": duplicates}
+
+
+@dataclass(frozen=True, repr=False)
+class FileOverview(Result):
+    """What a file, or the parts of one log, hold; see `describe_files`."""
+
+    facts: JsonObject
+
+    def headline(self) -> str:
+        """Returns which files, and how many messages."""
+        messages = sum(channel["messages"] for channel in self.facts["channels"].values())
+        return f"{', '.join(file['path'] for file in self.facts['files'])}: {messages} messages"
+
+    def to_dict(self) -> JsonObject:
+        """Returns plain values, with the keys of `trilat log info --json`."""
+        return self.facts
+
+    def rows(self) -> list[JsonObject]:
+        """Returns a row per channel."""
+        return [{"topic": topic, **channel} for topic, channel in self.facts["channels"].items()]
 
 
 def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:

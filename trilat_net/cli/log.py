@@ -1,38 +1,24 @@
 """`trilat log`: info, check, sign, recover, export, view. None of them executes the log."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from ..reporting import terminal_output as terminal
-from ..reporting.overview_tables import print_overview
-from ..reporting.text_table import TextTable
 from . import options
 
-if TYPE_CHECKING:
-    from ..log.recover import Recovery
-    from ..log.session_check import LogCheckResult
-
-
-_MAX_PLACES = 10
-"""Places of a failed check that are printed; the JSON has all."""
-_MAX_LOSSES = 10
-"""Losses that are printed."""
 _LOSSY_EXIT_CODE = 3
 
 
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
-    from ..analysis.file_overview import describe_files
+    from ..analysis.file_overview import FileOverview, describe_files
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts = describe_files(files, progress)
-    if as_json:
-        terminal.print_json(facts)
-        return
-    print_overview(facts)
-    for path in files:
+    terminal.print_result(FileOverview(facts), as_json=as_json)
+    for path in () if as_json else files:
         terminal.warn_if_unfinished(path)
 
 
@@ -57,32 +43,14 @@ def log_check_command(
 
         with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
             found.findings.append(check_signatures(files, key, progress))
-    if as_json:
-        checks = [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in found.findings]
-        facts = {"files": [str(path) for path in files], "kind": "trilat" if found.ours else "mcap"}
-        terminal.print_json({**facts, "sound": found.passed, "checks": checks})
-    else:
-        _print_check(files, found)
+    terminal.print_result(found, as_json=as_json)
+    if not as_json:
+        if not found.ours:
+            terminal.print_note("this is no log of trilat-net: only its structure was checked")
+        for path in files:
+            terminal.warn_if_unfinished(path)
     if not found.passed:
         raise typer.Exit(1)
-
-
-def _print_check(files: list[Path], found: "LogCheckResult") -> None:
-    for finding in found.findings:
-        terminal.print_check(finding.passed, f"{finding.check:<9}  {finding.text}")
-        if finding.wrong == 1 and str(finding.places[0]) in finding.text:
-            continue
-        for place in finding.places[:_MAX_PLACES]:
-            where = f"{place.file}: " if len(files) > 1 and place.file else ""
-            terminal.print_text(f"       {where}{place}")
-        if finding.wrong > _MAX_PLACES:
-            terminal.out.print(
-                f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}"
-            )
-    if not found.ours:
-        terminal.print_note("this is no log of trilat-net: only its structure was checked")
-    for path in files:
-        terminal.warn_if_unfinished(path)
 
 
 def log_sign_command(
@@ -124,49 +92,9 @@ def log_recover_command(
 
     with terminal.progress_bar(f"reading {file}") as progress:
         result = recover_log(file, output, force=force, progress=progress)
-    if as_json:
-        terminal.print_json(_recovery_json(result))
-    else:
-        _print_recovery(result)
+    terminal.print_result(result, as_json=as_json)
     if not result.lossless:
         raise typer.Exit(_LOSSY_EXIT_CODE)
-
-
-def _recovery_json(result: "Recovery") -> dict[str, object]:
-    return {
-        "file": str(result.path),
-        "output": str(result.output),
-        "finished": result.finished,
-        "lossless": result.lossless,
-        "messages": result.messages,
-        "records": result.coverage.judged,
-        "duration_s": result.duration_s,
-        "salvaged_messages": result.salvaged,
-        "lost_bytes": result.lost_bytes,
-        "lost": result.lost,
-        "missing": result.missing,
-        "coverage": {
-            site: {"records": there, "ticks": ticks}
-            for site, (there, ticks) in result.coverage.to_json().items()
-        },
-        "digest_chain": str(result.chain) or None,
-    }
-
-
-def _print_recovery(result: "Recovery") -> None:
-    how = "was finished" if result.finished else "was not finished"
-    terminal.print_text(f"{result.output}: made of {result.path}, which {how}")
-    rows = []
-    if there := result.coverage.judged:
-        rows.append(("records", ", ".join(f"{site} {count}" for site, count in there.items())))
-        rows.append(("of the run", str(result.coverage)))
-        rows.append(("source", f"digest chain {result.chain}"))
-    rows.append(("messages", f"{result.messages} in {result.duration_s:.3f} s"))
-    for name, lines in (("lost", result.lost), ("missing", result.missing)):
-        rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]
-        if len(lines) > _MAX_LOSSES:
-            rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
-    terminal.print_table(TextTable(("", ""), [(f"  {name}", text) for name, text in rows]))
 
 
 _FORMATS = ("ros2", "parquet", "csv", "npz", "mat")

@@ -16,6 +16,7 @@ def report_command(
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Writes the figures, the page and the summary of a log."""
     from ..files import make_results_folder
@@ -26,6 +27,6 @@ def report_command(
     results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
     with terminal.progress_bar("drawing") as progress:
         conclusion = conclude(log, results, progress, min_coverage=min_coverage)
-    terminal.print_conclusion(conclusion)
+    terminal.print_result(conclusion, as_json=as_json)
     if not conclusion.passed:
         raise typer.Exit(1)

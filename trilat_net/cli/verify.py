@@ -23,21 +23,11 @@ def verify_command(
     differs, was changed, or is missing. 2: no log.
     """
     from ..execution.log_checks import run_log_checks
-    from ..reporting.summary_text import format_run_lines
 
     log = terminal.open_with_progress(*files)
     terminal.warn_user_laws(log)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
         result = run_log_checks(log, virtual=virtual, progress=progress, min_coverage=min_coverage)
-    if as_json:
-        terminal.print_json({"files": [str(file) for file in files], **result.to_json()})
-    else:
-        for line in result.lines:
-            text = terminal.sanitize(f"{line.label}: {line.text}", 4000)
-            (terminal.out if line.passed else terminal.err).print(text, markup=False, soft_wrap=True)
+    terminal.print_result(result, as_json=as_json)
     if not result.passed:
         raise typer.Exit(1)
-    if as_json:
-        return
-    for note in format_run_lines(log):
-        terminal.print_text(note)

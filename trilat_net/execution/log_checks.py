@@ -5,12 +5,14 @@ Invariant: every claim rests on an execution made just now.
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ..errors import ScenarioError
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
+from ..results import Result
 from .verify import VerifyResult, find_user_laws, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
@@ -27,21 +29,38 @@ MAX_GAPS_NAMED = 60
 """Gaps that a line names."""
 
 
-class LogCheckReport(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class LogCheckReport(Result):
     """The result of executing a log again, and a line for that and for every other check."""
 
+    log: Log
     result: VerifyResult
     lines: list[CheckLine]
+
+    @property
+    def records(self) -> int:
+        """How many records were executed again."""
+        return self.result.records
+
+    @property
+    def identical(self) -> int:
+        """How many of them agree in every computed field."""
+        return self.result.identical
 
     @property
     def passed(self) -> bool:
         """True if the log is as it was made, enough of it was judged, and every execution agreed with it."""
         return all(line.passed for line in self.lines)
 
-    def to_json(self) -> dict[str, Any]:
-        """Returns the report for a program: every gap, and the first difference with both values."""
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns a row per check."""
+        return [line._asdict() for line in self.lines]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat verify --json`: every gap, the first difference."""
         result, first = self.result, self.result.first
         return {
+            "files": list(self.log.sources),
             "passed": self.passed,
             "whole_run": result.whole_run,
             "records": result.records,
@@ -57,7 +76,7 @@ class LogCheckReport(NamedTuple):
             "first_difference": None
             if first is None
             else {**first._asdict(), "logged": repr(first.logged), "computed": repr(first.computed)},
-            "checks": [line._asdict() for line in self.lines],
+            "checks": self.rows(),
         }
 
 
@@ -73,7 +92,7 @@ def run_log_checks(
         ScenarioError: the file of a user law does not exist.
     """
     result = verify(log, progress, min_coverage=min_coverage)
-    return LogCheckReport(result, list(_checks(log, result, virtual=virtual, progress=progress)))
+    return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 
 def check_log_files(sources: Sequence[str], min_coverage: float = MIN_COVERAGE) -> list[CheckLine]:

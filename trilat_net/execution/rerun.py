@@ -35,6 +35,7 @@ from ..log.ros2.viz_channels import VIZ_HZ
 from ..log.site_log import SiteLog
 from ..net.messages import READABLE, State
 from ..net.wire import decode
+from ..results import Result
 from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
@@ -173,11 +174,8 @@ def _compare_links(
     return found
 
 
-_REPR_LENGTH = 120
-
-
 @dataclass(frozen=True, repr=False)
-class Rerun:
+class Rerun(Result):
     """A log and its rerun: every executed tick, and the effects per executed site and per link to it."""
 
     before: Log
@@ -186,10 +184,11 @@ class Rerun:
     sites: dict[str, SiteEffect]
     links: dict[str, LinkEffect]
 
-    def __repr__(self) -> str:
+    def headline(self) -> str:
+        """Returns what was executed with which changes, in one line."""
         changed = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
-        words = f"{self.request.mode}, {', '.join(self.request.replaced)} executed, {changed}"
-        return f"<Rerun of {self.before.source}: {words[:_REPR_LENGTH]}>"
+        executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
+        return f"{self.before.source}: {executed}, {changed}"
 
     @cached_property
     def after(self) -> Log:
@@ -260,8 +259,12 @@ class Rerun:
         """Limits of the answer, a sentence each."""
         return list(_describe_limits(self))
 
-    def to_json(self) -> dict[str, Any]:
-        """Returns all results, ready for JSON; keys end in their unit."""
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns a row per executed site."""
+        return list(self.to_dict()["sites"].values())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat rerun --json`; they end in their unit."""
         return {
             "log": self.before.source,
             "mode": self.request.mode,

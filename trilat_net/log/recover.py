@@ -21,6 +21,7 @@ from mcap.opcode import Opcode
 from ..errors import LogError, NothingSaved, UsageError
 from ..files import open_regular
 from ..net import topics
+from ..results import Result
 from .accounting import Coverage, open_session_accounts, parse_counts
 from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
@@ -60,8 +61,8 @@ _MADE_AGAIN = frozenset(
 """What a finished file has besides its content: nothing is lost with it."""
 
 
-@dataclass
-class Recovery:
+@dataclass(repr=False)
+class Recovery(Result):
     """Result of a recovery.
 
     Attributes:
@@ -92,6 +93,27 @@ class Recovery:
     def lossless(self) -> bool:
         """True if all that was in the file is in the new one."""
         return not self.lost
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat log recover --json`."""
+        return {
+            "file": str(self.path),
+            "output": str(self.output),
+            "finished": self.finished,
+            "lossless": self.lossless,
+            "messages": self.messages,
+            "records": self.coverage.judged,
+            "duration_s": self.duration_s,
+            "salvaged_messages": self.salvaged,
+            "lost_bytes": self.lost_bytes,
+            "lost": self.lost,
+            "missing": self.missing,
+            "coverage": {
+                site: {"records": there, "ticks": ticks}
+                for site, (there, ticks) in self.coverage.to_json().items()
+            },
+            "digest_chain": str(self.chain) or None,
+        }
 
     def lose(self, what: str, size: int = 0) -> None:
         """Adds a loss of so many bytes."""

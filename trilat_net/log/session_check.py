@@ -10,6 +10,7 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -30,6 +31,7 @@ from ..net.messages import (
     json_schema,
 )
 from ..net.wire import decode
+from ..results import Result
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
 from .accounting import LAST, Account, parse_counts
@@ -51,14 +53,17 @@ _ACCOUNTS_SINCE = 3
 """First version whose logs have an account of every channel."""
 
 
-class LogCheckResult(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class LogCheckResult(Result):
     """Result of a check of files.
 
     Attributes:
+        files: their names.
         findings: one per check.
         ours: True if they are a trilat-net log; else only their bytes were checked.
     """
 
+    files: list[str]
     findings: list[CheckFinding]
     ours: bool
 
@@ -66,6 +71,15 @@ class LogCheckResult(NamedTuple):
     def passed(self) -> bool:
         """True if every check passed."""
         return all(finding.passed for finding in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat log check --json`."""
+        kind = "trilat" if self.ours else "mcap"
+        return {"files": self.files, "kind": kind, "sound": self.passed, "checks": self.rows()}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns a row per check."""
+        return [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in self.findings]
 
 
 def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogCheckResult:
@@ -88,7 +102,9 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    return LogCheckResult([*files.findings(), *session.findings()], session.ours)
+    return LogCheckResult(
+        [str(path) for path in paths], [*files.findings(), *session.findings()], session.ours
+    )
 
 
 class MessageIdentity(NamedTuple):

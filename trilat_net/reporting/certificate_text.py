@@ -3,6 +3,7 @@
 Invariant: both show the same sentences; the verdict comes first, and the listed energies add up.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.observed_energy import ObservedFinding
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.run_end import Stability
+from .result_text import Block, MarkedText
+from .text_table import TextTable
 
 MIN_ENERGY_SHARE = 1e-6
 """Smaller shares of the largest energy are not listed."""
@@ -21,6 +24,35 @@ _SOURCE_NAMES = {
     "shares": "change of shares",
     "estimates": "box, or wrong estimates",
 }
+
+
+_HOLDS = {True: "holds", False: "fails", None: "not told"}
+_MARKS = {
+    "ok": "[green]ok  [/green]",
+    "FAIL": "[red]FAIL[/red]",
+    "open": "[yellow]open[/yellow]",
+    "note": "note",
+}
+
+
+def compose_certificate(found: Certificate) -> Iterator[Block]:
+    """Yields the judgement with what it rests on, the premises, and the energies."""
+    for line in describe_certificate(found):
+        yield MarkedText(_MARKS[line.mark], line.text)
+    observed = found.observed
+    premises = [*found.premises, *(() if observed is None else observed.premises)]
+    rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
+    yield ""
+    yield TextTable(("premise", "", "found"), rows, styles={"holds": "green", "fails": "yellow"})
+    if observed is not None and observed.least:
+        least = [(name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least]
+        yield ""
+        yield TextTable(("energy of the laws", "least J", "at s"), least, align="lrr")
+    if found.balance is None:
+        return
+    energies = [(name, f"{amount:.4g}") for name, amount in list_energies(found.balance)]
+    yield ""
+    yield TextTable(("energy", "J"), energies, align="lr")
 
 
 class CertificateLine(NamedTuple):

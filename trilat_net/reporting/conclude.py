@@ -5,8 +5,9 @@ Invariant: every claim rests on an execution made just now, in another process w
 
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,16 @@ from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
+from ..results import Result
 from ..theory.end_pose import certify_with_roots
 from .certificate_text import describe_judgement
+from .result_text import Block, MarkedText
 from .summary_text import format_run_lines
 from .text_table import TextTable
 
 
-class Conclusion(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class Conclusion(Result):
     """A finished run with its checks: a row per site, lines on links, changes, modes, clocks and certificate.
 
     `paths` are the log's files, and those that were written.
@@ -39,6 +43,30 @@ class Conclusion(NamedTuple):
     def passed(self) -> bool:
         """True if every check passed."""
         return all(line.passed for line in self.lines)
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text."""
+        yield self.table
+        yield from self.notes
+        for line in self.lines:
+            mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
+            yield MarkedText(mark, f"{line.label}: {line.text}")
+        yield from (f"  {path}" for path in self.paths)
+
+    def headline(self) -> str:
+        """Returns whether every check passed, and where the page is."""
+        page = next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
+        return f"{'passed' if self.passed else 'FAILED'}; {page}"
+
+    def rows(self) -> list[dict[str, str]]:
+        """Returns a row per site."""
+        return [dict(zip(self.table.headers, row, strict=False)) for row in self.table.rows]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat report --json`."""
+        checks = [line._asdict() for line in self.lines]
+        paths = [str(path) for path in self.paths]
+        return {"passed": self.passed, "notes": self.notes, "checks": checks, "paths": paths}
 
 
 def conclude(

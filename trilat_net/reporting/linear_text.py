@@ -10,7 +10,36 @@ import numpy as np
 
 from ..core.vectors import Array
 from ..theory.linear_analysis import LinearAnalysis
+from ..theory.linear_edge import EdgeScan
+from .port_text import describe_ports
+from .result_text import Block, MarkedText
 from .text_table import TextTable
+
+_COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
+
+
+def compose_linear(found: LinearAnalysis) -> Iterator[Block]:
+    """Yields equilibrium, delays, roots, verdict, margin and notes, then the ports, then the edges."""
+    yield from (*describe_equilibrium(found), *describe_effective_delays(found), "")
+    yield tabulate_roots(found)
+    yield describe_zero_roots(found)
+    verdict, _, rest = describe_linear_verdict(found).partition(": ")
+    yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
+    yield describe_delay_margin(found)
+    yield from (f"note: {note}" for note in found.notes)
+    if found.ports is not None:
+        yield from describe_ports(found.ports)
+    yield from (_describe_scan(scan, found.scenario.name) for scan in found.scans)
+
+
+def _describe_scan(scan: EdgeScan, name: str) -> str:
+    edges = [
+        f"{'stable' if one.stable_above else 'unstable'} from {one.value:.6g} on "
+        f"({one.omega_rad_s:.4g} rad/s)"
+        for one in scan.edges
+    ]
+    found = ", ".join(edges) or f"stability of {name} does not change"
+    return f"{scan.key} from {scan.low:g} to {scan.high:g}: {found}"
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:

@@ -1,15 +1,15 @@
-"""Prints the contents of a log: session, missing records, sites, links, channels, accounts, files.
+"""The contents of a log as text: session, missing records, sites, links, channels, accounts, files.
 
-Invariant: text from the file passes `sanitize` before it reaches a terminal.
+Invariant: text from the file passes `sanitize`.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from rich.markup import escape
-
+from ..analysis.file_overview import FileOverview
 from ..analysis.json_values import JsonObject
-from .terminal_output import out, print_table, print_text, sanitize
+from .result_text import Block, MarkedText
+from .terminal_output import sanitize
 from .text_table import TextTable
 
 _MOST_GAPS = 4
@@ -17,43 +17,44 @@ _VIEWS = "/viz/"
 _TROUBLE = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
 
 
-def print_overview(facts: JsonObject) -> None:
-    """Prints the facts of `analysis.file_overview`."""
+def compose_overview(found: FileOverview) -> Iterator[Block]:
+    """Yields what a file holds."""
+    facts = found.facts
     session: JsonObject | None = facts["session"]
     if session is not None:
-        _print_session(facts, session)
-        _print_sites(facts["sites"])
-        _print_links(facts["links"])
+        yield from _compose_session(facts, session)
+        yield from _compose_sites(facts["sites"])
+        yield from _compose_links(facts["links"])
     elif facts["problem"]:
-        out.print(f"[red]cannot be opened:[/red] {escape(sanitize(facts['problem']))}", soft_wrap=True)
+        yield MarkedText("[red]cannot be opened:[/red]", sanitize(facts["problem"]))
     channels: dict[str, JsonObject] = facts["channels"]
     views = {topic: channel for topic, channel in channels.items() if topic.startswith(_VIEWS)}
     own = {topic: channel for topic, channel in channels.items() if topic not in views}
-    _print_channels(own, session)
+    yield from _compose_channels(own, session)
     if views:
         rows = [(topic, *_counts(v), v["schema"].rpartition("/")[2]) for topic, v in views.items()]
-        _print_table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
+        yield from _table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
     if session is not None:
-        _print_accounts(session)
-        _print_origin(session)
+        yield from _compose_accounts(session)
+        yield from _compose_origin(session)
     for file in facts["files"]:
-        _print_file(file)
+        yield from _compose_file(file)
 
 
-def _print_rows(*rows: tuple[str, str]) -> None:
+def _rows(*rows: tuple[str, str]) -> Iterator[Block]:
     for head, text in rows:
         if text:
-            out.print(f"[bold]{head:<9}[/bold] {escape(sanitize(text))}", soft_wrap=True)
+            yield MarkedText(f"[bold]{head:<9}[/bold]", sanitize(text))
 
 
-def _print_table(headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> None:
-    """Prints a table; its first columns hold words, the others numbers."""
+def _table(headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> Iterator[Block]:
+    """Yields an empty line and a table; its first columns hold words, the others numbers."""
     cells = [["-" if value is None else str(value) for value in row] for row in rows]
-    out.print()
-    print_table(TextTable(headers, cells, "l" * words + "r"))
+    yield ""
+    yield TextTable(headers, cells, "l" * words + "r")
 
 
-def _print_session(facts: JsonObject, session: JsonObject) -> None:
+def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
     scenario: JsonObject = session["scenario"]
     sites: dict[str, JsonObject] = facts["sites"]
     missing = sum(site["missing"] for site in sites.values())
@@ -64,7 +65,7 @@ def _print_session(facts: JsonObject, session: JsonObject) -> None:
     damaged = sum(len(file["damaged"]) for file in facts["files"])
     places = f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""
     title = f": {scenario['title']}" if scenario["title"] else ""
-    _print_rows(
+    yield from _rows(
         ("session", f"{session['session']}, {session['driver']}{began}"),
         ("scenario", scenario["name"] + title),
         ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
@@ -73,19 +74,19 @@ def _print_session(facts: JsonObject, session: JsonObject) -> None:
     )
 
 
-def _print_sites(sites: dict[str, JsonObject]) -> None:
+def _compose_sites(sites: dict[str, JsonObject]) -> Iterator[Block]:
     rows = []
     for name, site in sites.items():
         ticks = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
         of = (site["records"], ticks, site["missing"], site["overruns"])
         rows.append((name, site["role"], site["rate_hz"], *of))
-    _print_table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
+    yield from _table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
     if any(site["late_us"] for site in sites.values()):
         loops = [(name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()]
-        _print_table(("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops)
+        yield from _table(("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops)
 
 
-def _print_links(links: dict[str, JsonObject]) -> None:
+def _compose_links(links: dict[str, JsonObject]) -> Iterator[Block]:
     measured = any(link["one_way_ms"] for link in links.values())
     clocks = any(link["clock_bound_us"] for link in links.values())
     headers = ["link", "age ms p50", "p99", "max"]
@@ -97,10 +98,10 @@ def _print_links(links: dict[str, JsonObject]) -> None:
         row += _three(link["one_way_ms"]) if measured else []
         row += [link["clock_offset_us"], link["clock_bound_us"]] if clocks else []
         rows.append([*row, link["late"], link["lost"], link["duplicate"]])
-    _print_table([*headers, "late", "lost", "twice"], rows)
+    yield from _table([*headers, "late", "lost", "twice"], rows)
 
 
-def _print_channels(channels: dict[str, JsonObject], session: JsonObject | None) -> None:
+def _compose_channels(channels: dict[str, JsonObject], session: JsonObject | None) -> Iterator[Block]:
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
@@ -108,35 +109,37 @@ def _print_channels(channels: dict[str, JsonObject], session: JsonObject | None)
     for topic, channel in channels.items():
         name = topic.removeprefix(prefix) or "(none)"
         rows.append((name, *_counts(channel), channel["missing"], *_three(channel["between_ms"])))
-    _print_table(("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows)
+    yield from _table(
+        ("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows
+    )
     for topic, channel in channels.items():
         if gaps := channel["gaps"]:
             words = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in gaps[:_MOST_GAPS])
             more = f" and {len(gaps) - _MOST_GAPS} more ranges" if len(gaps) > _MOST_GAPS else ""
-            print_text(f"{topic.removeprefix(prefix)} lacks {words}{more}")
+            yield f"{topic.removeprefix(prefix)} lacks {words}{more}"
 
 
-def _print_accounts(session: JsonObject) -> None:
+def _compose_accounts(session: JsonObject) -> Iterator[Block]:
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
-    out.print()
+    yield ""
     if not accounts:
-        out.print("no accounts: the recording did not come to its end")
+        yield "no accounts: the recording did not come to its end"
         return
     faulty = {topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic}
     if len(accounts) > len(faulty):
-        out.print(f"the recorder accounts for {len(accounts) - len(faulty)} channels without a fault")
+        yield f"the recorder accounts for {len(accounts) - len(faulty)} channels without a fault"
     for topic, text in faulty.items():
-        print_text(f"{topic.removeprefix(prefix)}: {sanitize(text)}")
+        yield f"{topic.removeprefix(prefix)}: {sanitize(text)}"
 
 
-def _print_origin(session: JsonObject) -> None:
+def _compose_origin(session: JsonObject) -> Iterator[Block]:
     versions: dict[str, str] = session["versions"]
     dirty = {"true": " with changes", "false": ""}.get(session["commit_dirty"] or "", " (changes unknown)")
     version = versions.get("trilat-net", "unknown")
     others = ", ".join(f"{name} {version}" for name, version in versions.items() if name != "trilat-net")
-    out.print()
-    _print_rows(
+    yield ""
+    yield from _rows(
         ("made by", f"trilat-net {version}, commit {(session['commit'] or 'unknown')[:12]}{dirty}"),
         ("on", f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}"),
         ("with", others),
@@ -144,15 +147,15 @@ def _print_origin(session: JsonObject) -> None:
     )
 
 
-def _print_file(file: JsonObject) -> None:
+def _compose_file(file: JsonObject) -> Iterator[Block]:
     chunks = ", ".join(f"{count} chunks {name}" for name, count in file["compression"].items()) or "no chunks"
     ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
     end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
     part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
     size = _size(file["size_bytes"])
-    _print_rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
+    yield from _rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
     for damage in file["damaged"][:_MOST_GAPS]:
-        _print_rows(("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}"))
+        yield from _rows(("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}"))
 
 
 def _counts(channel: JsonObject) -> tuple[int, str | None, str]:

@@ -9,7 +9,7 @@ nothing of the bar; it calls a function with (done, total). Imports only Rich at
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
+    from ..results import Result
     from .conclude import Conclusion
     from .text_table import TextTable
 
@@ -105,20 +106,31 @@ def print_line(text: str) -> None:
     sys.stdout.flush()
 
 
-def print_table(table: "TextTable", styles: Mapping[str, str] | None = None) -> None:
-    """Prints a table; cells with a text of `styles` in that style."""
+def print_table(table: "TextTable") -> None:
+    """Prints a table."""
     wide = TextConsole(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
-    (out if out.is_terminal else wide).print(table.rich(styles or {}))
+    (out if out.is_terminal else wide).print(table.rich())
 
 
-def print_conclusion(conclusion: "Conclusion") -> None:
-    """Prints the report of a finished run."""
-    print_table(conclusion.table)
-    for note in conclusion.notes:
-        print_text(note)
-    for line in conclusion.lines:
-        print_check(line.passed, f"{line.label}: {line.text}")
-    print_paths(conclusion.paths)
+def print_result(found: "Result", *, as_json: bool = False) -> None:
+    """Prints a result: its text, or its values as JSON."""
+    if as_json:
+        print_json(found.to_dict())
+        return
+    from .result_text import compose
+    from .text_table import TextTable
+
+    for block in compose(found):
+        if isinstance(block, TextTable):
+            print_table(block)
+        elif isinstance(block, str):
+            print_text(block)
+        elif block.mark:
+            print_marked(block.mark, block.text)
+        else:
+            (err if block.failed else out).print(
+                sanitize(block.text, _MAX_LETTERS), markup=False, soft_wrap=True
+            )
 
 
 def conclude_files(paths: Sequence[Path], folder: Path) -> "tuple[Log, Conclusion]":
@@ -129,7 +141,7 @@ def conclude_files(paths: Sequence[Path], folder: Path) -> "tuple[Log, Conclusio
     log = open_with_progress(*paths)
     with progress_bar("executing and drawing") as progress:
         conclusion = conclude(log, folder, progress)
-    print_conclusion(conclusion)
+    print_result(conclusion)
     return log, conclusion
 
 

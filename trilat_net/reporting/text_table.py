@@ -1,9 +1,10 @@
-"""A table of texts, printed on a terminal, as Markdown or as plain lines.
+"""A table of texts, printed on a terminal, as Markdown, as HTML or as plain lines.
 
-Invariant: every cell is text already, and all three forms show the same cells in the same order.
+Invariant: every cell is text already, and all forms show the same cells in the same order.
 """
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,12 +24,14 @@ class TextTable(NamedTuple):
         align: a letter per column, "l" for words and "r" for numbers; the last one holds for all columns
             that follow.
         units: one per column, appended to its header; "" for none. May be shorter than `headers`.
+        styles: on a terminal, styles of cells by their texts, as in {"fails": "yellow"}.
     """
 
     headers: Sequence[str]
     rows: Sequence[Sequence[str]]
     align: str = "l"
     units: Sequence[str] = ()
+    styles: Mapping[str, str] = NO_STYLES
 
     @property
     def titles(self) -> list[str]:
@@ -41,11 +44,8 @@ class TextTable(NamedTuple):
         """Per column, True if its cells are aligned to the right."""
         return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
 
-    def rich(self, styles: Mapping[str, str] = NO_STYLES) -> "Table":
-        """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow.
-
-        Cells that are a text of `styles` get that style, as in {"fails": "yellow"}.
-        """
+    def rich(self) -> "Table":
+        """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow."""
         from rich.table import Table
         from rich.text import Text
 
@@ -56,7 +56,7 @@ class TextTable(NamedTuple):
             table.add_column(Text(sanitize(title)), justify="right" if right else "left", overflow="fold")
         for row in self.rows:
             heading = "bold" if len(row) == 1 < len(self.headers) else ""
-            table.add_row(*(Text(sanitize(cell), style=styles.get(cell, heading)) for cell in row))
+            table.add_row(*(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row))
         return table
 
     def markdown(self) -> str:
@@ -67,6 +67,18 @@ class TextTable(NamedTuple):
         return "\n".join(
             f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in cells
         )
+
+    def html(self) -> str:
+        """Returns it in HTML."""
+        sides = ["right" if right else "left" for right in self.to_the_right]
+
+        def line(cells: Sequence[str], kind: str) -> str:
+            pairs = zip(cells, sides, strict=False)
+            made = (f'<{kind} style="text-align:{side}">{escape(cell)}</{kind}>' for cell, side in pairs)
+            return f"<tr>{''.join(made)}</tr>"
+
+        head = f"<thead>{line(self.titles, 'th')}</thead>" if any(self.titles) else ""
+        return f"<table>{head}<tbody>{''.join(line(row, 'td') for row in self.rows)}</tbody></table>"
 
     def lines(self) -> list[str]:
         """Returns its lines with columns aligned by spaces; the first holds the headers."""

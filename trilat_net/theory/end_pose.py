@@ -6,6 +6,7 @@ records have. Nothing is executed.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -38,7 +39,7 @@ def certify_with_roots(
         LogError: a record cannot be read, or names a change that is none.
     """
     found = certify(log, min_coverage=min_coverage, own_laws=own_laws)
-    return found._replace(roots=find_end_pose_roots(log))
+    return replace(found, roots=find_end_pose_roots(log))
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:

@@ -4,8 +4,8 @@ Invariant: the verdict is that of the sampled loop where all sites have one rate
 otherwise. It holds for small motions about the equilibrium only.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,16 @@ import numpy as np
 
 from ..core.vectors import Array
 from ..errors import UsageError
+from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.describe import IRREVERSIBLE_SHARES, describe_law_conditions, lacks_detailed_balance
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
+from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .site_dynamics import share_own_pose
 from .tick_map import compute_sampled_spectrum, find_common_rate_hz
 
@@ -29,8 +32,8 @@ SAMPLED_ROOT_DIFFERENCE = 0.01
 """Continuous and sampled roots that differ by more, relative to abs(s), are both reported."""
 
 
-@dataclass(frozen=True)
-class LinearAnalysis:
+@dataclass(frozen=True, repr=False)
+class LinearAnalysis(Result):
     """The linear analysis of a scenario.
 
     Attributes:
@@ -41,6 +44,8 @@ class LinearAnalysis:
         continuous: roots of the delay-differential equation.
         sampled: roots of the sampled loop; None if the sites have several rates.
         margin: the common delays for which the continuous loop is stable.
+        scans: where stability changes along keys, of `analyse_linearly`.
+        ports: the haptic ports of the operators, likewise; None if nobody asked.
     """
 
     scenario: Scenario
@@ -50,6 +55,8 @@ class LinearAnalysis:
     continuous: Spectrum
     sampled: Spectrum | None
     margin: DelayMargin
+    scans: tuple[EdgeScan, ...] = ()
+    ports: PortAnalysis | None = None
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
@@ -90,6 +97,26 @@ class LinearAnalysis:
             notes.append(IRREVERSIBLE_SHARES)
         return (*notes, *describe_law_conditions(self.scenario))
 
+    def headline(self) -> str:
+        """Returns the verdict in one line."""
+        return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.words}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat linear --json`."""
+        ports = None if self.ports is None else ports_to_json(self.ports)
+        edges = {scan.key: [one._asdict() for one in scan.edges] for scan in self.scans}
+        return {**linear_to_json(self), "ports": ports, "edges": edges}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns a row per root: of the continuous loop, and as computed tick by tick."""
+        spectra = {"continuous": self.continuous, "as computed": self.sampled}
+        return [
+            {"loop": loop, **root, "states": ", ".join(root["states"])}
+            for loop, spectrum in spectra.items()
+            if spectrum is not None
+            for root in _spectrum_to_json(spectrum)["roots"]
+        ]
+
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or less."""
         if self.sampled is None or not self.sampled.roots:
@@ -100,7 +127,7 @@ class LinearAnalysis:
 
 def analyse_linear_loop(
     source: str | Path | Scenario,
-    overrides: Sequence[str] = (),
+    overrides: Mapping[str, Any] | Sequence[str] = (),
     *,
     pose: tuple[float, ...] | None = None,
     roots: int = DEFAULT_ROOTS,
@@ -124,6 +151,38 @@ def analyse_linear_loop(
     near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
     sampled = compute_sampled_spectrum(conditions, rest, near, roots)
     return LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
+
+
+def analyse_linearly(
+    source: str | Path | Scenario,
+    overrides: Mapping[str, Any] | Sequence[str] = (),
+    *,
+    pose: tuple[float, ...] | None = None,
+    roots: int = DEFAULT_ROOTS,
+    over: Sequence[str] = (),
+    ports: bool = True,
+) -> LinearAnalysis:
+    """Returns the linear analysis of a scenario with its ports, and where stability changes along keys.
+
+    Args:
+        source: the name of a shipped scenario, a path, or a scenario.
+        overrides: what is to be changed of it.
+        pose: the joint angles of all sites, rad; None for those at which a run ends.
+        roots: how many roots.
+        over: keys and ranges, as in "control.d=0.1:3".
+        ports: whether to analyse the ports of the operators.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or has no linear loop.
+        UsageError: another argument is not valid.
+    """
+    ranges = [parse_edge_range(text) for text in over]
+    found = analyse_linear_loop(source, overrides, pose=pose, roots=roots)
+    scans = tuple(
+        EdgeScan(key, low, high, tuple(iterate_linear_edges(found.scenario, key, low, high, found.rest)))
+        for key, low, high in ranges
+    )
+    return replace(found, scans=scans, ports=analyse_ports(found.scenario, found.rest) if ports else None)
 
 
 def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:

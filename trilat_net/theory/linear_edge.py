@@ -118,6 +118,31 @@ def find_linear_edge(
     return next(iterate_linear_edges(scenario, key, low, high, rest, points=points, sampled=sampled), None)
 
 
+class EdgeScan(NamedTuple):
+    """The edges along a key from `low` to `high`, by rising value."""
+
+    key: str
+    low: float
+    high: float
+    edges: tuple[LinearEdge, ...]
+
+
+def parse_edge_range(text: str) -> tuple[str, float, float]:
+    """Returns key and ends of a text such as control.d=0.1:3.
+
+    Raises:
+        UsageError: it names none.
+    """
+    key, _, ends = text.partition("=")
+    low, colon, high = ends.partition(":")
+    try:
+        if not key.strip() or not colon:
+            raise ValueError
+        return key.strip(), float(low), float(high)
+    except ValueError:
+        raise UsageError(f"--over reads KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}") from None
+
+
 def iterate_linear_edges(
     scenario: Scenario,
     key: str,

@@ -7,6 +7,7 @@ their unit, and unknown values are null.
 """
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.integrity import MIN_COVERAGE
 from ...log.log_reader import Log
+from ...results import Result
 from ..json_values import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
@@ -115,7 +117,8 @@ class EndPoseRoots(NamedTuple):
     text: str
 
 
-class Certificate(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class Certificate(Result):
     """Stability certificate of a log.
 
     Attributes:
@@ -136,7 +139,7 @@ class Certificate(NamedTuple):
     balance: EnergyBalance | None
     ones: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
-    energies: Mapping[str, SiteEnergy] = MappingProxyType({})
+    energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
     roots: EndPoseRoots | None = None
     observed: ObservedEnergy | None = None
 
@@ -182,6 +185,14 @@ class Certificate(NamedTuple):
     def passed(self) -> bool:
         """Decides the exit code: the run is stable."""
         return self.accepts(())
+
+    def to_dict(self) -> JsonObject:
+        """Returns plain values, with the keys of `trilat certify --json`."""
+        return certificate_to_json(self)
+
+    def rows(self) -> list[JsonObject]:
+        """Returns a row per premise."""
+        return [premise._asdict() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
         """True if the run is stable, or bounded or open where that is accepted.

@@ -7,7 +7,8 @@ of the whole run.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from ...core.task_space import PLACE
 from ...log.log_reader import Log
+from ...results import Result
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..aligned import align_records
@@ -82,10 +84,12 @@ _ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
 """Units along an axis in place of those of a joint."""
 
 
-class LogMetrics(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class LogMetrics(Result):
     """All metrics of a log.
 
     Attributes:
+        log, scenario, driver, complete: the name of its file, and what it says of itself.
         run, sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first of s).
         estimates: per site with records, its parameter estimates.
         static_windows, stiffness: their number, and the stiffness from one of them to the next.
@@ -96,6 +100,10 @@ class LogMetrics(NamedTuple):
         joint_names: names that the files of the arms give their joints, if they agree; else ().
     """
 
+    log: str
+    scenario: str
+    driver: str
+    complete: bool
     run: MetricValues
     sites: dict[str, MetricValues]
     links: dict[str, MetricValues]
@@ -118,6 +126,25 @@ class LogMetrics(NamedTuple):
     def unit(self, of_joint: str, number: int) -> str:
         """Returns the unit of a joint's quantity, or of that along an axis of a place."""
         return _ALONG_AXES.get(of_joint, of_joint) if self.axes and number <= PLACE else of_joint
+
+    def headline(self) -> str:
+        """Returns what was measured, in one line."""
+        known = sum(one.value is not None for _, one in self._each())
+        return f"{self.log}: {known} numbers of {self.scenario}, {', '.join(self.sites)}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat metrics --json`."""
+        return metrics_to_json(self)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns a row per quantity and place."""
+        return [{**row, "value": one.value, "why": one.why} for row, one in self._each() if one.applies]
+
+    def _each(self) -> Iterator[tuple[dict[str, str], Metric]]:
+        for quantity in QUANTITIES:
+            words = {"group": quantity.group, "key": quantity.key, "name": quantity.name}
+            for place, one in self.places(quantity).items():
+                yield {**words, "of": place or "run", "unit": quantity.unit}, one
 
     def places(self, quantity: Quantity) -> dict[str, Metric]:
         """Returns a quantity of every place that has it; of the run by the name ""."""
@@ -165,6 +192,10 @@ def _measure(log: Log) -> LogMetrics:
     loads = static_windows.find_joint_loads(scenario, windows)
     ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
     return LogMetrics(
+        Path(log.source).name,
+        scenario.name,
+        log.driver,
+        log.complete,
         {
             **motion.measure_spread(log, runs),
             **static_windows.measure_force_sharing(absent, windows, ratios),
@@ -240,7 +271,7 @@ METRICS_JSON_VERSION = 1
 """Of this layout: keys may be added under it, none is taken away or changes its meaning."""
 
 
-def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
+def metrics_to_json(metrics: LogMetrics) -> dict[str, Any]:
     """Returns the metrics of a log, ready for JSON."""
     places = {"sites": metrics.sites, "links": metrics.links, "walls": metrics.walls}
     windows = metrics.static_windows.value
@@ -248,10 +279,10 @@ def metrics_to_json(log: Log, metrics: LogMetrics) -> dict[str, Any]:
     metrics_by_path = {"run.": metrics.run, **named, "": {"windows_at_rest": metrics.static_windows}}
     content: dict[str, Any] = {
         "version": METRICS_JSON_VERSION,
-        "log": Path(log.source).name,
-        "scenario": log.scenario.name,
-        "driver": log.driver,
-        "complete": log.complete,
+        "log": metrics.log,
+        "scenario": metrics.scenario,
+        "driver": metrics.driver,
+        "complete": metrics.complete,
         "run": _values(metrics.run),
         **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
         "parameters": {site: estimates.to_json() for site, estimates in metrics.estimates.items()},
