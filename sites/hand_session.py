@@ -34,9 +34,9 @@ def hand(
 ) -> Iterator[Hand]:
     """Takes part in a live session as a hand at one arm; a context, which lets go at its end.
 
-        with trilat_net.hand("play", "m1") as hand:
-            hand.move(1.2, 0.4)
-            hand.force, hand.pose
+    >>> with tn.hand("play", "m1") as hand:  # doctest: +SKIP
+    ...     hand.move(1.2, 0.4)
+    ...     hand.force, hand.pose
 
     Args:
         session: the session's name, by default the scenario's.

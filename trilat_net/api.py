@@ -1,28 +1,403 @@
-"""The Python interface: everything that `import trilat_net` offers.
+"""The Python interface: a function per command, for logs, virtual time and studies.
 
-Invariant: no logic here but joining rooms: scenario, virtual time, log, execution, analysis, studies.
+Invariant: no logic here but joining rooms. A scenario is a name, a path, a TOML text, its tables or a
+`Scenario`; a log is a path or a `Log`. What takes a network is in `session_api`.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .execution.virtual import simulate_scenario
-from .log.log_reader import Log
+from .analysis.certificate.stability_certificate import Certificate
+from .analysis.file_overview import FileOverview, describe_files
+from .analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from .errors import UsageError
+from .execution.log_checks import LogCheckReport, run_log_checks
+from .execution.virtual import SimulatedLog, simulate_scenario
+from .files import make_results_folder
+from .log.integrity import MIN_COVERAGE
+from .log.log_reader import Log, open_log
+from .log.recover import Recovery, recover_log
+from .log.session_check import LogCheckResult, check_log
 from .scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from .reporting.conclude import Conclusion
+    from .studies.executor import Workers
+    from .studies.log_comparison import LogComparison
+    from .studies.sweep.margin_search import SweepMargins
+    from .studies.sweep.sweep_results import SweepResults
+    from .studies.tuning.tuning_plan import TuningResult
+    from .theory.linear_analysis import LinearAnalysis
+
+AnyScenario = str | Path | Mapping[str, Any] | Scenario
+AnyLog = str | Path | Log
+Overrides = Mapping[str, Any] | Sequence[str]
+
+
+def _open(log: AnyLog) -> Log:
+    return log if isinstance(log, Log) else open_log(log)
+
+
+def _texts(overrides: Overrides, duration_s: float | None) -> list[str]:
+    """Returns overrides as the command line takes them."""
+    from .studies.trials.trial import list_assignments
+
+    texts = list_assignments(overrides) if isinstance(overrides, Mapping) else overrides
+    return [*texts, *([] if duration_s is None else [f"duration_s={float(duration_s)!r}"])]
 
 
 def simulate(
-    scenario: str | Path | Scenario,
-    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
-) -> Log:
-    """Runs a scenario in virtual time and returns its log.
+    scenario: AnyScenario,
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    duration_s: float | None = None,
+    seed: int | None = None,
+) -> SimulatedLog:
+    """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
+
+    >>> log = tn.simulate("two_sites", duration_s=0.1)
+    >>> log["m"].q.shape
+    (100, 2)
 
     Args:
-        scenario: the name of a shipped scenario, a path, or a scenario.
-        set: overrides, as in `{"control.Kd": 5}`.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
+        duration_s: the duration of the run, s; by default the scenario's.
+        seed: the seed; by default the scenario's.
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
     """
-    return simulate_scenario(load_scenario(scenario, set))
+    return simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+
+
+def info(*files: str | Path) -> FileOverview:
+    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log info`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
+    >>> tn.info(path).to_dict()["sites"]["m"]["records"]
+    100
+
+    Raises:
+        LogError: a file cannot be read, or is no MCAP file.
+    """
+    return FileOverview(describe_files([Path(file) for file in files]))
+
+
+def check_file(*files: str | Path) -> LogCheckResult:
+    """Checks that a log is well-formed, complete and consistent; the command is `trilat log check`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("sound.mcap")
+    >>> tn.check_file(path).passed
+    True
+
+    Raises:
+        LogError: a file cannot be read.
+    """
+    return check_log([Path(file) for file in files])
+
+
+def recover(file: str | Path, out: str | Path | None = None, *, force: bool = False) -> Recovery:
+    """Makes a whole file of a torn or damaged one; the command is `trilat log recover`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
+    >>> tn.recover(path, "whole.mcap").lossless
+    True
+
+    Raises:
+        LogError: the file cannot be read.
+        NothingSaved: nothing could be recovered.
+    """
+    return recover_log(Path(file), None if out is None else Path(out), force=force)
+
+
+def export(log: AnyLog, to: str, out: str | Path, *, force: bool = False) -> Path:
+    """Exports a log to files for other tools and returns the path; the command is `trilat log export`.
+
+    >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
+    'run.npz'
+
+    Args:
+        log: the log, or its path.
+        to: ros2, parquet, csv, npz or mat.
+        out: a file, or of parquet and csv a folder.
+        force: whether it may replace one.
+
+    Raises:
+        UsageError: there is no such format, a package is missing, or the place is taken.
+    """
+    from .reporting.export import Exporter, ExportFormat
+
+    if to not in list(ExportFormat):
+        raise UsageError(f"an export is to one of {', '.join(ExportFormat)}, not {to!r}")
+    Exporter(ExportFormat(to), Path(out), force=force).export(_open(log))
+    return Path(out)
+
+
+def verify(log: AnyLog, *, virtual: bool = False, min_coverage: float = MIN_COVERAGE) -> LogCheckReport:
+    """Executes a log again and compares every computed field; the command is `trilat verify`.
+
+    >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
+    True
+
+    Args:
+        log: the log, or its path.
+        virtual: whether to compare with virtual time too.
+        min_coverage: the least share of every site's ticks that must be judged to pass.
+
+    Raises:
+        LogError: the log cannot be read.
+    """
+    return run_log_checks(_open(log), virtual=virtual, min_coverage=min_coverage)
+
+
+def certify(log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False) -> Certificate:
+    """Judges a run: stable, not stable or open, and why; the command is `trilat certify`.
+
+    >>> print(tn.certify(tn.simulate("free")).stability)
+    stable
+
+    Args:
+        log: the log, or its path.
+        min_coverage: the least share of every site's ticks that must be judged for a stable run.
+        own_laws: whether code of laws from outside may run, for the energies that they declare.
+
+    Raises:
+        LogError: the log cannot be read.
+    """
+    from .theory.end_pose import certify_with_roots
+
+    return certify_with_roots(_open(log), min_coverage=min_coverage, own_laws=own_laws)
+
+
+def metrics(log: AnyLog) -> LogMetrics:
+    """Measures a run: tracking, effort, energies, force sharing, network; the command is `trilat metrics`.
+
+    >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
+    >>> found.sites["m"]["rms_error_rad"].value > 0.0
+    True
+
+    Raises:
+        LogError: the log cannot be read.
+    """
+    return compute_log_metrics(_open(log))
+
+
+def compare(*logs: AnyLog) -> "LogComparison":
+    """Compares logs side by side, with the differences of their experiments; the command is `trilat compare`.
+
+    >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
+    >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
+    2
+
+    Raises:
+        UsageError: there are fewer than two logs.
+        LogError: a log cannot be read.
+    """
+    from .studies.log_comparison import compare_logs
+
+    return compare_logs([_open(log) for log in logs])
+
+
+def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -> "Conclusion":
+    """Writes the figures, the page and the summary of a log in a file; the command is `trilat report`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
+    >>> tn.report(path, "report").passed
+    True
+
+    Args:
+        log: the log's path, or the log that was opened from it.
+        out: the folder; by default the file's name without .mcap.
+        force: whether the folder may hold something already.
+
+    Raises:
+        UsageError: the folder holds something, or the log is in no file.
+    """
+    from .reporting.conclude import conclude
+
+    opened = _open(log)
+    first = Path(opened.sources[0])
+    if not first.is_file():
+        raise UsageError("a report is of a log in a file: save it first, as in log.save('run.mcap')")
+    folder = first.with_suffix("") if out is None else Path(out)
+    return conclude(opened, make_results_folder(folder, "", force=force))
+
+
+def linear(
+    scenario: AnyScenario,
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    pose: Sequence[float] | None = None,
+    roots: int = 6,
+    over: Sequence[str] = (),
+    ports: bool = True,
+) -> "LinearAnalysis":
+    """Linearises the loop about its equilibrium: roots, margins, ports; the command is `trilat linear`.
+
+    >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
+    'unstable'
+
+    Args:
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: overrides, as in `{"control.d": 0.9}`.
+        pose: the angles of all sites, rad; by default those at which a run ends.
+        roots: how many roots.
+        over: ranges in which to find where stability changes, as in `["control.d=0.1:3"]`.
+        ports: whether to analyse the impedances that operators feel, and passivity.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or has no linear loop.
+        UsageError: another argument is not valid.
+    """
+    from .theory.linear_analysis import analyse_linearly
+
+    fixed = None if pose is None else tuple(map(float, pose))
+    return analyse_linearly(load_scenario(scenario, set), pose=fixed, roots=roots, over=over, ports=ports)
+
+
+def sweep(
+    scenario: str | Path,
+    over: Sequence[str] = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str] = (),
+    duration_s: float | None = None,
+    longest_s: float | None = None,
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepResults":
+    """Runs a scenario over a grid of its keys and classifies stability; the command is `trilat sweep`.
+
+    >>> found = tn.sweep("p_d_margin", ["control.d=0.3,3"], duration_s=2, out="grid", jobs=1)
+    >>> len(found.rows)
+    2
+
+    Args:
+        scenario: the name of a shipped scenario, or a path.
+        over: the axes, as in `["link.delay_ms=0:1600:50"]`.
+        set: what is to be changed everywhere, as in `{"control.Kd": 5}`.
+        seeds: how many, or which.
+        laws: names of laws to sweep besides.
+        duration_s: how long a cell runs at first, s.
+        longest_s: how long at most, s; by default eight times that.
+        out: folder of the results; a sweep in it is continued. By default the next free runs/sweep-NAME-N.
+        jobs: how many processes; None for one per core.
+        on: what runs the cells instead: a Dask scheduler's address or an executor.
+
+    Raises:
+        ScenarioError: the scenario, an axis or one of its values is not valid.
+        UsageError: the folder holds something else, or polars is not installed.
+    """
+    from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
+    from .studies.sweep.sweep_results import require_polars
+
+    require_polars()
+    texts = _texts(set, duration_s)
+    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, laws=laws, longest_s=longest_s)
+    folder = prepare_sweep_folder(plan, None if out is None else Path(out))
+    return run_sweep(folder, jobs, on=on).results
+
+
+def margin(
+    scenario: str | Path,
+    along: str,
+    over: Sequence[str] = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    tolerance: float = 0.005,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str] = (),
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepMargins":
+    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+
+    >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
+    >>> [one.margin.spans[0].stable_below for one in found.found]
+    [False]
+
+    Args:
+        scenario: the name of a shipped scenario, or a path.
+        along: the key and its range, as in "control.d=0.2:3".
+        over: axes at every point of which it is searched, as in `["link.delay_ms=100,200"]`.
+        set: what is to be changed everywhere.
+        tolerance: how wide an edge may be, relative to its value.
+        seeds: how many, or which.
+        laws: names of laws to search besides.
+        duration_s: how long a run is at first, s.
+        jobs: how many processes; None for one per core.
+        on: what runs them instead: a Dask scheduler's address or an executor.
+
+    Raises:
+        ScenarioError: the scenario or one of the values is not valid.
+        UsageError: the range is none.
+    """
+    from .studies.sweep import plan_sweep
+    from .studies.sweep.margin_search import (
+        SweepMargins,
+        format_range_axis,
+        parse_search_range,
+        search_margins,
+    )
+
+    within = parse_search_range(along, tolerance)
+    axes = [*over, format_range_axis(within)]
+    plan = plan_sweep(scenario, _texts(set, duration_s), over=axes, seeds=seeds, laws=laws)
+    return SweepMargins(plan, within, search_margins(plan, within, jobs, on=on))
+
+
+def tune(
+    scenario: str | Path,
+    laws: Sequence[str] = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    budget: int = 64,
+    seed: int = 1,
+    seeds: int = 1,
+    objective: str = "error",
+    gravity_percent: float = 100.0,
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "TuningResult":
+    """Compares control laws, each tuned alike; the command is `trilat compare --tune`.
+
+    >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
+    >>> [law.space.law for law in found.found]
+    ['p_d']
+
+    Args:
+        scenario: the name of a shipped scenario, or a path.
+        laws: which laws; none means all that take any number of sites.
+        set: overrides, as in `{"link.delay_ms": 100}`.
+        budget: candidates per law.
+        seed: the seed of the search.
+        seeds: seeds of the scenario that each candidate is the mean of.
+        objective: error or settling, besides effort.
+        gravity_percent: gravity that all laws assume, in % of the truth.
+        duration_s: how long a run is, s.
+        jobs: how many processes; None for one per core.
+        on: what runs them instead: a Dask scheduler's address or an executor.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or laws cannot be compared in it.
+        UsageError: another argument is not valid.
+    """
+    from .studies.tuning import plan_tuning
+
+    plan = plan_tuning(
+        scenario,
+        _texts(set, duration_s),
+        laws=laws,
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity_percent,
+        seeds=seeds,
+    )
+    return plan.run(jobs, on=on)

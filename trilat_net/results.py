@@ -13,17 +13,17 @@ from .files import import_extra
 if TYPE_CHECKING:
     import pandas
 
-_REPR_LENGTH = 120
+_REPR_LENGTH = 200
 
 
 class Result:
-    """What a command found. A type states `to_dict`, and where a table has more than one row `rows`."""
+    """What a command found. A type states `to_dict`, and where a table has more than one row `to_rows`."""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of the command's --json."""
         raise NotImplementedError
 
-    def rows(self) -> Sequence[Mapping[str, Any]]:
+    def to_rows(self) -> Sequence[Mapping[str, Any]]:
         """Returns the rows of `to_frame`."""
         return [{key: one for key, one in self.to_dict().items() if not isinstance(one, dict | list)}]
 
@@ -37,7 +37,7 @@ class Result:
         Raises:
             UsageError: pandas is not installed.
         """
-        return import_extra("pandas", "frames", "data frames").DataFrame(list(self.rows()))
+        return import_extra("pandas", "frames", "data frames").DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
         """Returns the result in one line."""
@@ -46,7 +46,7 @@ class Result:
     def __repr__(self) -> str:
         text = self.headline()
         short = text if len(text) <= _REPR_LENGTH else text[:_REPR_LENGTH] + "..."
-        return f"<{type(self).__name__}: {short}>"
+        return f"<{type(self).__name__} {short}>"
 
     def _repr_html_(self) -> str:
         return str(_texts().render_html(self))

@@ -68,7 +68,7 @@ def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
     assert len(set(values)) == len(SEEDS)
     assert row.mean == mean_interval(values)
     assert row.mean.half > 0.01 * row.mean.mean
-    assert str(row.mean) in report.text()
+    assert str(row.mean) in report.summary()
     again = load_scenario(file, [f"seed={SEEDS[-1]}"])
     assert report.results[-1].trial.scenario == again
 

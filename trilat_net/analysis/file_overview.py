@@ -154,7 +154,7 @@ class FileOverview(Result):
         """Returns plain values, with the keys of `trilat log info --json`."""
         return self.facts
 
-    def rows(self) -> list[JsonObject]:
+    def to_rows(self) -> list[JsonObject]:
         """Returns a row per channel."""
         return [{"topic": topic, **channel} for topic, channel in self.facts["channels"].items()]
 

@@ -164,10 +164,7 @@ def load_chosen_scenario(
     """Returns the scenario that a command's options describe."""
     from ..scenario import load_scenario
 
-    given = list_overrides(overrides, duration)
-    if seed is not None:
-        given.append(f"seed={seed}")
-    return load_scenario(source, given)
+    return load_scenario(source, overrides or [], duration_s=duration, seed=seed)
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:

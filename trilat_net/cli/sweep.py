@@ -4,7 +4,6 @@ Invariant: everything printed is in the result files too, except live runs, whic
 interrupted prints the command that resumes it.
 """
 
-import json
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -68,24 +67,15 @@ def _search_margins(
 
     The last axis of the plan is the two ends of the range.
     """
-    from ..files import make_results_folder, write_whole
-    from ..studies.sweep.margin_search import (
-        build_margin_page,
-        margins_to_json,
-        search_margins,
-        tabulate_margins,
-    )
+    from ..files import make_results_folder
+    from ..studies.sweep.margin_search import SweepMargins, search_margins
 
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
     with terminal.progress_bar("searching") as progress:
-        found = search_margins(asked, within, jobs, progress, on)
+        found = SweepMargins(asked, within, search_margins(asked, within, jobs, progress, on))
     terminal.out.print()
-    terminal.print_table(tabulate_margins(asked, within, found))
-    paths = chosen / "margin.json", chosen / "margin.md"
-    facts = margins_to_json(asked, within, found)
-    write_whole(paths[0], json.dumps(facts, indent=2, allow_nan=False) + "\n")
-    write_whole(paths[1], build_margin_page(asked, within, found))
-    terminal.print_paths(paths)
+    terminal.print_result(found)
+    terminal.print_paths(found.write(chosen))
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:

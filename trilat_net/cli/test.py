@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from ..errors import UsageError
 from ..reporting import terminal_output as terminal
@@ -45,6 +44,7 @@ def test_command(
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     r"""Runs scenarios and checks their \[expect]: which held, by what margin, how to repeat the others."""
     from ..files import write_whole
@@ -60,7 +60,7 @@ def test_command(
     batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
     report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
-    _show(report)
+    terminal.print_result(report, as_json=as_json)
     if junit is not None:
         write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
     if not report.held:
@@ -140,14 +140,3 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
     return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
-
-
-def _show(report: "TrialReport") -> None:
-    heads, *rows = report.table()
-    terminal.out.print(heads, soft_wrap=True)
-    for line in rows:
-        mark, space, rest = line.partition(" ")
-        color = "green" if mark == "ok" else "red"
-        terminal.out.print(f"[{color}]{mark}[/{color}]{space}{escape(rest)}", soft_wrap=True)
-    for line in [*report.failures(), *report.remarks()]:
-        terminal.print_text(line)

@@ -36,6 +36,14 @@ T = TypeVar("T")
 def compiled(law: T) -> T:
     """Has the `torque` of a control law compiled, or a function that it calls; for use as a decorator.
 
+    >>> @tn.compiled
+    ... class Damper:
+    ...     remembers = ()
+    ...     def __init__(self, facts):
+    ...         pass
+    ...     def torque(self, now):
+    ...         return -now.qd
+
     The class needs `remembers`. What Numba does not take is refused when a site is built.
     """
     if not isinstance(law, type):

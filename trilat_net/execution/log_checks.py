@@ -52,7 +52,7 @@ class LogCheckReport(Result):
         """True if the log is as it was made, enough of it was judged, and every execution agreed with it."""
         return all(line.passed for line in self.lines)
 
-    def rows(self) -> list[dict[str, Any]]:
+    def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
         return [line._asdict() for line in self.lines]
 
@@ -76,7 +76,7 @@ class LogCheckReport(Result):
             "first_difference": None
             if first is None
             else {**first._asdict(), "logged": repr(first.logged), "computed": repr(first.computed)},
-            "checks": self.rows(),
+            "checks": self.to_rows(),
         }
 
 

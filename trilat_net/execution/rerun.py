@@ -259,7 +259,7 @@ class Rerun(Result):
         """Limits of the answer, a sentence each."""
         return list(_describe_limits(self))
 
-    def rows(self) -> list[dict[str, Any]]:
+    def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per executed site."""
         return list(self.to_dict()["sites"].values())
 
@@ -291,7 +291,11 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again and compares them with it.
+    """Executes sites of a log again and compares them with it; the command is `trilat rerun`.
+
+    >>> again = tn.rerun(tn.simulate("two_sites", duration_s=0.1), ["s"], {"control.Kd": 5})
+    >>> again.identical
+    False
 
     Args:
         log: the log, or its path.

@@ -18,6 +18,7 @@ from ..errors import LawFailed
 from ..log.log_file import LogFile
 from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
+from ..log.mcap_reader import LogContents, read_contents
 from ..log.mcap_writer import Sink
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..net import topics
@@ -221,14 +222,47 @@ def record_virtual(
         return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz)
 
 
+class SimulatedLog(Log):
+    """The log of a run in virtual time, which `save` makes a file of.
+
+    Args:
+        contents: the log.
+        make: makes it once more, into a stream and with views at a rate, Hz.
+    """
+
+    def __init__(self, contents: LogContents, make: Callable[[Sink, float], object]) -> None:
+        super().__init__(contents)
+        self._make = make
+
+    def save(self, path: str | Path, *, force: bool = False) -> Path:
+        """Writes the file that `trilat sim -o` writes, and returns its path; `force` lets it replace one.
+
+        The run is made once more, with the standard channels that viewers show.
+
+        Raises:
+            UsageError: the file exists, or cannot be made.
+            LogRefused: the disk refused it.
+        """
+        with LogFile(Path(path), force=force) as stream:
+            self._make(stream, VIZ_HZ)
+        return Path(path)
+
+
 def simulate_scenario(
     scenario: Scenario,
     *,
     as_named: bool = True,
     hands: HandTracks = {},  # noqa: B006
-) -> Log:
+) -> SimulatedLog:
     """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
-    return open_in_memory(lambda stream: write_virtual_log(scenario, stream, as_named=as_named, hands=hands))
+
+    def make(stream: Sink, views_hz: float) -> None:
+        write_virtual_log(scenario, stream, views_hz=views_hz, as_named=as_named, hands=hands)
+
+    stream = io.BytesIO()
+    make(stream, 0.0)
+    stream.seek(0)
+    return SimulatedLog(read_contents(stream, "log"), make)
 
 
 def open_in_memory(write: Callable[[io.BytesIO], object]) -> Log:

@@ -32,6 +32,7 @@ from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
+    import pandas
     import polars
 
 UNIT_SUFFIXES = {
@@ -362,6 +363,20 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
             texts = [v if isinstance(v, str) else json.dumps(v, sort_keys=True) if v else "" for v in values]
             columns.append(Column(field, np.array(texts, dtype=np.object_), unit, text, field))
     return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
+
+
+def to_pandas_frame(table: Table) -> "pandas.DataFrame":
+    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers.
+
+    Raises:
+        UsageError: pandas is not installed.
+    """
+    pd = import_extra("pandas", "frames", "data frames")
+    return cast("pandas.DataFrame", pd.DataFrame({one.name: _pandas_values(one) for one in table.columns}))
+
+
+def _pandas_values(column: Column) -> NDArray[Any] | list[Any]:
+    return column.rows(0, len(column.values)) if column.is_text else column.numbers()
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":

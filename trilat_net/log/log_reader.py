@@ -20,7 +20,7 @@ from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from ..files import open_regular
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
+from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
 from ..scenario.operators import find_live_hand
@@ -44,6 +45,7 @@ from .data_tables import (
     build_link_table,
     build_state_table,
     to_data_frame,
+    to_pandas_frame,
 )
 from .digest_chain import Integrity
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
@@ -52,13 +54,14 @@ from .merge import merge_parts
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
+    import pandas
     import polars
 
 
 M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
-class Log:
+class Log(Result):
     """A recorded session; `log["m1"]` is a site's part.
 
     Args:
@@ -92,7 +95,8 @@ class Log:
         self.unreadable: list[str] = []
         self.events = [event for topic in self._event_topics() for event in self._read_events(topic)]
 
-    def __repr__(self) -> str:
+    def headline(self) -> str:
+        """Returns the session, and how many records it has, in one line."""
         try:
             seconds = max((float(self[name].t_s[-1]) for name in self.sites if len(self[name])), default=0.0)
             records = sum(len(self[name]) for name in self.sites)
@@ -101,7 +105,45 @@ class Log:
         except LogError:
             holds = "with records that cannot be read"
         kind = f"{self.driver} session {self.session['session']} of {', '.join(self.sites)}"
-        return f"<Log {self.source}: {kind}; {holds}{'' if self.complete else '; not finished'}>"
+        return f"{self.source}: {kind}; {holds}{'' if self.complete else '; not finished'}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat sim --json`."""
+        return {
+            "files": list(self.sources),
+            "session": dict(self.session),
+            "scenario": self.scenario.name,
+            "scenario_sha256": self.scenario_sha256,
+            "seed": self.scenario.seed,
+            "duration_s": self.scenario.duration_s,
+            "complete": self.complete,
+            "diverged": [event.member for event in self.events if event.kind == "diverged"],
+            "sites": {str(row.pop("site")): row for row in self.to_rows()},
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per site."""
+        return [
+            {
+                "site": name,
+                "rate_hz": self[name].rate_hz,
+                "records": len(self[name]),
+                "missing": self.missing(name),
+                "last_s": float(self[name].t_s[-1]) if len(self[name]) else None,
+            }
+            for name in self.sites
+        ]
+
+    def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
+        """Returns a table of the log as a pandas data frame, see `table`; without a name a row per site.
+
+        Raises:
+            UsageError: pandas is not installed.
+        """
+        return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.sites)
 
     def _topic(self, member: str, channel: str) -> str:
         return "/" + topics.key(self.session["session"], member, channel)
@@ -398,7 +440,7 @@ class Log:
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns the same as a polars data frame; pandas has it by `log.frame("m1").to_pandas()`.
+        """Returns the same as a polars data frame; for pandas there is `to_frame`.
 
         Raises:
             UsageError: polars is not installed.
@@ -410,6 +452,10 @@ def open_log(
     source: str | Path | BinaryIO, *more: str | Path | BinaryIO, progress: Progress | None = None
 ) -> Log:
     """Returns the log in a file, or in files that are parts of one session, in any order.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
+    >>> tn.open_log(path)["m"].t_s[-1]
+    np.float64(0.099)
 
     Args:
         source: a path, or a file opened for reading.

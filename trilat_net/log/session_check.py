@@ -75,9 +75,9 @@ class LogCheckResult(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat log check --json`."""
         kind = "trilat" if self.ours else "mcap"
-        return {"files": self.files, "kind": kind, "sound": self.passed, "checks": self.rows()}
+        return {"files": self.files, "kind": kind, "sound": self.passed, "checks": self.to_rows()}
 
-    def rows(self) -> list[dict[str, Any]]:
+    def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
         return [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in self.findings]
 

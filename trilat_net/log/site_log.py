@@ -44,6 +44,16 @@ _PLACE = 3
 """Numbers of an end effector's place; those of its orientation follow."""
 
 
+def freeze(value: T) -> T:
+    """Makes arrays read-only, also those in a tuple or by name: nobody changes a log by accident."""
+    if isinstance(value, np.ndarray):
+        value.setflags(write=False)
+    elif isinstance(value, dict | tuple):
+        for one in value.values() if isinstance(value, dict) else value:
+            freeze(one)
+    return value
+
+
 def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """Returns x - x_des of places, and of orientations the turn from one to the other, shape (K, m).
 
@@ -201,9 +211,13 @@ class SiteLog:
             self.tick = self.tick[order]
             self.payloads = [payloads[n] for n in order.tolist()]
             self.log_time_ns, self.publish_time_ns = self.log_time_ns[order], self.publish_time_ns[order]
+        freeze((self.tick, self.log_time_ns, self.publish_time_ns))
 
     def __len__(self) -> int:
         return len(self.payloads)
+
+    def __dir__(self) -> list[str]:
+        return sorted(name for name in super().__dir__() if not name.startswith("_"))
 
     def __repr__(self) -> str:
         if not len(self):
@@ -215,7 +229,7 @@ class SiteLog:
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
         """Returns what a decoder makes of the records."""
         try:
-            return decode_column(self.payloads, *arguments)
+            return freeze(decode_column(self.payloads, *arguments))
         except WireError as error:
             raise LogError(f"{self._source}: a record of {self.name} cannot be read: {error}") from None
 
@@ -298,7 +312,7 @@ class SiteLog:
     @cached_property
     def t_s(self) -> Array:
         """Nominal time since the epoch, shape (K,), s."""
-        return self.t_ns / NS_PER_S
+        return freeze(self.t_ns / NS_PER_S)
 
     @property
     def e(self) -> Array:
@@ -314,7 +328,7 @@ class SiteLog:
         places: dict[str, list[int]] = {}
         for n, entry in enumerate(self.channel.entries(self.peers)):
             places.setdefault(entry.key, []).append(n)
-        return {key: self.ch[:, columns] for key, columns in places.items()}
+        return freeze({key: self.ch[:, columns] for key, columns in places.items()})
 
     @cached_property
     def busy_us(self) -> Ints:

@@ -58,7 +58,7 @@ class Conclusion(Result):
         page = next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
         return f"{'passed' if self.passed else 'FAILED'}; {page}"
 
-    def rows(self) -> list[dict[str, str]]:
+    def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
         return [dict(zip(self.table.headers, row, strict=False)) for row in self.table.rows]
 

@@ -40,6 +40,7 @@ Block = str | MarkedText | TextTable
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
     "LinearAnalysis": "linear_text:compose_linear",
+    "Log": "summary_text:compose_log",
     "LogCheckReport": "checks_text:compose_verification",
     "LogCheckResult": "checks_text:compose_log_check",
     "LogMetrics": "metrics_text:compose_metrics",
@@ -55,7 +56,8 @@ def compose(result: Result) -> Iterable[Block]:
     own = getattr(result, "blocks", None)
     if own is not None:
         return list(own())
-    module, _, name = _COMPOSERS[type(result).__name__].partition(":")
+    known = next(one.__name__ for one in type(result).__mro__ if one.__name__ in _COMPOSERS)
+    module, _, name = _COMPOSERS[known].partition(":")
     return list(getattr(import_module(f"{__package__}.{module}"), name)(result))
 
 

@@ -5,18 +5,31 @@ Links, changes, modes, clocks, and messages of user laws and arms.
 Invariant: a link with one constant delay and no loss gets no line.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from ..analysis.health import ClockSummary, summarise_clock
 from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..log.log_reader import Log
+from .result_text import Block
+from .text_table import TextTable
 
 MOST_LINES = 12
 """Lines of each kind; summary.json has the rest."""
 MOST_LINE_CHARACTERS = 400
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
 """Kinds of the events about user laws and external arms."""
+
+
+def compose_log(log: Log) -> Iterator[Block]:
+    """Yields the session, a row per site, and what else there is to say of the run."""
+    yield log.headline()
+    rows = [
+        [row["site"], f"{row['rate_hz']}", f"{row['records']}", f"{row['missing']}", f"{row['last_s']}"]
+        for row in log.to_rows()
+    ]
+    yield TextTable(("site", "rate Hz", "records", "missing", "until s"), rows, align="lr")
+    yield from format_run_lines(log)
 
 
 def format_run_lines(log: Log) -> list[str]:

@@ -4,7 +4,6 @@ Invariant: a scenario that loads also runs; every mistake that a person can make
 path of the key and the nearest valid name.
 """
 
-from ..deprecated import lookup_of
 from .arms import Arm as Arm
 from .delay_models import Link as Link
 from .expect import Expect as Expect
@@ -30,5 +29,3 @@ from .scenario_types import Limits as Limits
 from .scenario_types import OnStale as OnStale
 from .scenario_types import Scenario as Scenario
 from .scenario_types import SiteSpec as SiteSpec
-
-__getattr__ = lookup_of("scenario")

@@ -11,6 +11,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from ..core.chain import MAX_JOINTS
 from ..core.delay import MAX_DELAY_US
 from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
@@ -54,16 +56,38 @@ def read_template() -> str:
 
 
 def load_scenario(
-    source: str | Path | Scenario, overrides: Mapping[str, Any] | Sequence[str] = ()
+    source: str | Path | Mapping[str, Any] | Scenario,
+    overrides: Mapping[str, Any] | Sequence[str] = (),
+    *,
+    duration_s: float | None = None,
+    seed: int | None = None,
 ) -> Scenario:
-    """Returns a scenario by the name of a shipped one or by path, or a scenario with overrides applied.
+    """Returns a scenario with overrides applied; the command is `trilat scenario show`.
 
-    Overrides are `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a group applies to all
-    (`override`).
+    >>> tn.load_scenario("paper", {"control.Kd": 5}).names
+    ('m1', 'm2', 's')
+
+    Args:
+        source: the name of a shipped scenario, a path, a TOML text of several lines, its tables, or a
+            scenario.
+        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a group applies to
+            all (`override`).
+        duration_s: the duration, s; by default the scenario's.
+        seed: the seed; by default the scenario's.
 
     Raises:
         ScenarioError: the source cannot be read or is not a valid scenario.
     """
+    given = {"duration_s": duration_s, "seed": seed}
+    more = {key: value for key, value in given.items() if value is not None}
+    if isinstance(overrides, Mapping):
+        overrides = {**overrides, **more}
+    else:
+        overrides = [*overrides, *(f"{key}={value!r}" for key, value in more.items())]
+    if isinstance(source, Mapping):
+        return parse_scenario(tomli_w.dumps(source), "scenario", overrides)
+    if isinstance(source, str) and "\n" in source:
+        return parse_scenario(source, "scenario", overrides)
     if isinstance(source, Scenario):
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))

@@ -107,7 +107,7 @@ class LinearAnalysis(Result):
         edges = {scan.key: [one._asdict() for one in scan.edges] for scan in self.scans}
         return {**linear_to_json(self), "ports": ports, "edges": edges}
 
-    def rows(self) -> list[dict[str, Any]]:
+    def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per root: of the continuous loop, and as computed tick by tick."""
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
         return [

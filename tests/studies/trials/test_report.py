@@ -55,7 +55,7 @@ def test_a_run_without_a_result_fails_and_says_why() -> None:
         ("rms_error_max_rad", 1, 1),
         ("a result", 1, 2),
     ]
-    assert "code -9" in report.text()
+    assert "code -9" in report.summary()
 
 
 def test_what_held_is_told_without_failures() -> None:

@@ -90,7 +90,7 @@ def test_every_shipped_scenario_expects_something_and_it_holds(most: int, left_o
     batch = [trial for name in names for trial in trilat_net.trials(name)]
     assert len(batch) >= 7
     report = run_trials(batch)
-    assert report.held, report.text()
+    assert report.held, report.summary()
 
 
 RECIPE = textwrap.dedent(str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nOr all")[0])

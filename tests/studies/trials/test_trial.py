@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import trilat_net
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
-from trilat_net.studies.trials.trial import _assignments
+from trilat_net.studies.trials.trial import list_assignments
 
 from .results import TOO_MUCH, quick
 
@@ -85,7 +85,7 @@ tables = st.dictionaries(
 def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) -> None:
     by_text: dict[str, Any] = {}
     by_value: dict[str, Any] = {}
-    apply_overrides(by_text, shlex.split(shlex.join(_assignments(overrides))))
+    apply_overrides(by_text, shlex.split(shlex.join(list_assignments(overrides))))
     apply_overrides(by_value, overrides)
     assert by_text == by_value
 

@@ -186,11 +186,15 @@ class Certificate(Result):
         """Decides the exit code: the run is stable."""
         return self.accepts(())
 
+    def headline(self) -> str:
+        """Returns the judgement, and how the run ended."""
+        return f"{self.stability}: {self.end.behaviour}"
+
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
         return certificate_to_json(self)
 
-    def rows(self) -> list[JsonObject]:
+    def to_rows(self) -> list[JsonObject]:
         """Returns a row per premise."""
         return [premise._asdict() for premise in self.premises]
 

@@ -136,7 +136,7 @@ class LogMetrics(Result):
         """Returns plain values, with the keys of `trilat metrics --json`."""
         return metrics_to_json(self)
 
-    def rows(self) -> list[dict[str, Any]]:
+    def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per quantity and place."""
         return [{**row, "value": one.value, "why": one.why} for row, one in self._each() if one.applies]
 
@@ -192,10 +192,7 @@ def _measure(log: Log) -> LogMetrics:
     loads = static_windows.find_joint_loads(scenario, windows)
     ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
     return LogMetrics(
-        Path(log.source).name,
-        scenario.name,
-        log.driver,
-        log.complete,
+        *(Path(log.source).name, scenario.name, log.driver, log.complete),
         {
             **motion.measure_spread(log, runs),
             **static_windows.measure_force_sharing(absent, windows, ratios),

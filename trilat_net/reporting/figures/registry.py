@@ -20,7 +20,7 @@ from ...analysis.certificate.stability_certificate import certify
 from ...analysis.site_signals import sites_with_operator
 from ...errors import UsageError
 from ...files import make_folder, refuse_existing
-from ...log.log_reader import Log
+from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
 from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
@@ -145,14 +145,20 @@ FIGURES = {
 """By name, in the order in which a paper has them."""
 
 
-def figure(log: Log, name: str, width_in: float = COLUMN_IN) -> Figure:
+def figure(log: str | Path | Log, name: str, width_in: float = COLUMN_IN) -> Figure:
     """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
+
+    The command is `trilat figure`.
+
+    >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
+    >>> drawn.savefig("positions.pdf")
 
     Raises:
         UsageError: there is no such figure or width, or the log has nothing to show in it.
     """
     form = make_print_size(width_in)
-    return _find_figure(log, name).draw(log, form)
+    opened = log if isinstance(log, Log) else open_log(log)
+    return _find_figure(opened, name).draw(opened, form)
 
 
 def list_drawable_figures(log: Log) -> list[str]:

@@ -8,14 +8,19 @@ it and count for neither side; every edge that the scan sees is kept. The margin
 function of its scenario, its seed and the range.
 """
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import ScenarioError, UsageError
+from ...files import write_whole
 from ...reporting.text_table import TextTable
+from ...results import Result
 from ...scenario import Scenario
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, list_imported_laws, open_worker_pool
@@ -256,6 +261,44 @@ def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridP
             cells += _theory_cells(span, one.closed) if closed else []
             rows.append((*cells, str(one.margin.runs)))
     return TextTable(tuple(heads), rows)
+
+
+@dataclass(frozen=True, repr=False)
+class SweepMargins(Result):
+    """The edges of every place of a plan and every seed, in a range along one key."""
+
+    plan: SweepPlan
+    within: SearchRange
+    found: list[GridPointMargin]
+
+    def blocks(self) -> Iterator[TextTable]:
+        """Yields its text."""
+        yield tabulate_margins(self.plan, self.within, self.found)
+
+    def headline(self) -> str:
+        """Returns how many edges were found where."""
+        edges = sum(len(one.margin.spans) for one in self.found)
+        low, high = self.within.low, self.within.high
+        return f"{self.plan.base.name}: {edges} edges of {self.within.key} from {low:g} to {high:g}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat sweep --margin --json`."""
+        return margins_to_json(self.plan, self.within, self.found)
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per edge, or per place that has none."""
+        return [
+            {**{key: one for key, one in place.items() if not isinstance(one, list)}, **edge}
+            for place in self.to_dict()["places"]
+            for edge in place["edges"] or [{}]
+        ]
+
+    def write(self, folder: Path) -> list[Path]:
+        """Writes margin.json and margin.md, and returns their paths."""
+        paths = [folder / "margin.json", folder / "margin.md"]
+        write_whole(paths[0], json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_whole(paths[1], build_margin_page(self.plan, self.within, self.found))
+        return paths
 
 
 def build_margin_page(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:

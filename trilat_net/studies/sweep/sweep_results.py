@@ -10,7 +10,8 @@ is taken over the decided runs and carries a 95 % Wilson interval within [0, 1].
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ import msgspec
 from ...errors import UsageError
 from ...execution.fused import RunTotals
 from ...files import import_extra
+from ...results import Result
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from .cell_result import CellClass, CellResult
 from .sweep_cell import CellRun, apply_diff, build_sim_command
@@ -48,11 +50,26 @@ def require_polars() -> Any:
     return pl
 
 
-class SweepResults(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class SweepResults(Result):
     """Results of a sweep: its runs by cell, and then in the order of the seeds."""
 
     plan: SweepPlan
     rows: Sequence[ResultRow]
+
+    def blocks(self) -> Iterator[str]:
+        """Yields its text."""
+        from .sweep_run import describe_sweep_plan, summarize_sweep
+
+        yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
+
+    def to_rows(self) -> Sequence[ResultRow]:
+        """Returns a row per run."""
+        return self.rows
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat sweep --json`."""
+        return {"plan": self.plan.facts(), "runs": [dict(row) for row in self.rows]}
 
     def of_cell(self, number: int) -> list[ResultRow]:
         """Returns the runs of a cell, one per seed.

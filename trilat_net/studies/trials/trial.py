@@ -104,7 +104,10 @@ def trials(
     *,
     live: bool = False,
 ) -> list[Trial]:
-    """Returns the trials of a scenario, one per seed, ready to run.
+    """Returns the trials of a scenario, one per seed, ready to run, as for parameters of a test.
+
+    >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
+    ['jitter-seed1', 'jitter-seed2']
 
     In virtual time a scenario in which nothing is random has one trial, with the first of the seeds: the
     others would be the same run.
@@ -129,7 +132,7 @@ def trials(
             raise ScenarioError(f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=called)
     if not scenario.random and not live:
         del chosen[1:]
-    texts = tuple(_assignments(set) if isinstance(set, Mapping) else set)
+    texts = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
     return [Trial(reseed_scenario(scenario, seed), called, texts, live) for seed in chosen]
 
 
@@ -152,11 +155,11 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
             raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
 
 
-def _assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Yields overrides as the command line takes them."""
     for key, value in overrides.items():
         if isinstance(value, Mapping) and not is_distribution(value):
-            yield from _assignments(value, f"{prefix}{key}.")
+            yield from list_assignments(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}={format_toml_value(value)}"
 

@@ -7,11 +7,16 @@ everything that did not hold, an `error` for a run without a result.
 
 import re
 import xml.etree.ElementTree as Xml
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from msgspec.structs import asdict
+
+from ...reporting.result_text import Block, MarkedText
 from ...reporting.text_table import TextTable
+from ...results import Result
 from ..intervals import MeanInterval, mean_interval
 from .expectations import ExpectationResult
 from .trial import TrialResult
@@ -40,7 +45,8 @@ class ExpectationRow(NamedTuple):
         return mark, self.scenario, self.key, worst.limit, worst.measured, margin, held
 
 
-class TrialReport(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class TrialReport(Result):
     """All results, in the order of scenarios and seeds, and how long all of them took, s."""
 
     results: list[TrialResult]
@@ -90,9 +96,42 @@ class TrialReport(NamedTuple):
         cells = [(*row.cells(), str(row.mean) if row.mean else "") for row in rows]
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
-    def text(self) -> str:
-        """Returns all of it as plain text."""
-        return "\n".join([*self.table(), *self.failures(), *self.remarks()])
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text."""
+        heads, *rows = self.table()
+        yield heads
+        for line in rows:
+            mark, _, rest = line.partition(" ")
+            yield MarkedText(f"[{'green' if mark == 'ok' else 'red'}]{mark}[/]", rest)
+        yield from [*self.failures(), *self.remarks()]
+
+    def headline(self) -> str:
+        """Returns how many runs held."""
+        return f"{sum(result.held for result in self.results)} of {len(self.results)} runs as expected"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat test --json`."""
+        runs = [
+            {
+                "scenario": one.trial.source,
+                "seed": one.trial.scenario.seed,
+                "held": one.held,
+                "error": one.error or None,
+                "log": str(one.log) if one.log else None,
+                "again": one.trial.again,
+                "expected": [asdict(outcome) for outcome in one.outcomes],
+            }
+            for one in self.results
+        ]
+        return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per run and expectation."""
+        return [
+            {"scenario": one.trial.source, "seed": one.trial.scenario.seed, **asdict(outcome)}
+            for one in self.results
+            for outcome in one.outcomes
+        ]
 
 
 def format_margin(margin: float | None) -> str:

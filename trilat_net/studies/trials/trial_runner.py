@@ -76,6 +76,11 @@ def check(
 ) -> TrialReport:
     """Runs a scenario in virtual time, once per seed, and returns the results if all of [expect] held.
 
+    The command is `trilat test`.
+
+    >>> tn.check("free", jobs=1).held
+    True
+
     Args:
         source: the name of a shipped scenario, a path, or a scenario.
         seeds: which seeds; none means the scenario's own.
@@ -90,5 +95,5 @@ def check(
     """
     report = run_trials(trials(source, seeds, set), jobs, on=on)
     if not report.held:
-        raise AssertionError(f"not as expected\n{report.text()}")
+        raise AssertionError(f"not as expected\n{report.summary()}")
     return report

@@ -4,9 +4,10 @@ Invariant: the result is a function of the plan alone; neither the number of pro
 The gains that the paper prints are measured, never searched, and stand on no front.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -15,6 +16,7 @@ from ...errors import ScenarioError, UsageError
 from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
 from ...process import count_cores
+from ...results import Result
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .candidate import (
     CandidateScore,
@@ -147,12 +149,39 @@ _PROBE_S = 2.0
 """Duration of the run by which a search is estimated, s."""
 
 
-class TuningResult(NamedTuple):
+@dataclass(frozen=True, repr=False)
+class TuningResult(Result):
     """A comparison that was run; laws in the order in which they were asked for."""
 
     plan: TuningPlan
     found: list[CandidateSearch]
     printed: list[PaperGainsResult]
+
+    def blocks(self) -> Iterator[Any]:
+        """Yields its text."""
+        from .tuning_report import compose_tuning
+
+        return compose_tuning(self)
+
+    def headline(self) -> str:
+        """Returns which laws were compared in which scenario."""
+        fronts = ", ".join(f"{one.space.law} {len(one.front)}" for one in self.found)
+        return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat compare --tune --json`."""
+        from .tuning_report import tuning_to_json
+
+        return tuning_to_json(self)
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per candidate."""
+        laws = self.to_dict()["laws"].items()
+        return [
+            {"law": law, **{key: value for key, value in one.items() if key != "gains"}, **one["gains"]}
+            for law, found in laws
+            for one in found["candidates"]
+        ]
 
     def candidate(self, found: CandidateSearch, place: int) -> TuningScenario:
         """Returns one candidate as an experiment."""

@@ -8,7 +8,7 @@ stable run at the pose is drawn, on a front or not; the gains that the paper pri
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from ...analysis.json_values import JsonObject
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.palette import SITE_COLOURS
+from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
 from .candidate import CandidateScore
@@ -30,6 +31,35 @@ from .final_posture import CLASS_MEANINGS, CandidateClass
 from .pareto_search import REFINEMENT_STEPS, CandidateSearch, Objective
 from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, TuningPlan, TuningResult
+
+_MAX_FRONT_ROWS = 8
+"""Points of a front that the text shows; the files hold all."""
+
+
+def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
+    """Yields the laws, the classes, the fronts, the gains as printed, notes, and commands to run."""
+    yield tabulate_laws(tuned)
+    yield from (f"  {line}" for line in list_class_meanings())
+    for law in tuned.found:
+        if law.front:
+            yield ""
+            yield tabulate_front(tuned, law, _MAX_FRONT_ROWS)
+    yield f"  * no candidate of any law is better in both; of long fronts {_MAX_FRONT_ROWS} points are shown"
+    yield ""
+    yield tabulate_paper_gains(tuned)
+    for law in tuned.found:
+        for gain in tuned.at_edge(law):
+            yield f"note: {law.space.law} is best at the edge of the range of {gain}; widen the search"
+    yield ""
+    if not any(law.front for law in tuned.found):
+        yield (
+            "no candidate of any law is stable and at the pose: a longer --duration or a larger --budget "
+            "may show more"
+        )
+        return
+    yield "the last of each front, to run; front.md has the others:"
+    for law in tuned.found:
+        yield from (f"  {tuned.candidate(law, place).command}" for place in law.front[-1:])
 
 
 def tabulate_laws(tuned: TuningResult) -> TextTable:

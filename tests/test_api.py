@@ -1,0 +1,129 @@
+"""What `import trilat_net` offers: all that the command can do, described by examples that run."""
+
+import doctest
+import inspect
+import json
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.cli.running import trilat
+from trilat_net.errors import UsageError
+from trilat_net.results import Result
+
+FUNCTIONS = [name for name in tn.__all__ if name != "__version__"]
+
+
+def test_what_a_key_completes_is_what_there_is() -> None:
+    assert dir(tn) == sorted(tn.__all__)
+    assert all(getattr(tn, name) for name in dir(tn))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
+    text = inspect.getdoc(getattr(tn, name)) or ""
+    assert doctest.DocTestParser().get_examples(text), f"{name} shows no example"
+
+
+SLOW = {"check", "certify", "hand", "linear", "margin", "report", "run", "sweep", "tune"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name in SLOW else []) for name in FUNCTIONS]
+)
+def test_its_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = inspect.getdoc(getattr(tn, name)) or ""
+    example = doctest.DocTestParser().get_doctest(text, {"tn": tn}, name, None, None)
+    printed: list[str] = []
+    result = doctest.DocTestRunner(verbose=False).run(example, out=printed.append)
+    assert result.failed == 0, "".join(printed)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tn.simulate("two_sites", duration_s=0.2).save(tmp_path_factory.mktemp("api") / "run.mcap")
+
+
+class _Texts(HTMLParser):
+    """The texts of a page, without its marks."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.feed(page)
+
+    def handle_data(self, data: str) -> None:
+        self.words += data.split()
+
+
+RESULTS: dict[str, Callable[[Path], Result]] = {
+    "certify": tn.certify,
+    "metrics": tn.metrics,
+    "verify": tn.verify,
+    "log info": tn.info,
+    "log check": tn.check_file,
+    "compare": lambda file: tn.compare(file, file),
+    "rerun": lambda file: tn.rerun(file, ["s"], {"control.Kd": 5}),
+}
+
+
+@pytest.mark.parametrize("command", RESULTS)
+def test_a_result_says_what_its_command_prints(command: str, file: Path) -> None:
+    more = {"compare": [file], "rerun": ["--replace", "s", "--set", "control.Kd=5"]}.get(command, [])
+    found = RESULTS[command](file)
+    printed = trilat(*command.split(), file, *more, cwd=file.parent)
+    assert found.summary().split() == (printed.out + printed.err).split()
+    as_json = json.loads(trilat(*command.split(), file, *more, "--json", cwd=file.parent).out)
+    assert {**as_json, "file": None} == {**json.loads(json.dumps(found.to_dict())), "file": None}
+    assert "\n" not in repr(found)
+    assert repr(found).startswith(f"<{type(found).__name__} ")
+    assert _Texts(found._repr_html_()).words == found.summary().split()
+    frame = found.to_frame()
+    assert len(frame) == len(found.to_rows()) > 0
+
+
+def test_a_simulated_log_is_saved_as_the_command_writes_it(tmp_path: Path) -> None:
+    log = tn.simulate("jitter", duration_s=0.3, seed=4)
+    log.save(tmp_path / "api.mcap")
+    trilat("sim", "jitter", "--duration", "0.3", "--seed", "4", "-o", "cli.mcap", cwd=tmp_path)
+    assert (tmp_path / "api.mcap").read_bytes() == (tmp_path / "cli.mcap").read_bytes()
+    with pytest.raises(UsageError, match="exists"):
+        log.save(tmp_path / "api.mcap")
+
+
+def test_nothing_changes_a_log_by_accident(file: Path) -> None:
+    site = tn.open_log(file)["m"]
+    for values in (site.q, site.t_s, site.tick, site.used["s"], site.theta_hat):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 1
+
+
+def test_a_log_completes_its_sites_and_becomes_a_frame(file: Path) -> None:
+    log = tn.open_log(file)
+    assert log._ipython_key_completions_() == ["m", "s"]
+    assert list(log.to_frame()["records"]) == [200, 200]
+    frame = log.to_frame("m")
+    assert np.array_equal(frame["q1_rad"], log["m"].q[:, 0])
+    assert log.frame("m").to_pandas().equals(frame)
+    assert len(log.to_frame("events")) == len(log.events)
+
+
+def test_a_scenario_is_a_name_a_text_its_tables_or_itself(tmp_path: Path) -> None:
+    named = tn.load_scenario("two_sites", ["duration_s=0.5"])
+    text = named.text
+    (tmp_path / "mine.toml").write_text(text)
+    for source in (named, text, tmp_path / "mine.toml"):
+        assert tn.load_scenario(source) == named
+    assert tn.load_scenario("two_sites", {"control.Kd": 5}, seed=3).seed == 3
+
+
+def test_without_pandas_an_error_says_what_to_install(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(UsageError, match=r"pip install 'trilat-net\[frames\]'"):
+        tn.metrics(file).to_frame()
