@@ -183,7 +183,7 @@ def test_a_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
 
 
 def test_growth_fails_a_run_whatever_v_did() -> None:
-    grown = still()._replace(end=still().end._replace(behaviour=EndBehaviour.GROWS))
+    grown = replace(still(), end=still().end._replace(behaviour=EndBehaviour.GROWS))
     assert grown.stability is Stability.NOT_STABLE
     assert not grown.accepts(("bounded", "open"))
 
@@ -201,7 +201,7 @@ def test_growth_fails_a_run_whatever_v_did() -> None:
 def test_only_what_is_accepted_passes_besides_a_stable_run(
     behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
 ) -> None:
-    found = still()._replace(end=still().end._replace(behaviour=behaviour))
+    found = replace(still(), end=still().end._replace(behaviour=behaviour))
     assert not found.passed
     assert found.accepts(accepted) is passes
 
@@ -214,10 +214,10 @@ def test_a_broken_balance_is_never_accepted() -> None:
 
 def test_an_unstable_rest_leaves_a_run_open() -> None:
     roots = EndPoseRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
-    assert still()._replace(roots=roots).stability is Stability.OPEN
-    assert roots.text in still()._replace(roots=roots).reasons
-    assert not still()._replace(roots=roots._replace(exact=False)).passed  # a doubt, if no proof
-    assert still()._replace(roots=roots._replace(verdict="stable")).passed
+    assert replace(still(), roots=roots).stability is Stability.OPEN
+    assert roots.text in replace(still(), roots=roots).reasons
+    assert not replace(still(), roots=roots._replace(exact=False)).passed  # a doubt, if no proof
+    assert replace(still(), roots=roots._replace(verdict="stable")).passed
 
 
 def test_v_that_rises_at_the_end_or_ends_above_its_beginning_is_named() -> None:
