@@ -33,7 +33,7 @@ def test_markdown_escapes_bars_and_marks_numbers() -> None:
 
 def test_a_terminal_gets_every_cell_and_no_control_characters() -> None:
     console = Console(file=StringIO(), width=12)
-    console.print(TABLE.rich({"7": "green"}))
+    console.print(TABLE._replace(styles={"7": "green"}).rich())
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "\x1b" not in text
     assert "".join(text.split()).count("[red]") == 1
