@@ -71,10 +71,10 @@ class PeerInbox:
         self._last[index] = max(self._last[index], first - 1)
         self._passed_over[index] = self._last[index]
 
-    def newest_tick(self, index: int) -> int | None:
-        """Returns the newest tick of a peer's start of which a sample came; None without any."""
+    def newest_before(self, index: int, boot: int) -> int | None:
+        """Returns the newest tick of which a sample came of a peer's start, if this is another one."""
         newest = self._last[index]
-        return newest if newest > self._passed_over[index] else None
+        return newest if boot != self._boots[index] and newest > self._passed_over[index] else None
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS."""

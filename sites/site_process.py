@@ -305,7 +305,7 @@ class RunningSite:
 
     def _tell_last(self, index: int, coming: Event, t_ns: int) -> None:
         """Publishes how far the start of a peer was heard that ends now: it may not have been able to."""
-        newest = self._inbox.newest_tick(index)
+        newest = self._inbox.newest_before(index, coming.boot)
         if newest is not None:
             text = f"of the start of {coming.member} before came samples up to tick {newest}"
             about = {"about": coming.member, "boots": {coming.member: coming.boot}, "ticks": newest + 1}

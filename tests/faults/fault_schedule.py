@@ -13,9 +13,9 @@ from trilat_net.net.requests import ChangeRequest
 SITES = ("m1", "m2", "s")
 MEMBERS = (*SITES, "recorder")
 LENGTH_S = 5.0
-TROUBLE_S = (0.8, 2.2)
+TROUBLE_S = (0.5, 1.6)
 """Tick 0 is at 0 s."""
-HEALED_S = 2.4
+HEALED_S = 1.8
 MOST_FAULTS = 4
 
 

@@ -2,7 +2,9 @@
 
 import gc
 import hashlib
+import math
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +14,7 @@ from typing import NamedTuple
 
 from .fault_schedule import Fault, describe, draw_faults
 from .fault_session import FaultSession, run_faults
-from .invariants import INVARIANTS, check_torque, find_holds, largest_step
+from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, find_rises, largest_steps
 
 TORQUE, AGAIN = "I6 torque", "I11 again"
 
@@ -25,12 +27,16 @@ class Judged(NamedTuple):
         violations: by invariant, in words; empty if all held.
         visited: how often what happened: modes that were entered, events, what was dropped, how sites ended.
         holds: ticks from the last sample that came into use to each hold.
+        steps_nm: the largest step of a torque between ticks, by mode.
+        rises_j: how much the storage rises in a tick of a hold, as `find_rises` says.
     """
 
     faults: Sequence[Fault]
     violations: dict[str, list[str]]
     visited: Counter[str]
     holds: list[int]
+    steps_nm: dict[str, float]
+    rises_j: tuple[float, float]
 
     def __str__(self) -> str:
         found = [f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]]
@@ -40,6 +46,13 @@ class Judged(NamedTuple):
 def judge_seed(seed: int, *, again: bool = True) -> Judged:
     """Judges the faults of a seed; `again` runs them twice and compares."""
     return judge_faults(draw_faults(seed), seed, again=again)
+
+
+def time_seed(seed: int) -> tuple[Judged, float]:
+    """Judges the faults of a seed, run twice; with what that took of a processor, s."""
+    find_undisturbed_step()
+    began_s = time.process_time()
+    return judge_seed(seed), time.process_time() - began_s
 
 
 def judge_faults(faults: Sequence[Fault], seed: int = 0, *, again: bool = False) -> Judged:
@@ -56,7 +69,15 @@ def judge_faults(faults: Sequence[Fault], seed: int = 0, *, again: bool = False)
                 if digest_session(run_faults(faults, Path(folder), seed)) != digest:
                     found[AGAIN] = ["the same seed publishes or records other bytes"]
         violations = {name: texts for name, texts in found.items() if texts}
-        return Judged(faults, violations, count_visited(session), list(find_holds(session)))
+        rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
+        return Judged(
+            faults,
+            violations,
+            count_visited(session),
+            list(find_holds(session)),
+            largest_steps(session.published, 0),
+            (float(max(at_rest for at_rest, _ in rises_j)), float(max(before for _, before in rises_j))),
+        )
 
 
 @contextmanager
@@ -74,7 +95,7 @@ def collector_at_rest() -> Iterator[None]:
 def find_undisturbed_step() -> float:
     """The largest step of a torque in the session without faults, after its first 0.1 s, N m."""
     with tempfile.TemporaryDirectory() as folder:
-        return largest_step(run_faults((), Path(folder)).published, 100)
+        return max(largest_steps(run_faults((), Path(folder)).published, START_TICKS).values())
 
 
 def digest_session(session: FaultSession) -> str:
