@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
-from trilat_net.core.jit import is_core_cached
+from trilat_net.core.jit import COMPILING, compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.net import topics
@@ -106,7 +106,8 @@ def run_demo(
         layouts = {arm.counts: name for name, arm in scenario.arms.items()}
         chains = any(arm.chain is not None for arm in scenario.arms.values())
         if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
-            display.say("compiling, once for this machine and each number of joints ...")
+            display.say(COMPILING)
+            compiling_notice.said = True
             with interrupt.raising():
                 for name in layouts.values():
                     warm_up(scenario, name)  # once for all children

@@ -9,7 +9,7 @@ import errno
 import gc
 import os
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
-from ..reporting.terminal_output import err, print_error
+from ..reporting.terminal_output import err, print_error, print_line
 from . import (
     bench,
     certify,
@@ -74,6 +74,24 @@ app = typer.Typer(
     help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
     epilog="Begin with: trilat demo paper",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print_line(f"trilat-net {version('trilat-net')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    _: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+    ] = False,
+) -> None:
+    pass
 
 
 def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any) -> typer.Typer:

@@ -121,7 +121,7 @@ def bench_command(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="Folder; a suite in it goes on. Default: runs/bench-STUDY."
+            "--out", "-o", metavar="DIR", help="Folder; a suite in it goes on. Default: runs/bench-STUDY."
         ),
     ] = None,
     jobs: options.JobsOption = None,

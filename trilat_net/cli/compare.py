@@ -94,7 +94,9 @@ def compare_command(
     on: options.OnOption = None,
     output: Annotated[
         Path | None,
-        _option("--out", metavar="DIR", help="Folder of the results; default: the next free runs/tune-..."),
+        _option(
+            "--out", "-o", metavar="DIR", help="Folder of the results; default: the next free runs/tune-..."
+        ),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,

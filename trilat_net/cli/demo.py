@@ -13,11 +13,13 @@ def demo_command(
     scenario: options.ScenarioArgument = "paper",
     duration: options.DurationOption = None,
     folder: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder of the results; default: runs/NAME-N.")
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder of the results; default: runs/NAME-N."),
     ] = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live: each site and a recorder as a process over Zenoh, then verifies and reports."""
     from sites.demo_session import demo_session_name, run_demo
@@ -27,11 +29,12 @@ def demo_command(
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     results = make_results_folder(folder, chosen.name, force=force)
-    terminal.print_text(chosen.title or chosen.name)
-    members = f"{', '.join(chosen.names)} and a recorder, session {demo_session_name(chosen)}"
-    terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
-    with SessionDisplay(chosen, terminal.out) as display:
-        outcome = run_demo(chosen, results, display)
+    with terminal.lines_aside(as_json):
+        terminal.print_text(chosen.title or chosen.name)
+        members = f"{', '.join(chosen.names)} and a recorder, session {demo_session_name(chosen)}"
+        terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
+        with SessionDisplay(chosen, terminal.out) as display:
+            outcome = run_demo(chosen, results, display)
     for problem in outcome.problems:
         terminal.print_error(problem)
     if outcome.interrupted:
@@ -40,6 +43,6 @@ def demo_command(
         raise typer.Exit(128 + outcome.interrupted)
     if not outcome.log.exists():
         raise typer.Exit(outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)

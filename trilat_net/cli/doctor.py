@@ -21,9 +21,9 @@ def doctor_command(
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Ask its members for their clocks, too.")
     ] = None,
-    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where results would go.")] = Path(
-        "runs"
-    ),
+    folder: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results would go.")
+    ] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
     """Examines keys, links, clocks, real-time rights, disk and processors: a line for each finding.

@@ -19,7 +19,11 @@ def figure_command(
     file: options.LogArgument,
     names: Annotated[
         list[str] | None,
-        typer.Argument(help="Names of figures, see --list; default: all that FILE has.", metavar="NAME"),
+        typer.Argument(
+            help="Names of figures, see --list; default: all that FILE has.",
+            metavar="NAME",
+            autocompletion=options.complete_figures,
+        ),
     ] = None,
     width_in: Annotated[
         float, typer.Option("--width", metavar="3.5|7", help="Width of one or two columns of a paper, in.")

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from ..reporting import terminal_output as terminal
+from . import options
 
 
 def keys_new_command(
@@ -56,10 +57,14 @@ def keys_pair_command(
 
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
+    as_json: options.JsonOption = False,
 ) -> None:
     """Shows whose keys these are, until when they hold, and the settings of Zenoh that they make."""
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)
+    if as_json:
+        facts = {"member": keys.member, "members": list(keys.members), "until": keys.ends.isoformat()}
+        return terminal.print_json({**facts, "zenoh": keys.settings})
     terminal.print_line(f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC")
-    terminal.print_json(keys.settings)
+    return terminal.print_json(keys.settings)

@@ -33,11 +33,13 @@ def live_command(
     ] = True,
     duration: options.DurationOption = None,
     folder: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder of the results; default: runs/NAME-N.")
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder of the results; default: runs/NAME-N."),
     ] = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live with a page to watch and take part, until its button or Ctrl-C; then reports.
 
@@ -50,7 +52,7 @@ def live_command(
     page = PageOptions(host, port, insecure, browser)
     page.check()
     if session is not None:
-        alone = {"--duration", "--out", "--seed", "--set", "--force", "scenario"}
+        alone = {"--duration", "--out", "--seed", "--set", "--force", "--json", "scenario"}
         if extra := alone & set(options.given_options(context)):
             raise UsageError(f"--session shows a session that runs: leave out {', '.join(sorted(extra))}")
         connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
@@ -59,7 +61,7 @@ def live_command(
         raise typer.Exit(code)
     if connect or router or zenoh_config or keys:
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
-    _run_session(page, scenario, folder, duration, seed, overrides, force=force)
+    _run_session(page, scenario, folder, duration, seed, overrides, force=force, as_json=as_json)
 
 
 def _run_session(
@@ -71,6 +73,7 @@ def _run_session(
     overrides: list[str] | None,
     *,
     force: bool,
+    as_json: bool,
 ) -> None:
     from live.live_session import LONGEST_S, PageOptions, attend_with_page
     from sites.demo_session import run_demo
@@ -84,13 +87,13 @@ def _run_session(
         source, overrides, LONGEST_S if duration is None else duration, seed
     )
     results = make_results_folder(folder, chosen.name, force=force)
-    terminal.print_text(chosen.title or chosen.name)
-    with SessionDisplay(chosen, terminal.out) as display:
+    with terminal.lines_aside(as_json), SessionDisplay(chosen, terminal.out) as display:
+        terminal.print_text(chosen.title or chosen.name)
         outcome = run_demo(chosen, results, display, attend_with_page(page, SystemClock(), display.say))
     for problem in outcome.problems:
         terminal.print_error(problem)
     if not outcome.log.exists():
         raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)

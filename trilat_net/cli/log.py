@@ -59,6 +59,7 @@ def log_sign_command(
         Path, typer.Option("--key", metavar="KEY", help="Private key, as trilat keys pair makes one.")
     ],
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Signs a finished log with Ed25519: writes FILE.sig, and leaves FILE as it is.
 
@@ -69,7 +70,10 @@ def log_sign_command(
 
     with terminal.progress_bar(f"reading {file}") as progress:
         made = sign_log(file, key, force=force, progress=progress)
-    terminal.print_text(f"{made}: signs {file}")
+    if as_json:
+        terminal.print_json({"file": str(file), "signature": str(made)})
+    else:
+        terminal.print_text(f"{made}: signs {file}")
 
 
 def log_recover_command(
@@ -77,7 +81,11 @@ def log_recover_command(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="OUT", help="Default: FILE without .active, or FILE.recovered.mcap."
+            "-o",
+            "--out",
+            "--output",
+            metavar="OUT",
+            help="Default: FILE without .active, or FILE.recovered.mcap.",
         ),
     ] = None,
     force: options.ForceOption = False,
@@ -118,6 +126,7 @@ def log_export_command(
         ),
     ] = None,
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Exports a log to files for other tools: names end in their units, numbers are exact."""
     from ..errors import UsageError
@@ -131,8 +140,11 @@ def log_export_command(
     exporter = Exporter(chosen, path, force=force)
     with terminal.progress_bar(f"writing {path}") as progress:
         exporter.export(log, progress)
-    records = sum(len(log[site]) for site in log.sites)
-    terminal.print_text(f"{path}: {records} records of {', '.join(log.sites)}")
+    records = {site: len(log[site]) for site in log.sites}
+    if as_json:
+        terminal.print_json({"file": str(path), "format": form, "records": records})
+    else:
+        terminal.print_text(f"{path}: {sum(records.values())} records of {', '.join(records)}")
 
 
 def log_view_command(

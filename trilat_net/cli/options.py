@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,44 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
-ScenarioArgument = Annotated[str, typer.Argument(help="Name of a shipped scenario, or path of a TOML file.")]
+def complete_scenarios(incomplete: str) -> list[str]:
+    """Returns what a shell completes to a scenario: shipped names, and TOML files and folders here."""
+    shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
+    names = [name for name in shipped if "." not in name and not name.startswith("_")]
+    folder = Path(incomplete).parent if "/" in incomplete else Path()
+    here = [str(path) for path in folder.glob("*.toml")] if folder.is_dir() else []
+    return sorted(name for name in [*names, *here] if name.startswith(incomplete))
+
+
+def complete_figures(incomplete: str) -> list[str]:
+    """Returns what a shell completes to the name of a figure."""
+    from ..reporting.figures.registry import FIGURES
+
+    return [name for name in FIGURES if name.startswith(incomplete)]
+
+
+def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
+    """Returns what a shell completes to a site: those of the scenario or the log that was named before."""
+    from ..errors import TrilatError
+    from ..log.log_reader import open_log
+    from ..scenario import load_scenario
+
+    files = context.params.get("files") or []
+    try:
+        names = open_log(*files).sites if files else load_scenario(context.params["scenario"]).names
+    except (TrilatError, KeyError, TypeError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
+_SCENARIOS = resources.files("trilat_net") / "scenarios"
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a shipped scenario, or path of a TOML file.", autocompletion=complete_scenarios
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as in control.Kd=5; repeatable."),

@@ -20,7 +20,14 @@ def record_command(
     keys: options.KeysOption = None,
     insecure: options.InsecureOption = False,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: SESSION.mcap.")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            "--output",
+            metavar="FILE",
+            help="Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
+        ),
     ] = None,
     join_timeout: Annotated[
         float | None,
@@ -78,7 +85,7 @@ def record_command(
     connection = options.resolve_connection(
         listen, connect, router, zenoh_config, [], None, keys, insecure=insecure
     )
-    path = output if output is not None else Path(f"{options.check_session_name(session)}.mcap")
+    path = _choose_path(output, options.check_session_name(session), concluded=concluded)
     place = LogStorage(
         path,
         force=force,
@@ -101,6 +108,18 @@ def record_command(
         options.check_session_name(session), place, connection, join_timeout, clock, terminal.print_line, then
     )
     raise typer.Exit(code)
+
+
+def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
+    """Returns where the log goes; the folder of a log with a report is made."""
+    from ..files import make_folder, make_results_folder
+
+    if not concluded:
+        return output if output is not None else Path(f"{session}.mcap")
+    if output is None:
+        return make_results_folder(None, session, force=False) / "run.mcap"
+    make_folder(output.parent)
+    return output
 
 
 def _conclude(parts: list[Path]) -> None:

@@ -14,14 +14,20 @@ def rerun_command(
     files: options.LogsArgument,
     replace: Annotated[
         list[str] | None,
-        typer.Option("--replace", metavar="SITE", help="Execute this site again; repeatable."),
+        typer.Option(
+            "--replace",
+            metavar="SITE",
+            help="Execute this site again; repeatable.",
+            autocompletion=options.complete_sites,
+        ),
     ] = None,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Execute all sites, over the network of the log.")
     ] = False,
     overrides: options.SetOption = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result as a log.")
+        Path | None,
+        typer.Option("-o", "--out", "--output", metavar="FILE", help="Write the result as a log."),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,

@@ -11,13 +11,19 @@ from ..reporting.text_table import TextTable
 from . import options
 
 
-def scenario_list_command() -> None:
+def scenario_list_command(as_json: options.JsonOption = False) -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario
 
     chosen = [(name, load_scenario(name)) for name in list_shipped()]
+    if as_json:
+        facts = [
+            {"name": name, "sites": one.names, "duration_s": one.duration_s, "title": one.title}
+            for name, one in chosen
+        ]
+        return terminal.print_json(facts)
     rows = [(name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen]
-    terminal.print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
+    return terminal.print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
 
 
 def scenario_show_command(
@@ -33,6 +39,7 @@ def scenario_show_command(
 def scenario_check_command(
     file: options.ScenarioArgument,
     overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Checks a scenario, and prints its consequences."""
     from ..scenario.describe import describe_scenario
@@ -40,8 +47,13 @@ def scenario_check_command(
 
     scenario = options.load_chosen_scenario(file, overrides, None, None)
     check_outside_arms(scenario)
-    for line in describe_scenario(scenario):
+    lines = describe_scenario(scenario)
+    if as_json:
+        facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
+        return terminal.print_json(facts)
+    for line in lines:
         terminal.print_text(line)
+    return None
 
 
 def scenario_new_command(

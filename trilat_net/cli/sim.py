@@ -13,13 +13,14 @@ from . import options
 def sim_command(
     scenario: options.ScenarioArgument,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: NAME.mcap.")
+        Path | None, typer.Option("-o", "--out", "--output", metavar="FILE", help="Default: NAME.mcap.")
     ] = None,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Runs the same experiment in virtual time, into the same kind of log."""
     from ..execution.virtual import record_virtual
@@ -33,7 +34,12 @@ def sim_command(
     if interrupt.requested():
         terminal.err.print(f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True)
         raise typer.Exit(interrupt.exit_code)
-    terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+    if as_json:
+        from ..log.log_reader import open_log
+
+        terminal.print_json(open_log(path).to_dict())
+    else:
+        terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
     if not within:
         chains = any(spec.arm.urdf for spec in chosen.sites.values())
         terminal.print_error(

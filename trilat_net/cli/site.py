@@ -13,9 +13,18 @@ from . import options
 
 
 def site_command(
-    name: Annotated[str, typer.Argument(help="Name of the site in the scenario.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites),
+    ],
     scenario: Annotated[
-        str, typer.Option("--scenario", "-s", help="Name of a shipped scenario, or path of a TOML file.")
+        str,
+        typer.Option(
+            "--scenario",
+            "-s",
+            help="Name of a shipped scenario, or path of a TOML file.",
+            autocompletion=options.complete_scenarios,
+        ),
     ],
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Default: the scenario's name.")

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
-def _check_modes(given: Sequence[str]) -> None:
-    """Refuses options of two modes at once, and options of a mode that is not chosen."""
+def _check_modes(given: Sequence[str]) -> Sequence[str]:
+    """Returns options; refuses those of two modes at once, and those of a mode that is not chosen."""
     chosen = [name for name in ("--map", "--margin", "--confirm", "--cell") if name in given]
     if len(chosen) > 1:
         raise UsageError(f"{' and '.join(chosen)} exclude each other: give one at a time")
@@ -41,6 +41,7 @@ def _check_modes(given: Sequence[str]) -> None:
         raise UsageError("--width is of a map: use it with --map")
     if "--tolerance" in given and "--margin" not in given:
         raise UsageError("--tolerance is of an edge: use it with --margin")
+    return given
 
 
 def _draw_map(
@@ -61,7 +62,13 @@ def _draw_map(
 
 
 def _search_margins(
-    asked: "SweepPlan", within: "SearchRange", folder: Path | None, jobs: int | None, on: str | None
+    asked: "SweepPlan",
+    within: "SearchRange",
+    folder: Path | None,
+    jobs: int | None,
+    on: str | None,
+    *,
+    as_json: bool,
 ) -> None:
     """Searches edges along one key, prints them with theory, and writes margin.json and margin.md.
 
@@ -73,9 +80,11 @@ def _search_margins(
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
     with terminal.progress_bar("searching") as progress:
         found = SweepMargins(asked, within, search_margins(asked, within, jobs, progress, on))
-    terminal.out.print()
-    terminal.print_result(found)
-    terminal.print_paths(found.write(chosen))
+    paths = found.write(chosen)
+    if not as_json:
+        terminal.out.print()
+    terminal.print_result(found, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
@@ -220,17 +229,20 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
     yield line
 
 
-def _print_cell_commands(path: Path, number: int) -> None:
+def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_run import build_reproduce_command
 
     results = read_results(path)
+    if as_json:
+        return terminal.print_json([dict(row) for row in results.of_cell(number)])
     for row in results.of_cell(number):
         command, note = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
         if note:
             terminal.print_note(note)
         terminal.print_line(command)
+    return None
 
 
 def sweep_command(
@@ -240,6 +252,7 @@ def sweep_command(
         typer.Argument(
             metavar="[SCENARIO|RESULTS]",
             help="Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.",
+            autocompletion=options.complete_scenarios,
         ),
     ] = None,
     over: Annotated[
@@ -319,6 +332,7 @@ def sweep_command(
             help="With results: run this many cells on each side of the edge live.",
         ),
     ] = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
@@ -329,8 +343,7 @@ def sweep_command(
     from ..studies.sweep.sweep_results import require_polars
 
     require_polars()
-    given = options.given_options(context)
-    _check_modes(given)
+    given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     if cell is not None or resume is not None or results is not None:
         _refuse_beside_results(given)
@@ -339,30 +352,31 @@ def sweep_command(
     if resume is not None:
         if scenario is not None or cell is not None:
             raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
-        swept = _resume_sweep(open_sweep_folder(resume), jobs, on, yes=yes)
+        with terminal.lines_aside(as_json):
+            swept = _resume_sweep(open_sweep_folder(resume), jobs, on, yes=yes)
     elif cell is not None:
         if scenario is None:
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
-        return _print_cell_commands(Path(scenario), cell)
+        return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
-        return _show_results(results, jobs, on, mapped=mapped, width=width, confirm=confirm)
+        return _show_results(results, jobs, on, mapped=mapped, width=width, confirm=confirm, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
         within = None if margin is None else parse_search_range(margin, tolerance)
-        asked = plan_sweep(
-            scenario,
-            options.list_overrides(overrides, duration),
-            over=[*(over or []), *([] if within is None else [format_range_axis(within)])],
-            seeds=parse_seed_count(seeds),
-            laws=options.split_names(law),
-            longest_s=longest,
-        )
+        axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
+        laws, texts = options.split_names(law), options.list_overrides(overrides, duration)
+        count = parse_seed_count(seeds)
+        asked = plan_sweep(scenario, texts, over=axes, seeds=count, laws=laws, longest_s=longest)
         if within is not None:
-            return _search_margins(asked, within, output, jobs, on)
-        swept = _start_sweep(asked, output, jobs, on, yes=yes)
+            return _search_margins(asked, within, output, jobs, on, as_json=as_json)
+        with terminal.lines_aside(as_json):
+            swept = _start_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
-        _draw_map(swept.results, swept.folder.path, width, jobs, on)
+        with terminal.lines_aside(as_json):
+            _draw_map(swept.results, swept.folder.path, width, jobs, on)
+    if as_json:
+        terminal.print_json(swept.results.to_dict())
     return None
 
 
@@ -374,17 +388,21 @@ def _show_results(
     mapped: bool,
     width: float | None,
     confirm: int | None,
+    as_json: bool,
 ) -> None:
     from ..studies.sweep import read_results
 
     results = read_results(path)
-    if confirm is not None:
-        _confirm_cells(results, confirm)
-    elif mapped:
-        _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
-    else:
-        _print_plan(results.plan)
-        _print_results(results, [], path)
+    with terminal.lines_aside(as_json):
+        if confirm is not None:
+            _confirm_cells(results, confirm)
+        elif mapped:
+            _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
+        else:
+            _print_plan(results.plan)
+            _print_results(results, [], path)
+    if as_json:
+        terminal.print_json(results.to_dict())
 
 
 def _refuse_beside_results(given: Sequence[str]) -> None:

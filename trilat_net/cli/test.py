@@ -25,7 +25,9 @@ def test_command(
     scenarios: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[SCENARIO]...", help="Names or paths; none: all that are shipped with \\[expect]."
+            metavar="[SCENARIO]...",
+            help="Names or paths; none: all that are shipped with \\[expect].",
+            autocompletion=options.complete_scenarios,
         ),
     ] = None,
     live: Annotated[

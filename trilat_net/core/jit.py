@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from numba.core import event
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -53,6 +54,30 @@ _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 def is_core_cached() -> bool:
     """True if the cache holds compiled leaves of this version of the core."""
     return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
+
+
+COMPILING = "compiling, once for this machine and each number of joints ..."
+
+
+class _CompilingNotice(event.Listener):
+    """Says once, at a terminal or in a notebook, why the first run takes longer."""
+
+    def __init__(self) -> None:
+        self.said = not (sys.stderr.isatty() or "ipykernel" in sys.modules)
+
+    def on_start(self, begun: Any) -> None:
+        """Says so as the kernel is compiled."""
+        if not self.said and begun.data["dispatcher"].py_func.__module__ == f"{__package__}.kernel":
+            self.said = True
+            print(COMPILING, file=sys.stderr, flush=True)
+
+    def on_end(self, ended: Any) -> None:
+        """Says nothing."""
+
+
+compiling_notice = _CompilingNotice()
+_register: Any = event.register
+_register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: numba.types.Record) -> tuple[str, tuple[str]]:

@@ -10,7 +10,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,15 +133,23 @@ def print_result(found: "Result", *, as_json: bool = False) -> None:
             )
 
 
-def conclude_files(paths: Sequence[Path], folder: Path) -> "tuple[Log, Conclusion]":
+@contextmanager
+def lines_aside(aside: bool) -> Iterator[None]:
+    """Prints what would go to standard output to standard error, where that is for JSON."""
+    with redirect_stdout(sys.stderr) if aside else nullcontext():
+        yield
+
+
+def conclude_files(paths: Sequence[Path], folder: Path, *, as_json: bool = False) -> "tuple[Log, Conclusion]":
     """Checks a log that was just recorded, writes its report into a folder and prints the conclusion."""
     from .conclude import conclude
 
-    out.print("checking the log and drawing ...")
+    if not as_json:
+        out.print("checking the log and drawing ...")
     log = open_with_progress(*paths)
     with progress_bar("executing and drawing") as progress:
         conclusion = conclude(log, folder, progress)
-    print_result(conclusion)
+    print_result(conclusion, as_json=as_json)
     return log, conclusion
 
 

@@ -91,9 +91,11 @@ class Trial(NamedTuple):
         Raises:
             AssertionError: something that is expected did not hold; it says what, and how to repeat it.
         """
+        __tracebackhide__ = True  # pytest shows the reason, not this line
         result = self.run()
         if not result.held:
-            raise AssertionError("\n  ".join([f"{self}:", *result.failures, self.again, self.look]))
+            reasons = "; ".join(result.failures)
+            raise AssertionError("\n  ".join([f"{self}: {reasons}", self.again, self.look]))
         return result
 
 

@@ -93,7 +93,9 @@ def check(
         UsageError: the cluster cannot be reached, or one of its workers is not fit.
         AssertionError: something did not hold; it says what, by how much, and how to repeat it.
     """
+    __tracebackhide__ = True  # pytest shows the reason, not this line
     report = run_trials(trials(source, seeds, set), jobs, on=on)
     if not report.held:
-        raise AssertionError(f"not as expected\n{report.summary()}")
+        first = next(f"{one.trial}: {'; '.join(one.failures)}" for one in report.results if not one.held)
+        raise AssertionError(f"not as expected: {first}\n{report.summary()}")
     return report
