@@ -44,11 +44,12 @@ def test_a_run_that_diverged_fails_though_its_log_is_sound(
     monkeypatch.setattr(recorder.record_process, "record_session", recorded)
     done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
     assert "FAIL" not in done.out
-    done.refuses("x.mcap", "diverged at t = ", code=1)
+    assert (tmp_path / "runs" / "x-001" / "report.html").is_file()  # a folder of its own
+    done.refuses("run.mcap", "diverged at t = ", code=1)
 
 
 def test_the_report_of_another_log_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text("another's", encoding="utf-8")
-    done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
+    done = trilat("record", "--session", "x", "--conclude", "-o", "x.mcap", cwd=tmp_path)
     done.refuses("report.html", "--force")
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == "another's"

@@ -61,7 +61,8 @@ def test_command(
         raise UsageError(f"{junit}: cannot be written")
     batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
-    report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
+    with terminal.lines_aside(as_json):
+        report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
     terminal.print_result(report, as_json=as_json)
     if junit is not None:
         write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))

@@ -1,0 +1,85 @@
+"""What holds for every command: results as JSON, outputs by one option, completion, a version."""
+
+import json
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import trilat_net as tn
+from tests.golden.surface import all_options
+
+from .running import PLAIN, trilat
+
+OPTIONS = {name: names for name, names in all_options().items() if name != "trilat"}
+COMMANDS = [name for name in OPTIONS if not any(other.startswith(f"{name} ") for other in OPTIONS)]
+NO_RESULT = {
+    *(f"trilat {name}" for name in ("site", "record", "watch", "router", "log view")),  # run until they end
+    *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
+    *(f"trilat {name}" for name in ("scenario show", "scenario new", "keys new", "keys pair")),  # files
+}
+"""Commands that print what they do, and find nothing."""
+
+
+def test_every_command_that_finds_something_prints_it_as_json() -> None:
+    assert {name for name in COMMANDS if "--json" not in OPTIONS[name]} == NO_RESULT
+
+
+def test_every_output_is_named_alike() -> None:
+    for name, names in OPTIONS.items():
+        given = {"-o", "--out", "--output"} & set(names)
+        assert not given or given >= {"-o", "--out"}, name
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert trilat("--version", cwd=Path()).succeeds() == f"trilat-net {version('trilat-net')}\n"
+    assert tn.__version__ == version("trilat-net")
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("sim tw", {"two_sites"}),
+        ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
+        ("figure run.mcap se", {"settling"}),
+        ("site --scenario two_sites ", {"m", "s"}),
+    ],
+)
+def test_a_shell_completes(words: str, found: set[str]) -> None:
+    asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    code = "from trilat_net.cli import app; app(prog_name='trilat')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {words}"},
+        capture_output=True,
+        text=True,
+    )
+    assert {line.split("\t")[0] for line in done.stdout.splitlines()} == found, done.stderr
+
+
+def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
+    made = json.loads(trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds())
+    assert made["files"] == ["two_sites.mcap"]
+    assert made["sites"]["m"]["records"] == 100
+    asked = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
+    assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {"m": 100, "s": 100}
+    shipped = json.loads(trilat("scenario", "list", "--json", cwd=tmp_path).succeeds())
+    assert {"free", "paper"} < {one["name"] for one in shipped}
+    told = json.loads(trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds())
+    assert told["sha256"] == tn.load_scenario("paper").sha256
+    ran = json.loads(trilat("test", "free", "--jobs", "1", "--json", cwd=tmp_path).out)
+    assert ran["held"]
+    assert [run["seed"] for run in ran["runs"]] == [1]
+
+
+@pytest.mark.long
+def test_a_sweep_is_json_while_its_lines_go_aside(tmp_path: Path) -> None:
+    over = ("--over", "control.d=0.3,3", "--duration", "2", "--jobs", "1", "-o", "grid")
+    first = trilat("sweep", "p_d_margin", *over, "--json", cwd=tmp_path)
+    again = trilat("sweep", "grid", "--json", cwd=tmp_path)
+    assert json.loads(first.out) == json.loads(again.out)
+    assert "2 runs of 2 cells" in first.err
+    cell = json.loads(trilat("sweep", "grid", "--cell", "1", "--json", cwd=tmp_path).out)
+    assert cell == json.loads(first.out)["runs"][1:]
