@@ -210,7 +210,9 @@ class Charts:
                     entry = {"label": f"{name}, {link.peer}", "values": percent, "dash": dash}
                     series.append({**entry, "colour": self._log.sites.index(link.peer)})
             title = f"delay and age on the way to {site}"
-            yield _chart("delays", title, "ms", series, points=len(x_ms), end=float(x_ms[-1]))
+            yield _chart(
+                "delays", title, "ms", series, x=_packed(x_ms.astype("<f4")), log=bool(x_ms[0] > 0.0)
+            )
 
     def _histograms(self) -> Iterator[JsonObject]:
         log = self._log

@@ -94,7 +94,7 @@ def write_report(
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
             data = base64.b64encode(stream.getvalue()).decode()
-            section += f'<img src="data:image/png;base64,{data}" alt="{words}" style="max-width:100%">'
+            section += f'<img src="data:image/png;base64,{data}" alt="{words}" class="picture">'
         section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
     facts["checks"] = [line._asdict() for line in lines]
@@ -141,23 +141,22 @@ def render_report(
 
 
 def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
-    """Returns a heading, a sentence and room for charts per section, or the reason why there are none."""
+    """Returns a heading, a sentence and room for charts per section, and why some are not there."""
     filled = {chart["section"] for chart in drawn}
     chains = any(arm.chain for arm in log.scenario.arms.values())
     absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
-    html = ""
+    html, missing = "", []
     for key, (heading, sentence) in _SECTIONS.items():
         if key in filled:
             kind = "charts small" if key == "estimates" and chains else "charts"
             if chains and key == "estimates":
                 sentence = "Of every link, about the frame of its joint. Dashed: the true value."
             body = f'<p class="note">{escape(sentence)}</p><div class="{kind}" data-section="{key}"></div>'
-        elif key in absent:
-            body = f'<p class="note">{escape(absent[key])}.</p>'
-        else:
-            continue
-        html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
-    return html
+            html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
+        elif absent.get(key):
+            missing.append(f"{heading.lower()} ({absent[key]})")
+    reasons = f'<p class="note">Not on this page: {escape("; ".join(missing))}.</p>' if missing else ""
+    return html + reasons
 
 
 def _links(log: Log, facts: JsonObject) -> str:

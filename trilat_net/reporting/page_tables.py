@@ -3,6 +3,7 @@
 Invariant: every text from a scenario or a log is escaped here, cell by cell. Empty tables are left out.
 """
 
+import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -18,6 +19,7 @@ from ..scenario import Scenario, list_shipped, load_scenario
 from .certificate_text import describe_certificate, list_energies
 from .style import typeset
 
+_CODE = re.compile(r"`([^`]+)`")
 _MOST_MODES = 200
 """Intervals of a site that are listed."""
 _MOST_ALARMS = 8
@@ -54,9 +56,9 @@ def render_alarms(log: Log) -> str:
 
 
 def render_description(scenario: Scenario) -> str:
-    """Returns the scenario's description, a paragraph for every one of its own."""
-    paragraphs = scenario.about.strip().split("\n\n")
-    return "".join(f"<p>{escape(text)}</p>" for text in paragraphs if text)
+    """Returns the scenario's description, a paragraph for each of its own, code where it has backticks."""
+    text = _CODE.sub(r"<code>\1</code>", escape(scenario.about.strip()))
+    return "".join(f"<p>{paragraph}</p>" for paragraph in text.split("\n\n") if paragraph)
 
 
 def render_run_facts(log: Log, facts: JsonObject) -> str:

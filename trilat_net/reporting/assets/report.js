@@ -51,8 +51,13 @@
     zooming = false;
   }
 
+  const written = (u, splits, index, space, step) => { // as many digits as tell one from the next
+    let digits = 0;
+    while (digits < 12 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits += 1;
+    return splits.map((v) => (v == null ? "" : v.toFixed(digits)));
+  };
   const axis = (label, extra) => ({
-    label, stroke: ink(), labelSize: 18, labelFont: "12px system-ui, sans-serif", font: "11px system-ui, sans-serif",
+    label, values: written, stroke: ink(), labelSize: 18, labelFont: "12px system-ui, sans-serif", font: "11px system-ui, sans-serif",
     grid: { stroke: grid(), width: 1 }, ticks: { stroke: grid(), width: 1, size: 4 }, ...extra,
   });
 
@@ -152,7 +157,7 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs } : {}) })],
+      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: undefined } : {}) })],
       hooks: {
         drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
         draw: chart.links ? [horizontals(lines)] : [],
@@ -210,10 +215,9 @@
   }
 
   function distribution(chart, box) {
-    const x = Array.from({ length: chart.points }, (_, n) => (n * chart.end) / (chart.points - 1));
     return new uPlot({
       width: box.clientWidth, height: 210, padding: [8, 16, 0, 0],
-      scales: { x: { time: false }, y: { range: [0, 104] } },
+      scales: { x: { time: false, distr: chart.log ? 3 : 1 }, y: { range: [0, 104] } },
       cursor: { drag: { x: false, y: false }, points: { size: 6 } },
       series: [
         { label: "up to", value: (u, v) => number(v, chart.unit) },
@@ -222,8 +226,8 @@
           points: { show: false }, value: (u, v) => number(v, "%"),
         })),
       ],
-      axes: [axis(`${chart.unit}; dashed: the delay of the samples`, { size: 30 }), axis("cumulative (%)", { size: 52 })],
-    }, [x, ...chart.series.map((series) => floats(series.values))], box);
+      axes: [axis(`${chart.unit}; dashed: the delay of the samples`, { size: 30, ...(chart.log ? { splits: rungs, values: undefined } : {}) }), axis("cumulative (%)", { size: 52 })],
+    }, [floats(chart.x), ...chart.series.map((series) => floats(series.values))], box);
   }
 
   const boxes = page.charts.map((chart) => {
