@@ -7,8 +7,10 @@ from matplotlib.figure import Figure
 
 import trilat_net
 from tests.analysis import logs
+from tests.task_arms import planar_task
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.timeline import find_mode_intervals
+from trilat_net.errors import UsageError
 from trilat_net.reporting import style
 from trilat_net.reporting.figures import (
     arm_poses,
@@ -16,11 +18,12 @@ from trilat_net.reporting.figures import (
     joint_motion,
     loop_timing,
     registry,
+    run_overview,
     sample_age,
     time_figure,
 )
 from trilat_net.reporting.palette import SITE_COLOURS, list_site_colours
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import load_scenario, parse_scenario
 
 BACKGROUND = 0.6
 """What marks are drawn at or below, so that lines cover them."""
@@ -221,3 +224,23 @@ def test_shares_are_drawn_as_they_change():
     assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx([0.5, 0.625, 0.75, 0.375, 0.0])
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
     assert authority.sites_with_changing_dominance(logs.simulated("paper")) == []
+
+
+def test_an_overview_has_the_extremes_of_every_site_and_the_verdict():
+    log = logs.simulated("paper")
+    made = run_overview.draw_overview(log)
+    errors, _, torques, _ = made.axes
+    for site, error, torque in zip(log.sites, lines(errors), lines(torques), strict=False):
+        assert np.nanmax(error.get_ydata()) == np.abs(log[site].e).max()
+        assert np.nanmax(torque.get_ydata()) == np.abs(log[site].tau).max()
+    assert str(trilat_net.certify(log).stability) in made.legends[0].get_title().get_text()
+
+
+def test_runs_over_one_another_are_the_largest_of_their_sites_and_of_one_kind():
+    paper, task = logs.simulated("paper"), trilat_net.simulate(parse_scenario(planar_task(0.02)))
+    made = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
+    one, _ = lines(made.axes[2])
+    assert np.nanmax(one.get_ydata()) == max(np.abs(paper[site].tau).max() for site in paper.sites)
+    assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
+    with pytest.raises(UsageError, match="of one kind"):
+        run_overview.draw_overlay({"a": paper, "b": task})

@@ -174,7 +174,7 @@ def test_the_force_of_a_wall_is_what_the_record_says_of_the_arm():
     ("names", "options", "said"),
     [
         (["setling"], {}, "did you mean 'settling'"),
-        (["x"], {}, "there are operation"),
+        (["x"], {}, "there are overview, operation"),
         (["authority"], {}, "shares of all sites are constant"),
         (["contact"], {"width_in": 5.0}, "3.5 or 7 in"),
         (["contact"], {"formats": ["eps"]}, "pdf, png, svg"),

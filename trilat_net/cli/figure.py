@@ -1,7 +1,7 @@
 """`trilat figure`: single figures of a log for a paper."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -34,6 +34,12 @@ def figure_command(
     folder: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Default: FILE without .mcap, -figures.")
     ] = None,
+    others: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with", metavar="FILE", help="Draw this log over FILE, as the figure overlay; repeatable."
+        ),
+    ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only list the figures.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
@@ -43,14 +49,21 @@ def figure_command(
     if listed:
         _list_figures(log, as_json=as_json)
         return
-    from ..reporting.figures.registry import write_figures
+    from ..reporting.figures.registry import write_figures, write_overlay
 
     place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
     kinds = _formats(formats)
-    with terminal.progress_bar("drawing") as progress:
-        paths = write_figures(
-            log, place, names or (), width_in=width_in, formats=kinds, force=force, progress=progress
-        )
+    shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
+    if others:
+        if names:
+            raise UsageError("--with draws the figure overlay, and no other: leave the names out")
+        logs = {file.stem: log, **{one.stem: terminal.open_with_progress(one) for one in others}}
+        if len(logs) <= len(others):
+            raise UsageError("logs that are drawn over one another need names of their own")
+        paths = write_overlay(logs, place, **shape)
+    else:
+        with terminal.progress_bar("drawing") as progress:
+            paths = write_figures(log, place, names or (), progress=progress, **shape)
     if as_json:
         terminal.print_json([str(path) for path in paths])
         return

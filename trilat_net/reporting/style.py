@@ -246,9 +246,9 @@ def typeset_symbol(parameter: str) -> str:
     return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
-def add_legend(figure: Figure, entries: LegendEntries) -> None:
+def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
     """Puts a legend of lines above the panels, see `place_legend`."""
-    place_legend(figure, [Line2D([], [], label=text, **options) for text, options in entries])
+    place_legend(figure, [Line2D([], [], label=text, **line) for text, line in entries], **options)
 
 
 def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:

@@ -30,6 +30,7 @@ from .authority import draw_authority, sites_with_changing_dominance
 from .certificate_energy import draw_functional, draw_observed_energy
 from .contact_force import draw_contact, sites_with_walls
 from .loop_timing import draw_loop_timing, explain_missing_loop_times
+from .run_overview import draw_overlay, draw_overview
 from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_delay
 
 NO_OPERATOR = "no site has an operator in this run"
@@ -82,6 +83,7 @@ def _learns(log: Log) -> bool:
 _ReportEntry = partial(FigureEntry, in_report=True)
 
 FIGURES = {
+    "overview": FigureEntry("errors, speeds, torques and ages of a run at a glance", draw_overview),
     "operation": FigureEntry(
         "torque on the arms above their angles", joint_motion.draw_operation, explain_absent_operator
     ),
@@ -186,14 +188,43 @@ def write_figures(
             exists.
     """
     form, wanted = make_print_size(width_in), list(dict.fromkeys(names)) or list_drawable_figures(log)
-    kinds = list(dict.fromkeys(formats))
-    for kind in kinds:
-        if kind not in FIGURE_FORMATS:
-            raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {kind!r}")
+    kinds = _check_formats(formats)
     chosen = {name: _find_figure(log, name).draw for name in wanted}
     for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
         refuse_existing(path, force=force)
     return _write(log, make_folder(folder), chosen, form, kinds, progress)
+
+
+def write_overlay(
+    logs: Mapping[str, Log],
+    folder: Path,
+    *,
+    width_in: float = COLUMN_IN,
+    formats: Sequence[str] = FIGURE_FORMATS[:2],
+    force: bool = False,
+) -> list[Path]:
+    """Writes several logs over one another, by their names in the legend, as overlay.pdf and so on.
+
+    Raises:
+        UsageError: there is no such width or format, the logs differ in kind, or a file exists.
+    """
+    form, kinds = make_print_size(width_in), _check_formats(formats)
+    paths = [folder / f"overlay.{kind}" for kind in kinds]
+    for path in paths:
+        refuse_existing(path, force=force)
+    drawn = draw_overlay(logs, form)
+    make_folder(folder)
+    for path in paths:
+        write_figure(drawn, path, form.dpi)
+    return paths
+
+
+def _check_formats(formats: Sequence[str]) -> list[str]:
+    kinds = list(dict.fromkeys(formats))
+    for kind in kinds:
+        if kind not in FIGURE_FORMATS:
+            raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {kind!r}")
+    return kinds
 
 
 def write_report_figures(

@@ -103,13 +103,15 @@ class TimeFigure:
             if numbered:
                 axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)
 
-    def finish(self, lowest: Sequence[Axes], entries: style.LegendEntries, *, links: bool = False) -> None:
+    def finish(
+        self, lowest: Sequence[Axes], entries: style.LegendEntries, *, links: bool = False, title: str = ""
+    ) -> None:
         """Gives the lowest panels their time axis, the figure its legend, and explains its markers.
 
-        With `links`, only changes of links are marked.
+        With `links`, only changes of links are marked; the title stands above the legend.
         """
         style.set_time_axis(self.log, lowest)
-        style.add_legend(self.figure, entries)
+        style.add_legend(self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {}))
         marked = [(n, c) for n, c in self._changes if c.change.link or not links]
         words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
         if len(marked) > MOST_EXPLAINED_CHANGES:

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ...analysis.json_values import JsonObject
 from ...files import write_whole
@@ -289,7 +289,8 @@ def draw_front(tuned: TuningResult) -> Figure:
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
-                axis.set_minor_locator(NullLocator())
+                axis.set_minor_locator(LogLocator(subs=range(1, 10)))
+                axis.set_minor_formatter(NullFormatter())
         look: dict[str, Any] = {"labelspacing": 0.3, "columnspacing": 0.8, "handlelength": 1.2}
         handles = [*drawn, *stars]
         figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look)
