@@ -11,6 +11,7 @@ import trilat_net
 from tests.core.test_session_life import TEXT
 from trilat_net.core.safeguards import BLEND_S
 from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.core.user_law import LawContext, LawInput
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.rerun import rerun
@@ -236,3 +237,55 @@ def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for
 def test_a_site_of_another_rule_knows_no_orders() -> None:
     with pytest.raises(ScenarioError, match=r"has on_stale\.action = 'use'"):
         make_site_order(load_scenario("free"), "s", "stop", 0)
+
+
+class Pull:
+    """Springs to the peers themselves: what they sent last pulls on, however long ago that was."""
+
+    remembers = ()
+
+    def __init__(self, _facts: LawContext, K: float = 60.0, d: float = 12.0) -> None:
+        self.K, self.d = K, d
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            now.tau[i] = now.gravity[i] - self.d * now.qd[i] - self.K * (now.q[i] - now.peers[0].q[i])
+
+
+class PullHeld(Pull):
+    holds = True
+
+
+def with_own_law(name: str) -> Log:
+    text = TEXT.replace('law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:{name}"')
+    return trilat_net.simulate(guarded({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0))
+
+
+def test_a_law_of_ones_own_gives_way_to_damping_and_gravity_while_its_site_holds() -> None:
+    """The slave holds from 2.12 to 2.7 s; its damping then brings a joint to rest in 0.1 s."""
+    log = with_own_law("Pull")
+    part, arm = log["s"], log.scenario.arms["s"]
+    q, qd, held = part.q, part.qd, slice(2120, 2700)
+    assert set(part.mode[held]) == {"hold"}
+    outer = arm.theta[4] * np.cos(q[:, 0] + q[:, 1])
+    gravity = 9.81 * np.stack([arm.theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
+    damping = arm.joint_inertias(log.scenario.sites["s"].q0_rad) / 0.1
+    share = np.minimum((np.arange(580) + 1.0) * 1e-3 / BLEND_S, 1.0)[:, None]
+    wanted = (1.0 - share) * part.tau[2119] + share * (gravity - damping * qd)[held]
+    assert np.abs(part.tau[held] - wanted).max() <= 1e-9
+    law = gravity - 12.0 * qd - 60.0 * (q - log["m"].q[np.maximum(np.arange(4000) - 100, 0)])
+    share = np.minimum(np.arange(200) * 1e-3 / BLEND_S, 1.0)[:, None]
+    wanted = (1.0 - share) * part.tau[2699] + share * law[2700:2900]
+    assert np.abs(part.tau[2700:2900] - wanted).max() <= 1e-9
+    assert np.abs(part.tau[0]).max() == 0.0  # it waits from 0 s on
+    assert verify(log).identical == 8000
+    assert compare_with_virtual(log).fed.identical == 8000
+
+
+def test_a_law_that_says_that_it_holds_is_left_to_it() -> None:
+    log = with_own_law("PullHeld")
+    part, theta = log["s"], log.scenario.arms["s"].theta
+    q, last = part.q[2120:2700], log["m"].q[1999]
+    outer = theta[4] * np.cos(q[:, 0] + q[:, 1])
+    gravity = 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
+    assert np.abs(part.tau[2120:2700] - gravity + 12.0 * part.qd[2120:2700] + 60.0 * (q - last)).max() <= 1e-9

@@ -321,4 +321,5 @@ def plug_law(law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> Pla
         ScenarioError: it is to be compiled, and Numba does not take it.
     """
     arrays.site["needs_model"] = getattr(law, "needs_model", False)
+    arrays.site["holds"] = getattr(law, "holds", False)
     return (CompiledLaw if is_compiled(law) else PlainLaw)(law, setup, arrays, sent)

@@ -12,7 +12,7 @@ from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
-from .safeguards import blend_torque, is_torque_finite, limit_reference, limit_torque_rate
+from .safeguards import fall_back, is_torque_finite, limit_reference, limit_torque_rate, return_to_law
 from .session_life import latch, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
@@ -21,6 +21,7 @@ from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
 _DIVERGED, _FAULT, _STOPPED = int(Mode.DIVERGED), int(Mode.FAULT), int(Mode.STOPPED)
+_HOLD, _WAITING, _ALIGN = int(Mode.HOLD), int(Mode.WAITING), int(Mode.RETURN)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
@@ -96,13 +97,20 @@ def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of a site in FAULT or STOPPED, and none that changes faster than it may."""
+    """Ends stage 6: the torque of a site without its law, and none that changes faster than it may.
+
+    In FAULT and STOPPED no law acts; one that is plugged in does not while the site waits or holds, unless it
+    says that it holds by its reference.
+    """
     if s.on_stale == _GLIDE:
         if s.mode != _FAULT and s.mode != _DIVERGED and not is_torque_finite(s):
             latch(tick_ns(k - 1, s.rate_hz), s, _FAULT, _NOT_FINITE)
-        if s.mode == _FAULT or s.mode == _STOPPED:
+        pauses = s.law == _OWN and s.holds == 0
+        if s.mode == _FAULT or s.mode == _STOPPED or (pauses and (s.mode == _HOLD or s.mode == _WAITING)):
             _put_known_gravity(s, chain, s.u)
-            blend_torque(t_ns, s)
+            fall_back(t_ns, s)
+        elif pauses and s.mode == _ALIGN:
+            return_to_law(t_ns, s)
     limit_torque_rate(s)
 
 

@@ -11,7 +11,7 @@ from .jit import leaf
 from .vectors import Row
 
 BLEND_S = 0.1
-"""Time in which the torque of a site in FAULT or STOPPED goes over to damping and gravity."""
+"""Time in which a torque goes over to damping and gravity, and back to that of the law."""
 
 
 @leaf
@@ -42,8 +42,8 @@ def is_torque_finite(site: Row) -> bool:
 
 
 @leaf
-def blend_torque(t_ns: int, site: Row) -> None:
-    """Writes the torque of a site in FAULT or STOPPED: from the last one to `u`, which is gravity, less B qd.
+def fall_back(t_ns: int, site: Row) -> None:
+    """Writes the torque of a site without its law: from the last one to `u`, which is gravity, less B qd.
 
     A torque that is no number is none.
     """
@@ -53,6 +53,14 @@ def blend_torque(t_ns: int, site: Row) -> None:
         if not isfinite(goal):
             goal = 0.0
         site.tau[i] = site.tau_held[i] + share * (goal - site.tau_held[i])
+
+
+@leaf
+def return_to_law(t_ns: int, site: Row) -> None:
+    """Writes the torque of a site that has its law again: from the last one to that of the law."""
+    share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
+    for i in range(site.joints):
+        site.tau[i] = site.tau_held[i] + share * (site.tau[i] - site.tau_held[i])
 
 
 @leaf

@@ -88,6 +88,7 @@ def _begin_aligning(t_ns: int, site: Row, reason: int) -> None:
     for i in range(site.q_held.shape[0]):
         q, qd = _find_held(t_ns, site, i)
         site.q_held[i], site.qd_held[i] = q - site.q_des[i], qd - site.qd_des[i]
+    put(site.tau_held, site.tau_before)
     _enter(t_ns, _ALIGN, reason, site)
 
 
@@ -97,6 +98,7 @@ def _wait(t_ns: int, site: Row, reason: int) -> None:
     for i in range(site.q_held.shape[0]):
         site.q_held[i] = site.x[i] if site.task else site.q[i]
         site.qd_held[i] = 0.0
+    put(site.tau_held, site.tau_before)
     _enter(t_ns, _WAITING, reason, site)
 
 
@@ -105,6 +107,7 @@ def _hold(before_ns: int, site: Row, reason: int) -> None:
     """Begins to hold the reference that was in force at the tick before."""
     put(site.q_held, site.q_followed)
     put(site.qd_held, site.qd_followed)
+    put(site.tau_held, site.tau_before)
     _enter(before_ns, _HOLD, reason, site)
 
 

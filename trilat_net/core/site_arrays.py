@@ -25,7 +25,7 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 _SETTINGS = (
     *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
     *("theta_known", "needs_model", "remembered", "asked", "order", "skipped"),
-    *("degrades", "regrouped", "bit"),
+    *("degrades", "regrouped", "bit", "holds"),
 )
 _COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))

@@ -126,7 +126,8 @@ class UserLaw(Protocol):
 
     All that `torque` needs of the ticks so far is its memory: the attributes that its class names in
     `remembers`, or what a method `memory()` returns as numbers, from which `recall(memory)` restores it. It
-    may have an attribute `theta_hat`, a number per parameter, which is recorded.
+    may have an attribute `theta_hat`, a number per parameter, which is recorded. One whose torque is right
+    while the reference is held, because it follows that and nothing else of its peers, has `holds = True`.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
