@@ -9,6 +9,7 @@ import pytest
 
 import trilat_net
 from tests.core.test_session_life import TEXT
+from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.core.safeguards import BLEND_S
 from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
 from trilat_net.core.user_law import LawContext, LawInput
@@ -237,6 +238,23 @@ def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for
 def test_a_site_of_another_rule_knows_no_orders() -> None:
     with pytest.raises(ScenarioError, match=r"has on_stale\.action = 'use'"):
         make_site_order(load_scenario("free"), "s", "stop", 0)
+
+
+def test_stops_and_returns_step_no_more_than_the_run_without_them() -> None:
+    """Arms that begin 3 rad apart, without a limit of the torque's rate."""
+    text = adaptive_text().replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]")
+    text = text.replace("q0_rad = [0.1, 0.4]", "q0_rad = [-0.1, 1.9]")
+    scenario = guarded({}, text, duration_s=8.0)
+    orders = {"s": {5000: "stop", 6000: "enable"}, "m": {6500: "stop", 6540: "enable"}}
+    log = ordered(scenario, orders)
+    free = trilat_net.simulate(scenario)
+    for site in log.sites:
+        assert largest_step(log, site, 100) <= 1.1 * largest_step(free, site, 100)
+    (jump,) = np.flatnonzero((log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped"))
+    assert (log["s"].tau[jump + 1] == log["s"].tau[jump]).all()
+    assert verify(log).identical == 16_000
+    balance = compute_energy_balance(compute_site_energies(log))
+    assert np.abs(balance.residual).max() <= 1e-3 * balance.scale
 
 
 class Pull:

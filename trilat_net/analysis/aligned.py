@@ -9,11 +9,12 @@ constant delay of the theorem; the difference from the sample in use at the next
 link.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.safeguards import BLEND_S
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -29,6 +30,8 @@ _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 STOPPED_MODES = ("fault", "stopped")
 """Modes in which the torque is not that of the law."""
+RESUMING_S = 2.0 * BLEND_S
+"""For so long after these it may not be that of the law alone."""
 
 
 class AlignedRecords(NamedTuple):
@@ -51,7 +54,7 @@ class AlignedRecords(NamedTuple):
         wrench: what tau_x amounts to there, likewise.
         axes: see `SiteLog`.
         hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
-        stopped: True in one of the `STOPPED_MODES`; empty: never.
+        stopped: True in one of the `STOPPED_MODES`, and for `RESUMING_S` afterwards; empty: never.
     """
 
     site: str
@@ -164,6 +167,16 @@ def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
     return np.asarray((np.abs(qd_des) < limit).all(axis=-1))
 
 
+def _find_stopped(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
+    """Returns the records in one of the `STOPPED_MODES`, or within `RESUMING_S` after one."""
+    stopped = np.isin(modes, STOPPED_MODES)
+    if not stopped.any():
+        return stopped
+    last = np.maximum.accumulate(np.where(stopped, tick, np.iinfo(np.int64).min // 2))
+    found: Bools = tick - last <= RESUMING_S * rate_hz
+    return found
+
+
 def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
     """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
     names = (*RECORD_COLUMNS, *(_TASK_COLUMNS if part.layout.task else ()))
@@ -176,7 +189,7 @@ def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | N
     before = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[before] == grid
     follows: Bools = (part.mode[rows] == "run")[before]
-    stopped: Bools = np.isin(part.mode[rows], STOPPED_MODES)[before]
+    stopped = _find_stopped(part.mode[rows], tick, part.rate_hz)[before]
     follows &= find_unlimited(scenario.sites[part.name].limits, part.qd_des[rows])[before]
     columns = {name: getattr(part, name)[rows] for name in names}
     for name, values in columns.items():

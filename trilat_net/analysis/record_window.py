@@ -12,7 +12,7 @@ import numpy as np
 
 from ..net.messages import TASK_VECTORS, State
 from ..scenario import Scenario
-from .aligned import RECORD_COLUMNS, STOPPED_MODES, AlignedRecords, find_unlimited
+from .aligned import RECORD_COLUMNS, RESUMING_S, STOPPED_MODES, AlignedRecords, find_unlimited
 
 KEPT_S = 12.0
 """Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
@@ -41,6 +41,7 @@ class RecordWindow:
         self._follows, self._stopped = np.zeros((2, 2 * self._kept), dtype=np.bool_)
         self._limits = scenario.sites[site].limits
         self.first, self.newest = 0, -1
+        self._stopped_at = -(2**40)
 
     def take(self, record: State) -> bool:
         """Adds a record; false if it is older than the window, or says that the site diverged."""
@@ -54,7 +55,10 @@ class RecordWindow:
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
-        self._known[row], self._stopped[row] = True, record.mode in STOPPED_MODES
+        if record.mode in STOPPED_MODES:
+            self._stopped_at = max(self._stopped_at, record.tick)
+        since = record.tick - self._stopped_at
+        self._known[row], self._stopped[row] = True, 0 <= since <= RESUMING_S * self.rate_hz
         free = self._limits.qd_des_limit_rad_s is None or find_unlimited(
             self._limits, np.array(record.qd_des)
         )

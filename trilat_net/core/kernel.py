@@ -13,7 +13,7 @@ from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
 from .safeguards import fall_back, is_torque_finite, limit_reference, limit_torque_rate, return_to_law
-from .session_life import latch, update_session_life
+from .session_life import is_law_returning, latch, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
 from .task_space import POSE, update_orientation_reference
@@ -109,7 +109,7 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
         if s.mode == _FAULT or s.mode == _STOPPED or (pauses and (s.mode == _HOLD or s.mode == _WAITING)):
             _put_known_gravity(s, chain, s.u)
             fall_back(t_ns, s)
-        elif pauses and s.mode == _ALIGN:
+        elif (pauses and s.mode == _ALIGN) or is_law_returning(t_ns, s):
             return_to_law(t_ns, s)
     limit_torque_rate(s)
 

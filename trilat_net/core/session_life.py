@@ -9,8 +9,9 @@ the rate of the reference falls to zero over the time after which a peer counts 
 is its integral; while the site aligns, the way from the peers' reference falls to zero with its rate, no
 faster than `align_speed` beyond what it had. A peer that holds or aligns itself is followed like any other.
 FAULT and STOPPED are latched: the torque goes over from the last one to damping and gravity (`safeguards`),
-the reference is the own pose, estimates stay as they are. No message of a peer leads there or back. A switch
-that is held again ends what its release began, but no stop by order.
+and afterwards in the same way back to that of the law; meanwhile the reference is the own pose, and estimates
+stay as they are. No message of a peer leads there or back. A switch that is held again ends what its release
+began, but no stop by order.
 """
 
 from math import isfinite
@@ -21,6 +22,8 @@ from .vectors import Row, RowArray, put
 
 MIN_ALIGN_NS = 250_000_000
 """The least time of an alignment."""
+RETURN_NS = 100_000_000
+"""Time in which a torque goes back from damping and gravity to that of the law, `safeguards.BLEND_S`."""
 HELD_OVERRUN_TICKS = 20
 """A site at an arm outside that missed more ticks than these holds."""
 FAULT_OVERRUN_TICKS = 200
@@ -37,6 +40,7 @@ _LIMIT_Q, _LIMIT_QD = int(LifeReason.LIMIT_Q), int(LifeReason.LIMIT_QD)
 _NOT_FINITE, _STOP = int(LifeReason.NOT_FINITE), int(LifeReason.STOP)
 _ENABLE, _RESET = int(LifeReason.ENABLE), int(LifeReason.RESET)
 _ARM_SILENT, _ARM_BACK = int(LifeReason.ARM_SILENT), int(LifeReason.ARM_BACK)
+_RESUMED = int(LifeReason.RESUMED)
 _RELEASED, _HELD = int(LifeReason.RELEASED), int(LifeReason.HELD)
 _TO_STOP, _TO_ENABLE, _TO_RESET = int(LifeOrder.STOP), int(LifeOrder.ENABLE), int(LifeOrder.RESET)
 _HEAR_SILENCE, _LOSE_ARM = int(LifeOrder.ARM_SILENT), int(LifeOrder.ARM_LOST)
@@ -100,6 +104,14 @@ def _wait(t_ns: int, site: Row, reason: int) -> None:
         site.qd_held[i] = 0.0
     put(site.tau_held, site.tau_before)
     _enter(t_ns, _WAITING, reason, site)
+
+
+@leaf
+def is_law_returning(t_ns: int, site: Row) -> bool:
+    """True if a site waits, or aligns, that was stopped or in fault until a moment ago."""
+    again = site.mode == _WAITING and site.return_from_ns > tick_ns(site.first, site.rate_hz)
+    soon: bool = t_ns - site.return_from_ns < RETURN_NS
+    return soon and (again or (site.mode == _ALIGN and site.reason == _RESUMED))
 
 
 @leaf
@@ -175,7 +187,7 @@ def _update_mode(t_ns: int, before_ns: int, site: Row, links: RowArray) -> None:
         return
     heard = _all_heard(t_ns, site.stale_ns, links)
     if heard and site.mode == _WAITING:
-        _begin_aligning(t_ns, site, _PEERS_HERE)
+        _begin_aligning(t_ns, site, _RESUMED if is_law_returning(t_ns, site) else _PEERS_HERE)
     elif heard and site.mode == _HOLD and site.return_from_ns != before_ns:
         _begin_aligning(t_ns, site, _PEERS_BACK)
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):

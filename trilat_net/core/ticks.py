@@ -78,6 +78,7 @@ class LifeReason(IntEnum):
     HELD = 16
     DROPPED = 17
     RESTORED = 18
+    RESUMED = 19
 
 
 class LifeOrder(IntEnum):

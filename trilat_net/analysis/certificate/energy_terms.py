@@ -515,7 +515,8 @@ def estimate_work(site: SiteMotion) -> Increment:
     at, c = site.records, site.constants
     off = at.theta_hat - c.theta
     at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts
-    wrong = (off != 0.0) & (~c.adapts | site.stopped[:, np.newaxis])
+    still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)])
+    wrong = (off != 0.0) & (~c.adapts | (site.stopped & still)[:, np.newaxis])
     if not (at_edge.any() or wrong.any()):
         return _nothing(site)
     held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr  # what the box kept the estimate from
