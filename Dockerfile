@@ -1,6 +1,9 @@
 # One image for every member of a session. What builds it stays behind in the first stage; the second one
 # adds a virtual environment to Python and nothing else: no build tools, no pip, no tests.
-# BASE=python@sha256:... builds on one image and no other.
+# BASE=python@sha256:... builds on one image and no other. The tag stands here and no digest, because a digest that
+# nobody renews keeps the holes of its day; pin the one of today, and renew it by the same two lines:
+#   docker pull python:3.11-slim-bookworm
+#   BASE=$(docker image inspect --format '{{index .RepoDigests 0}}' python:3.11-slim-bookworm) docker compose build
 ARG BASE=python:3.11-slim-bookworm
 FROM ${BASE} AS build
 # An eighth of what is installed below is symbols for debuggers; `strip` takes them out.
@@ -44,6 +47,6 @@ ENV PATH=/opt/trilat/bin:$PATH \
     XDG_CACHE_HOME=/tmp/cache \
     COLUMNS=120
 # A new volume takes over the rights of its folder: whoever makes the keys may write there.
-RUN install -d -m 1777 /keys/recorder /keys/m1 /keys/m2 /keys/s
+RUN install -d -m 1777 /keys/recorder /keys/operator /keys/m1 /keys/m2 /keys/s
 USER 10001:10001
 ENTRYPOINT ["python", "-I", "/opt/trilat/entry.py", "trilat"]

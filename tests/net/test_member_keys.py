@@ -4,6 +4,7 @@ The attacker is a member, `s`, that holds itself to no rules; what it may say co
 the same link, so that the first has been refused once the second is there.
 """
 
+import json
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -18,7 +19,14 @@ from trilat_net.net import topics
 from trilat_net.net.access_rules import OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
-from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, MemberKeys, create_keys, read_member_keys
+from trilat_net.net.member_keys import (
+    CERTIFICATE,
+    MEMBERS,
+    PRIVATE_KEY,
+    MemberKeys,
+    create_keys,
+    read_member_keys,
+)
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
@@ -156,6 +164,32 @@ def test_every_member_may_ask_a_site_to_stop_and_nothing_else(meeting: Meeting, 
         assert until(lambda bus=member: answered(bus, key("m1", topics.STOP), b"stop"))  # type: ignore[misc]
     assert until(lambda: answered(members[2], key("m1", topics.SET), b"reset"))
     assert [answered(member, key("m1", topics.SET), b"reset") for member in members[:2]] == [None, None]
+
+
+def test_a_member_whose_name_was_taken_out_is_denied_everything(folder: Path, tmp_path: Path) -> None:
+    """By the list in the folder of the one that it speaks to; its certificate is still good."""
+    for file in (folder / "m1").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / PRIVATE_KEY).chmod(0o600)
+    listed = [name for name in ALL if name != "s"]
+    (tmp_path / MEMBERS).write_text(json.dumps({"member": "m1", "members": listed}))
+    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
+    m1 = ZenohBus([place], own=read_member_keys(tmp_path).settings)
+    others = {
+        name: ZenohBus([], [place], own=read_member_keys(folder / name).settings) for name in ("s", "m2")
+    }
+    try:
+        inbox = m1.inbox(key("*", topics.EVENT))
+        withdrawn, true = (others[name].publisher(key(name, topics.EVENT)) for name in ("s", "m2"))
+
+        def say(payload: bytes) -> None:
+            withdrawn(b"withdrawn")
+            true(payload)
+
+        assert {where for where, _ in heard(say, inbox)} == {key("m2", topics.EVENT)}
+    finally:
+        for bus in (*others.values(), m1):
+            bus.close()
 
 
 def test_what_is_too_long_is_dropped_and_what_is_not_goes_on(meeting: Meeting) -> None:
