@@ -13,6 +13,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,8 +22,15 @@ from trilat_net import process
 from trilat_net.core.jit import is_core_cached
 from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection, find_endpoint_addresses, is_loopback, secure_connection
+from trilat_net.net.connection import (
+    ENCRYPTED,
+    Connection,
+    find_endpoint_addresses,
+    is_loopback,
+    secure_connection,
+)
 from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
+from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 
 from .session_ping import PingResult, ping_session
 
@@ -118,7 +126,10 @@ def examine_links(
     for place in find_endpoint_addresses(safe.reach(safe.listen)):
         yield _examine_listening(place)
     for place in find_endpoint_addresses(safe.reach(safe.connect or ())):
-        yield _examine_reaching(place, folder if owned else None)
+        if place.startswith("quic/"):
+            yield _examine_quic(place, owned)
+        else:
+            yield _examine_reaching(place, folder if owned else None)
     if not safe.listen and not safe.connect:
         yield DoctorFinding("links", "ok", "no endpoints given: --listen and --connect are tried if given")
 
@@ -126,16 +137,19 @@ def examine_links(
 def _examine_listening(place: str) -> DoctorFinding:
     address = _split_address(place)
     if address is None:
-        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP")
+        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
     try:
         family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        with socket.socket(family) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        quic = place.startswith("quic/")
+        with socket.socket(family, socket.SOCK_DGRAM if quic else socket.SOCK_STREAM) as probe:
+            if not quic:  # two sockets of UDP at one port would both be let
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
-            probe.listen(1)
+            if not quic:
+                probe.listen(1)
     except OSError as error:
         return DoctorFinding("links", "fail", f"cannot listen at {place}: {error.strerror or error}")
-    if place.startswith("tls/") or is_loopback(place):
+    if place.startswith(ENCRYPTED) or is_loopback(place):
         return DoctorFinding("links", "ok", f"can listen at {place}")
     return DoctorFinding("links", "warn", f"{place} would listen unencrypted, to anybody who reaches it")
 
@@ -143,7 +157,7 @@ def _examine_listening(place: str) -> DoctorFinding:
 def _examine_reaching(place: str, folder: Path | None) -> DoctorFinding:
     address = _split_address(place)
     if address is None:
-        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP")
+        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
     try:
         with socket.create_connection(address, CONNECT_S) as link:
             if not place.startswith("tls/"):
@@ -161,6 +175,18 @@ def _examine_reaching(place: str, folder: Path | None) -> DoctorFinding:
         return DoctorFinding("links", "fail", f"{place} cannot be reached: {error.strerror or error}")
 
 
+def _examine_quic(place: str, owned: MemberKeys | None) -> DoctorFinding:
+    """Returns whether a member answers over QUIC: there is no way to try that but to connect as a member."""
+    if owned is None:
+        return DoctorFinding("links", "warn", f"{place} was not tried: QUIC asks for the keys of a member")
+    try:
+        with closing(ZenohBus([], [place], "client", owned.settings)):
+            text = f"{place} answers over QUIC, with a certificate of the same authority"
+            return DoctorFinding("links", "ok", text)
+    except (RouterSilent, UsageError) as error:
+        return DoctorFinding("links", "fail", f"{place} does not answer a member with these keys: {error}")
+
+
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
     if folder is None:
         context = ssl.create_default_context()
@@ -172,8 +198,8 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(place: str) -> tuple[str, int] | None:
-    """Returns host and port of an endpoint over TCP; None for another."""
-    found = re.fullmatch(r"(?:tcp|tls)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?", place)
+    """Returns host and port of an endpoint over TCP or QUIC; None for another."""
+    found = re.fullmatch(r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?", place)
     return (found[1].strip("[]"), int(found[2])) if found and int(found[2]) < 1 << 16 else None
 
 

@@ -78,6 +78,19 @@ def test_a_member_with_keys_answers_one_with_keys_of_the_same_authority(folder: 
     assert links(folder / "s", [nobody], []) == ["ok"]
 
 
+@pytest.mark.long
+def test_so_it_is_over_quic(folder: Path, tmp_path: Path) -> None:
+    create_keys(tmp_path / "others", MEMBERS, [], 30)
+    (place, nobody) = (one.replace("tcp", "quic") for one in find_free_endpoints(2))
+    with member(folder / "m1", place):
+        assert links(folder / "s", [], [place]) == ["ok"]
+        assert links(tmp_path / "others" / "s", [], [place]) == ["fail"]
+        assert links(None, [], [place]) == ["warn"]
+        assert links(folder / "s", [place], []) == ["fail"]
+    assert links(folder / "s", [], [nobody]) == ["fail"]
+    assert links(folder / "s", [nobody], []) == ["ok"]
+
+
 def test_endpoints_that_are_open_to_a_network_are_told() -> None:
     assert links(None, ["tcp/0.0.0.0:0"], []) == ["fail"]
     assert links(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
