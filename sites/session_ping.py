@@ -6,6 +6,7 @@ Invariant: read-only. It announces no token; a session neither waits for it nor 
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
 
 from trilat_net.errors import RunFailed, ScenarioError, SessionError
 from trilat_net.net import topics
@@ -17,6 +18,7 @@ from trilat_net.net.membership import MemberQuery, read_messages
 from trilat_net.net.messages import Info, LinkStats
 from trilat_net.net.offset import OffsetEstimate, exact_offset
 from trilat_net.net.pinging import PING_PACE_NS, Pinger
+from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
 
 POLL_NS = 1_000_000
@@ -138,3 +140,67 @@ def ping_session(
             "name, and has it not ended? name other endpoints with --connect"
         )
     return ping
+
+
+@dataclass(frozen=True, repr=False)
+class PingReport(Result):
+    """Round trips and clock offsets to every member of a session, and its links as its sites measure them."""
+
+    session: str
+    members: list[dict[str, Any]]
+    links: list[dict[str, Any]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat ping --json`."""
+        return {"session": self.session, "members": self.members, "links": self.links}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per member."""
+        return self.members
+
+
+def describe_ping(session: str, probe: SessionPing) -> PingReport:
+    """Returns what a measurement found."""
+    return PingReport(session, [_member(reach) for reach in probe.reached()], _links(probe))
+
+
+def _member(reach: PingResult) -> dict[str, Any]:
+    info, rtts = reach.info, sorted(reach.rtts_ns)
+    facts: dict[str, Any] = {
+        "member": info.member,
+        "host": info.host,
+        "running": info.running,
+        "ticks": info.ticks,
+        "answers": len(rtts),
+        "same_clock": reach.shared,
+    }
+    if rtts:
+        steps = [abs(b - a) for a, b in zip(reach.rtts_ns, reach.rtts_ns[1:], strict=False)]
+        facts["rtt_us"] = {
+            "min": rtts[0] / 1000,
+            "p50": rtts[len(rtts) // 2] / 1000,
+            "p99": rtts[min(len(rtts) - 1, len(rtts) * 99 // 100)] / 1000,
+        }
+        facts["jitter_us"] = sum(steps) / max(1, len(steps)) / 1000
+    if reach.estimate is not None:
+        estimate = reach.estimate
+        facts["offset_ns"] = estimate.offset_ns
+        facts["bound_us"] = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
+    return facts
+
+
+def _links(probe: SessionPing) -> list[dict[str, Any]]:
+    """Returns the links as running sites measure them; times in us."""
+    return [
+        {
+            "from": peer,
+            "to": site,
+            "delay_us": stats.delay_us[peer],
+            "delay_max_us": stats.delay_max_us.get(peer, -1),
+            "rtt_us": stats.rtt_us.get(peer, -1),
+            "offset_us": stats.offset_us.get(peer, 0),
+            "bound_us": stats.bound_us.get(peer, 0),
+        }
+        for site, stats in sorted(probe.links.items())
+        for peer in stats.delay_us
+    ]

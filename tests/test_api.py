@@ -13,6 +13,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
+from tests.golden.surface import all_options
 from trilat_net.errors import UsageError
 from trilat_net.results import Result
 
@@ -24,13 +25,46 @@ def test_what_a_key_completes_is_what_there_is() -> None:
     assert all(getattr(tn, name) for name in dir(tn))
 
 
+COUNTERPARTS = {
+    "run": ["demo"],
+    "start": ["live", "site", "record", "watch", "router", "replay"],
+    "session": ["ping", "stop", "enable", "reset", "set link", "set dominance"],
+    "simulate": ["sim"],
+    "compare": ["compare"],
+    "info": ["log info"],
+    "check_file": ["log check"],
+    "sign_log": ["log sign"],
+    "recover": ["log recover"],
+    "export": ["log export"],
+    "view": ["log view"],
+    "check": ["test"],
+    "list_shipped": ["scenario list"],
+    "load_scenario": ["scenario show"],
+    "describe_scenario": ["scenario check"],
+    "read_template": ["scenario new"],
+    "create_keys": ["keys new"],
+    "create_signing_keys": ["keys pair"],
+    "read_member_keys": ["keys info"],
+    **{name: [name] for name in ("doctor", "verify", "certify", "metrics", "figure", "report", "rerun")},
+    **{name: [name] for name in ("sweep", "bench", "linear")},
+}
+"""By name in Python the commands that do the same."""
+
+
+def test_every_command_has_a_counterpart() -> None:
+    names = [name.removeprefix("trilat ") for name in all_options() if name != "trilat"]
+    commands = {name for name in names if not any(other.startswith(f"{name} ") for other in names)}
+    assert {command for done in COUNTERPARTS.values() for command in done} == commands
+    assert not COUNTERPARTS.keys() - set(dir(tn))
+
+
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
     text = inspect.getdoc(getattr(tn, name)) or ""
     assert doctest.DocTestParser().get_examples(text), f"{name} shows no example"
 
 
-SLOW = {"check", "certify", "hand", "linear", "margin", "report", "run", "sweep", "tune"}
+SLOW = {"bench", "check", "certify", "hand", "linear", "margin", "report", "run", "sweep", "tune"}
 
 
 @pytest.mark.parametrize(

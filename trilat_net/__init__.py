@@ -18,8 +18,10 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from sites.hand_session import hand
     from sites.live_run import run
+    from sites.running_session import doctor, session, start
 
     from .api import (
+        bench,
         certify,
         check_file,
         compare,
@@ -34,12 +36,16 @@ if _TYPE_CHECKING:
         sweep,
         tune,
         verify,
+        view,
     )
     from .core.compiled_law import compiled
     from .execution.rerun import rerun
     from .log.log_reader import open_log
+    from .log.log_signature import create_signing_keys, sign_log
+    from .net.member_keys import create_keys, read_member_keys
     from .reporting.figures.registry import figure
-    from .scenario import load_scenario
+    from .scenario import list_shipped, load_scenario, read_template
+    from .scenario.describe import describe_scenario
     from .studies.trials.trial import trials
     from .studies.trials.trial_runner import check
 
@@ -47,40 +53,62 @@ if _TYPE_CHECKING:
 
 __all__ = [
     "__version__",
+    "bench",
     "certify",
     "check",
     "check_file",
     "compare",
     "compiled",
+    "create_keys",
+    "create_signing_keys",
+    "describe_scenario",
+    "doctor",
     "export",
     "figure",
     "hand",
     "info",
     "linear",
+    "list_shipped",
     "load_scenario",
     "margin",
     "metrics",
     "open_log",
+    "read_member_keys",
+    "read_template",
     "recover",
     "report",
     "rerun",
     "run",
+    "session",
+    "sign_log",
     "simulate",
+    "start",
     "sweep",
     "trials",
     "tune",
     "verify",
+    "view",
 ]
 
 _MODULES = {
     "check": "trilat_net.studies.trials.trial_runner",
     "compiled": "trilat_net.core.compiled_law",
+    "create_keys": "trilat_net.net.member_keys",
+    "create_signing_keys": "trilat_net.log.log_signature",
+    "describe_scenario": "trilat_net.scenario.describe",
+    "doctor": "sites.running_session",
     "figure": "trilat_net.reporting.figures.registry",
     "hand": "sites.hand_session",
+    "list_shipped": "trilat_net.scenario",
     "load_scenario": "trilat_net.scenario",
     "open_log": "trilat_net.log.log_reader",
+    "read_member_keys": "trilat_net.net.member_keys",
+    "read_template": "trilat_net.scenario",
     "rerun": "trilat_net.execution.rerun",
     "run": "sites.live_run",
+    "session": "sites.running_session",
+    "sign_log": "trilat_net.log.log_signature",
+    "start": "sites.running_session",
     "trials": "trilat_net.studies.trials.trial",
 }
 """Where names are; the others are in `api`."""

@@ -23,6 +23,7 @@ from .scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
     from .reporting.conclude import Conclusion
+    from .studies.bench import BenchResults
     from .studies.executor import Workers
     from .studies.log_comparison import LogComparison
     from .studies.sweep.margin_search import SweepMargins
@@ -401,3 +402,60 @@ def tune(
         seeds=seeds,
     )
     return plan.run(jobs, on=on)
+
+
+def bench(
+    study: str = "small",
+    *,
+    tasks: Sequence[str] = (),
+    laws: Sequence[str] = (),
+    links: Sequence[str] = (),
+    seeds: int | None = None,
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "BenchResults":
+    """Runs the suite of control laws; the command is `trilat bench`, which writes tables and figures as well.
+
+    >>> found = tn.bench(tasks=["free"], laws=["p_d"], links=["rtt68"], seeds=1, out="suite", jobs=1)
+    >>> len(found.runs)
+    1
+
+    Args:
+        study: full, small or round-trips.
+        tasks: some tasks alone.
+        laws: some laws alone.
+        links: other links, as in "rtt68-loss10" or "4g".
+        seeds: how many; by default the study's.
+        out: folder; a suite in it goes on. By default runs/bench-STUDY.
+        jobs: how many processes; None for one per core.
+        on: what runs them instead: a Dask scheduler's address or an executor.
+
+    Raises:
+        UsageError: there is no such study, task, law or link, or the folder holds something else.
+    """
+    from .studies.bench import plan_bench, prepare_bench_folder, run_bench
+
+    plan = plan_bench(study, tasks=tasks, laws=laws, links=links, seeds=seeds)
+    return run_bench(prepare_bench_folder(plan, None if out is None else Path(out)), jobs, on)
+
+
+def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:
+    """Opens a log in Rerun, until it is closed; the command is `trilat log view`.
+
+    >>> tn.view("run.mcap")  # doctest: +SKIP
+
+    Args:
+        files: the log, or its parts.
+        full: whether every record is shown.
+        save: a file for Rerun to write instead of opening it.
+
+    Raises:
+        UsageError: Rerun is not installed, or there is no display.
+        LogError: the log cannot be read.
+    """
+    from .reporting.rerun_viewer import ViewerOptions, open_rerun
+
+    paths = [Path(file) for file in files]
+    kept = None if save is None else Path(save)
+    open_rerun(paths, lambda: open_log(*paths), ViewerOptions(full=full, web=False, save=kept), print)

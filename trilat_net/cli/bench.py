@@ -55,47 +55,6 @@ def _run(folder: "BenchFolder", jobs: int | None, on: str | None) -> "BenchResul
         raise
 
 
-def _write(results: "BenchResults", folder: Path, command: str) -> list[Path]:
-    from ..files import write_whole
-    from ..studies.bench.bench_figures import write_bench_figures
-    from ..studies.bench.bench_tables import build_bench_page, encode_places, encode_runs
-
-    texts = {
-        "bench.md": build_bench_page(results, command),
-        "places.csv": encode_places(results),
-        "runs.csv": encode_runs(results),
-    }
-    for name, text in texts.items():
-        write_whole(folder / name, text)
-    return [*(folder / name for name in texts), *write_bench_figures(results, folder)]
-
-
-def _print_results(results: "BenchResults", paths: list[Path]) -> None:
-    from ..studies.bench.bench_tables import (
-        describe_bench,
-        list_quantities,
-        tabulate_energies,
-        tabulate_quantity,
-        tabulate_round_trips,
-        tabulate_verdicts,
-    )
-
-    for line in describe_bench(results):
-        terminal.print_text(line)
-    terminal.out.print()
-    terminal.print_table(tabulate_verdicts(results))
-    for asked in list_quantities(results):
-        if asked.key != "effort_nm":
-            terminal.out.print()
-            terminal.print_text(f"{asked.task}: {asked.words}")
-            terminal.print_table(tabulate_quantity(results, asked))
-    if any(run.observed for run in results.runs):
-        terminal.print_table(tabulate_energies(results))
-    if results.plan.study == "round-trips":
-        terminal.print_table(tabulate_round_trips(results))
-    terminal.print_paths(paths)
-
-
 def bench_command(
     study: Annotated[
         str, typer.Option("--study", metavar="full|small|round-trips", help="Which part of the suite.")
@@ -133,8 +92,8 @@ def bench_command(
     Each law has the gains that one procedure found for it. What is done is kept: the same command goes on.
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
+    from ..studies.bench.bench_figures import write_bench
     from ..studies.bench.bench_gains import find_stale
-    from ..studies.bench.bench_tables import bench_to_json
     from ..studies.commands import format_command
     from ..studies.executor import check_workers
 
@@ -154,9 +113,7 @@ def bench_command(
     results = _run(folder, jobs, on)
     given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
     words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
-    paths = _write(results, folder.path, format_command("bench", "--study", chosen, *words))
-    if as_json:
-        terminal.print_json(bench_to_json(results))
-    else:
-        _print_results(results, paths)
+    paths = write_bench(results, folder.path, format_command("bench", "--study", chosen, *words))
+    terminal.print_result(results, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
     return None

@@ -6,9 +6,8 @@ from typing import Annotated
 import typer
 
 from ..reporting import terminal_output as terminal
+from ..reporting.session_text import MARKS
 from . import options
-
-_MARKS = {"ok": "[green]ok[/green]  ", "warn": "[yellow]warn[/yellow]", "fail": "[red]fail[/red]"}
 
 
 def doctor_command(
@@ -43,7 +42,7 @@ def doctor_command(
     for finding in examine_machine(connection, keys, folder, name, SystemClock(), insecure=insecure):
         findings.append(finding)
         if not as_json:
-            terminal.print_marked(_MARKS[finding.state], f"{finding.check:<10}  {finding.text}")
+            terminal.print_marked(MARKS[finding.state], f"{finding.check:<10}  {finding.text}")
     if as_json:
         terminal.print_json([finding._asdict() for finding in findings])
     if any(finding.state == "fail" for finding in findings):

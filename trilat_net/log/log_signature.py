@@ -47,12 +47,18 @@ class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     signature: str
 
 
-def create_signing_keys(path: Path) -> tuple[Path, Path]:
+def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     """Makes a pair of keys, PATH.key, which nobody else may read, and PATH.pub; returns their files.
+
+    The command is `trilat keys pair`.
+
+    >>> [file.name for file in tn.create_signing_keys("lab")]
+    ['lab.key', 'lab.pub']
 
     Raises:
         UsageError: one of them exists, or cannot be made.
     """
+    path = Path(path)
     if not path.name:
         raise UsageError(f"{path}: is no name; keys are named as in: trilat keys pair lab")
     private, public = path.with_name(f"{path.name}.key"), path.with_name(f"{path.name}.pub")
@@ -70,14 +76,20 @@ def create_signing_keys(path: Path) -> tuple[Path, Path]:
     return private, public
 
 
-def sign_log(path: Path, key_file: Path, *, force: bool = False, progress: Progress | None = None) -> Path:
-    """Signs a finished log; returns the signature's file.
+def sign_log(
+    path: str | Path, key_file: str | Path, *, force: bool = False, progress: Progress | None = None
+) -> Path:
+    """Signs a finished log; returns the signature's file. The command is `trilat log sign`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("signed.mcap")
+    >>> tn.sign_log(path, tn.create_signing_keys("mine")[0]).name
+    'signed.mcap.sig'
 
     Raises:
         LogError: the log cannot be read, has no digest chain, or does not agree with it.
         UsageError: the key is none, others can read it, or there is a signature already.
     """
-    key = _load_private_key(key_file)
+    path, key = Path(path), _load_private_key(Path(key_file))
     made = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(made, force=force)
     integrity, chain = _read_chain(path, progress)

@@ -53,8 +53,13 @@ class MemberKeys(NamedTuple):
     settings: dict[str, Any]
 
 
-def create_keys(folder: Path, members: Sequence[str], hosts: Sequence[str], days: int) -> list[Path]:
-    """Makes an authority and a folder of keys for each member; returns the folders.
+def create_keys(
+    folder: str | Path, members: Sequence[str], hosts: Sequence[str] = (), days: int = 30
+) -> list[Path]:
+    """Makes an authority and a folder of keys for each member; returns the folders, as `trilat keys new`.
+
+    >>> [one.name for one in tn.create_keys("keys", ["m", "s", "recorder"])]
+    ['m', 's', 'recorder']
 
     Args:
         folder: where they are made; it must not exist, or be empty.
@@ -65,6 +70,7 @@ def create_keys(folder: Path, members: Sequence[str], hosts: Sequence[str], days
     Raises:
         UsageError: a name cannot be one, or the folder is not empty.
     """
+    folder = Path(folder)
     for name in members:
         if not name or not all(c.isalnum() or c in "_-" for c in name) or name == _AUTHORITY_FOLDER:
             raise UsageError(f"a member's name is letters, digits, _ and -, not {name!r}")
@@ -144,12 +150,16 @@ def _read(path: Path) -> bytes:
     return content
 
 
-def read_member_keys(folder: Path) -> MemberKeys:
-    """Returns the keys in a member's folder.
+def read_member_keys(folder: str | Path) -> MemberKeys:
+    """Returns the keys in a member's folder; the command is `trilat keys info`.
+
+    >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
+    'm'
 
     Raises:
         UsageError: something is missing, has ended, or does not belong together.
     """
+    folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
         raise UsageError(f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1")
     try:

@@ -44,7 +44,9 @@ _COMPOSERS = {
     "LogCheckReport": "checks_text:compose_verification",
     "LogCheckResult": "checks_text:compose_log_check",
     "LogMetrics": "metrics_text:compose_metrics",
+    "DoctorReport": "session_text:compose_doctor",
     "FileOverview": "overview_tables:compose_overview",
+    "PingReport": "session_text:compose_ping",
     "Recovery": "checks_text:compose_recovery",
     "Rerun": "rerun_text:compose_rerun",
 }

@@ -72,7 +72,11 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
 
 
 def describe_scenario(scenario: Scenario) -> list[str]:
-    """Returns the facts of a valid scenario and their consequences, as lines."""
+    """Returns the facts of a valid scenario and their consequences, as lines; as `trilat scenario check`.
+
+    >>> len(tn.describe_scenario(tn.load_scenario("paper"))) > 5
+    True
+    """
     beta = scenario.beta
     weights = (
         "none: alpha is reducible, some site's weight is zero"

@@ -34,7 +34,11 @@ _FOLDER = resources.files("trilat_net") / "scenarios"
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the scenarios that come with the package."""
+    """Returns the names of the scenarios that come with the package; the command is `trilat scenario list`.
+
+    >>> "paper" in tn.list_shipped()
+    True
+    """
     names = (entry.name for entry in _FOLDER.iterdir())
     return sorted(n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_"))
 
@@ -51,7 +55,11 @@ def read_shipped(name: str) -> str:
 
 
 def read_template() -> str:
-    """Returns the commented template of a scenario, valid as it stands."""
+    """Returns the commented template of a scenario, valid as it stands; as `trilat scenario new`.
+
+    >>> tn.load_scenario(tn.read_template()).names
+    ('m1', 'm2', 's')
+    """
     return (_FOLDER / "_template.toml").read_text(encoding="utf-8")
 
 

@@ -14,11 +14,12 @@ from matplotlib.figure import Figure
 
 from ...analysis.run_end import Stability
 from ...core.vectors import Array
+from ...files import write_whole
 from ...reporting import style
 from ...reporting.figure_size import make_print_size
 from ..intervals import MeanInterval
 from .bench_run import BenchPlace, BenchResults
-from .bench_tables import list_laws, name_law
+from .bench_tables import build_bench_page, encode_places, encode_runs, list_laws, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
@@ -104,3 +105,15 @@ def write_bench_figures(results: BenchResults, folder: Path) -> list[Path]:
     for path, name in zip(paths, FIGURES_OF_BENCH, strict=True):
         draw_bench(results, name).savefig(path, dpi=style.REPORT_DPI)
     return paths
+
+
+def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
+    """Writes the page, the tables and the figures of a suite, and returns their paths."""
+    texts = {
+        "bench.md": build_bench_page(results, command),
+        "places.csv": encode_places(results),
+        "runs.csv": encode_runs(results),
+    }
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+    return [*(folder / name for name in texts), *write_bench_figures(results, folder)]

@@ -8,13 +8,14 @@ run. A folder belongs to one version of the program on one arithmetic.
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...analysis.run_end import Stability
 from ...core.fingerprint import compute_fingerprint
 from ...errors import UsageError
 from ...files import make_results_folder, write_whole
 from ...log.log_layout import collect_provenance
+from ...results import Result
 from ..commands import format_command
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..intervals import MeanInterval, mean_interval, wilson_interval
@@ -97,7 +98,7 @@ class BenchPlace(NamedTuple):
         return values[0] if len(values) == 1 else mean_interval(values)
 
 
-class BenchResults:
+class BenchResults(Result):
     """The results of a suite.
 
     Attributes:
@@ -110,6 +111,26 @@ class BenchResults:
         self.plan = plan
         self.places = [BenchPlace(cell, [runs[cell.key, seed] for seed in cell.seeds]) for cell in plan.cells]
         self.runs = [run for place in self.places for run in place.runs]
+
+    def blocks(self) -> Iterator[Any]:
+        """Yields its text."""
+        from .bench_tables import compose_bench
+
+        return compose_bench(self)
+
+    def headline(self) -> str:
+        """Returns which study, and how many runs."""
+        return f"{self.plan.study}: {len(self.places)} cells, {len(self.runs)} runs"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat bench --json`."""
+        from .bench_tables import bench_to_json
+
+        return bench_to_json(self)
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per cell."""
+        return list(self.to_dict()["places"])
 
     def of(self, task: str, law: str = "", link: str = "") -> Iterator[BenchPlace]:
         """Yields the places of a task, and of a law and a link if they are named."""

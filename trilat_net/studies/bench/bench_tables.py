@@ -14,6 +14,7 @@ import msgspec
 from ...analysis.certificate.observed_energy import ObservedFinding
 from ...analysis.json_values import JsonObject
 from ...analysis.run_end import Stability
+from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval, wilson_interval
 from .bench_cell import BenchRun, declares_energies
@@ -240,6 +241,20 @@ def _encode_csv(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows({key: "" if value is None else value for key, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+def compose_bench(results: BenchResults) -> Iterator[Block]:
+    """Yields verdicts, each quantity of each task, the energies that laws declare, and round trips."""
+    yield from (*describe_bench(results), "")
+    yield tabulate_verdicts(results)
+    for asked in list_quantities(results):
+        if asked.key != "effort_nm":
+            yield from ("", f"{asked.task}: {asked.words}")
+            yield tabulate_quantity(results, asked)
+    if any(run.observed for run in results.runs):
+        yield tabulate_energies(results)
+    if results.plan.study == "round-trips":
+        yield tabulate_round_trips(results)
 
 
 def bench_to_json(results: BenchResults) -> JsonObject:
