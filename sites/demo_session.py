@@ -16,6 +16,7 @@ from pathlib import Path
 from trilat_net.core.jit import COMPILING, compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
+from trilat_net.files import find_page
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import reserve_session_endpoints
@@ -116,7 +117,7 @@ def run_demo(
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.external:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
-            display.say(f"{name} waits for its arm on {place}; see docs/external-arm.md")
+            display.say(f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}")
         attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints)
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:

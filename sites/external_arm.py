@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import LifeReason, Mode, PlantState
 from trilat_net.errors import SessionError, WireError
+from trilat_net.files import find_page
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
@@ -83,7 +84,7 @@ class ExternalArm:
                 raise SessionError(
                     f"{self._site} waited in vain for its arm: no measurement came on {self._place}"
                     + (f"; dropped: {dropped}" if dropped else "")
-                    + "; see docs/external-arm.md"
+                    + f"; see {find_page('external-arm.md')}"
                 )
             self._clock.sleep_until(now_ns + POLL_NS)
         return False

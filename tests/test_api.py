@@ -14,7 +14,8 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.golden.surface import all_options
-from trilat_net.errors import UsageError
+from tests.laws import Adaptive
+from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.results import Result
 
 FUNCTIONS = [name for name in tn.__all__ if name != "__version__"]
@@ -161,3 +162,22 @@ def test_without_pandas_an_error_says_what_to_install(file: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(UsageError, match=r"pip install 'trilat-net\[frames\]'"):
         tn.metrics(file).to_frame()
+
+
+def test_a_law_is_given_as_its_class() -> None:
+    log = tn.simulate("two_sites", {"control.law": Adaptive, "control.Kp": 2.0}, duration_s=0.1)
+    assert {site.control.code for site in log.scenario.sites.values()} == {"tests.laws:Adaptive"}
+    (trial,) = tn.trials("free", set={"control.law": Adaptive})
+    assert trial.overrides == ('control.law="tests.laws:Adaptive"',)
+
+    class Local(Adaptive):
+        """Of no file's own."""
+
+    with pytest.raises(ScenarioError, match="is no class of a file"):
+        tn.simulate("two_sites", {"control.law": Local})
+
+
+def test_errors_name_pages_that_are_there() -> None:
+    with pytest.raises(ScenarioError) as refused:
+        tn.simulate("two_sites", {"control.law": "tests.laws:nobody"}, duration_s=0.1)
+    assert Path(str(refused.value).rpartition("see ")[2]).is_file()

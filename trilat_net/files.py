@@ -10,6 +10,7 @@ import itertools
 import os
 import shutil
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -33,6 +34,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     except ImportError:
         package = module.partition(".")[0]
         raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{extra}]'") from None
+
+
+def find_page(name: str) -> Path:
+    """Returns where a page of the documentation is on this machine: beside the sources, or as installed."""
+    sources = Path(__file__).parents[1] / "docs" / name
+    return sources if sources.is_file() else Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
 
 
 def open_regular(path: Path, **how: Any) -> Any:

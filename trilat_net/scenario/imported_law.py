@@ -22,6 +22,7 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from ..files import find_page
 from .fields import Frozen
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
@@ -173,7 +174,9 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
     methods = ("torque",) if hasattr(kind, "remembers") else ("torque", "memory", "recall")
     missing = [name for name in methods if not callable(getattr(kind, name, None))]
     if missing:
-        raise ScenarioError(f"{code} has no {', '.join(missing)}; see docs/own-controller.md", path=path)
+        raise ScenarioError(
+            f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}", path=path
+        )
     stated = getattr(kind, "sites", None)
     ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
     if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(n, int) for n in ends)):
@@ -243,7 +246,9 @@ def _import_class(code: str, path: str) -> Any:
     except (SyntaxError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
     if not any(isinstance(node, ast.ClassDef) and node.name == name for node in tree.body):
-        raise ScenarioError(f"{file} defines no class {name}; see docs/own-controller.md", path=path)
+        raise ScenarioError(
+            f"{file} defines no class {name}; see {find_page('own-controller.md')}", path=path
+        )
     now = hash_law_source(code, path)
     with _searching_here():
         try:
@@ -255,6 +260,23 @@ def _import_class(code: str, path: str) -> Any:
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
     return getattr(found, name)
+
+
+def name_law_class(kind: type) -> str:
+    """Returns what a scenario calls a class, as in "mylaws:Spring".
+
+    Raises:
+        ScenarioError: it stands in no file, or within something else there.
+    """
+    module, name = kind.__module__, kind.__qualname__
+    if module == "__main__":
+        module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
+    if not module or not name.isidentifier():
+        raise ScenarioError(
+            f"{name} is no class of a file, which a log could name: write it into one, in a notebook with "
+            f"%%writefile mylaws.py, and import it from there; see {find_page('own-controller.md')}"
+        )
+    return f"{module}:{name}"
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..core.dominance import is_irreducible
 from ..errors import ScenarioError
+from ..files import find_page
 from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
@@ -86,7 +87,7 @@ def check_outside_arms(scenario: Scenario) -> None:
         if site.on_stale.action != "glide":
             raise ScenarioError(
                 f"is {site.on_stale.action!r}, and an arm outside of the program needs 'glide': only so does "
-                "its site wait, hold and stop without a jump (docs/links.md)",
+                f"its site wait, hold and stop without a jump ({find_page('links.md')})",
                 path=f"sites.{name}.on_stale.action",
                 source=scenario.name,
             )

@@ -6,6 +6,8 @@ from typing import Any
 
 import tomli_w
 
+from ..scenario.imported_law import name_law_class
+
 
 def format_command(*words: str) -> str:
     """Returns a command of the program, quoted for a shell."""
@@ -19,6 +21,8 @@ def set_options(overrides: Iterable[str]) -> list[str]:
 
 def format_toml_value(value: Any) -> str:
     """Returns a value as TOML on one line; numbers as short as they can be."""
+    if isinstance(value, type):
+        value = name_law_class(value)
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{key} = {format_toml_value(entry)}' for key, entry in value.items())}}}"
     if isinstance(value, list | tuple):

@@ -21,6 +21,7 @@ from ..core.site_setup import Gains, Scheme, SiteSetup, StaleAction
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from ..files import find_page
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.imported_law import ImportedLaw, PluggedLaw
@@ -164,7 +165,7 @@ def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
                 f"has no linear loop: {why}"
                 if why
                 else f"{code}, whose equations are unknown here; adaptive, adaptive_box, p_d, pd_d and p_f "
-                "can be linearised, and some others, see docs/laws.md",
+                f"can be linearised, and some others, see {find_page('laws.md')}",
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
