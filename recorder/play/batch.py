@@ -19,7 +19,8 @@ from trilat_net.log.record_columns import Ints
 PlayedMessage = tuple[int, int, int, bytes]
 """Time in ns since the epoch, channel, number in it, and payload of a message.
 
-The number is the tick of a record, the place from 0 of another message of a site, else the time.
+The number is the tick of a record, the place from 0 of another message of a site (of its events in each of
+its starts, which are `NUMBERS_OF_A_START` apart), else the time.
 """
 PIECE_BYTES = 65_536
 """Payload of a piece: small enough that preparing or receiving one does not delay the player."""

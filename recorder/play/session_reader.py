@@ -99,6 +99,8 @@ HORIZON_NS = 70 * NS_PER_S
 something."""
 _LAST = 1 << 61
 """Bound of times and numbers, whatever a file says."""
+NUMBERS_OF_A_START = 1 << 40
+"""Each start of a site numbers its events from 0: those of the next one come so much later."""
 
 
 class _PayloadHeader(msgspec.Struct):
@@ -157,6 +159,7 @@ class _PlayedChannel:
                 header.topics.append(topic)
             self.place = header.topics.index(topic)
         self._count = 0
+        self._starts: dict[int, int] = {}
 
     def number(self, item: McapMessage, t_ns: int) -> int:
         """Returns the number of a message, or its time if it has none."""
@@ -164,9 +167,12 @@ class _PlayedChannel:
             return number_message(self.kind, item.sequence, self.rate_hz)
         if self.kind != topics.EVENT:
             return t_ns
-        number = _decode_header(item.payload).n
-        self._count += 1  # before version 3 events had no number
-        return min(number, _LAST) if number >= 0 else self._count - 1
+        header = _decode_header(item.payload)
+        self._count += 1
+        if header.n < 0:  # before version 3 events had no number
+            return self._count - 1
+        start = self._starts.setdefault(header.boot, len(self._starts))
+        return min(min(header.n, NUMBERS_OF_A_START - 1) + start * NUMBERS_OF_A_START, _LAST)
 
 
 class SessionReader:

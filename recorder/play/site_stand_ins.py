@@ -8,6 +8,7 @@ played: a minute of them when the log is read during play (L6), all of them when
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
+from contextlib import suppress
 
 import msgspec
 import numpy as np
@@ -18,14 +19,14 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import describe_member, liveliness_token, read_events
-from trilat_net.net.messages import Info
+from trilat_net.net.messages import Event, Info
 from trilat_net.net.pinging import RepeatedQuery, answer_backfill, answer_pings
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 from trilat_net.net.wire import decode, encode
 
 from .batch import MessageBatch
 from .pace import Pace
-from .session_reader import SessionHeader
+from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 _PlayedRun = tuple[Ints, Ints, MessageBatch]
 """Messages of one channel within one batch: their numbers, ascending, their places in it, and the batch."""
@@ -111,6 +112,7 @@ class SiteStandIns:
         self._clock, self._header, self._history = clock, header, history
         self._stored: dict[str, set[str]] = {}
         self._met: set[str] = set()
+        self._boots: dict[str, tuple[int, int]] = {}
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         self._recorder_query = RepeatedQuery(bus, clock, topics.key(session, topics.RECORDER, topics.INFO))
@@ -188,10 +190,26 @@ class SiteStandIns:
         topic = "/" + topics.key(self._header.session, site, channel)
         return self._header.topics.index(topic) if topic in self._header.topics else -1
 
+    def _find_start(self, site: str) -> tuple[int, int]:
+        """Returns which start of a site is played, from 0, and its boot: that of its newest event."""
+        channel = self._find_channel(site, topics.EVENT)
+        newest = self._history.made.get(channel, 0) - 1
+        start = max(newest, 0) // NUMBERS_OF_A_START
+        if start and self._boots.get(site, (0, 0))[0] != start:
+            for payload in self._history.chunk(channel, newest, newest)[1]:
+                with suppress(WireError):
+                    self._boots[site] = start, decode(payload, Event).boot
+        first = 0, self._infos[site].boot
+        return self._boots.get(site, first) if start else first
+
     def _answer_backfill(self, site: str, query: Query) -> None:
+        start, boot = self._find_start(site)
+
         def find(wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
             channel = self._find_channel(site, wanted.channel)
-            made = self._history.made.get(channel, 0)
-            return *self._history.chunk(channel, wanted.first, wanted.last), made
+            before = start * NUMBERS_OF_A_START if wanted.channel == topics.EVENT else 0
+            made = self._history.made.get(channel, 0) - before
+            first, payloads = self._history.chunk(channel, wanted.first + before, wanted.last + before)
+            return max(first - before, 0), payloads, max(made, 0)
 
-        self.refilled += answer_backfill(query, site, self._infos[site].boot, find)
+        self.refilled += answer_backfill(query, site, boot, find)

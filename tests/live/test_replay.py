@@ -7,6 +7,8 @@ import pytest
 
 from tests.log_editing import recorded
 from tests.recorder.play.logs import session_payloads
+from tests.sites.sessions import Session as Sites
+from tests.sites.test_leaving import gliding
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
 
@@ -97,3 +99,19 @@ def test_read_by_another_process_and_as_fast_as_can_be_nothing_is_lost(stage: St
     replay = again.replay("--rate", "max", "--preload", "0", "--needs-recorder")
     assert (replay.code(), recorder.code()) == (0, 0)
     assert numbered(second) == numbered(path)
+
+
+@pytest.mark.long
+def test_a_log_in_which_a_site_began_anew_is_played_whole(stage: Stage) -> None:
+    """Each start numbers its events from 0; they are played start after start, and none is lost."""
+    session = Sites.whole(gliding(5.0), stage.folder, ends={})
+    session.clocks["m"].dies_ns = 3_000_000_000
+    session.site("m", at_ns=4_000_000_000)
+    path = session.run().source
+    again = Again(stage, Path(path))
+    second = stage.folder / "second.mcap"
+    recorder, replay = again.recorder(second), again.replay("--needs-recorder")
+    assert (replay.code(), recorder.code()) == (0, 0), (replay, recorder)
+    assert numbered(second) == numbered(Path(path))
+    assert open_log(second).starts["m"] == open_log(path).starts["m"]
+    executed_again(open_log(second))

@@ -183,9 +183,11 @@ def test_an_arm_that_falls_silent_is_held_then_in_fault_and_the_session_goes_on(
     whole(log)
 
 
-def braked(bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]]) -> None:
+def braked(
+    bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]], arm: Pendulum | None = None
+) -> None:
     """The program of an arm with brakes, every millisecond."""
-    arm = Pendulum((0.3, -0.1))
+    arm = arm or Pendulum((0.3, -0.1))
     with ArmPort(bus, clock, SESSION, "s") as port:
         next_ns = clock.monotonic_ns()
         while not port.over:
@@ -297,6 +299,39 @@ def test_a_switch_is_held_by_one_program_until_it_lets_go_or_is_silent() -> None
     ring.take(b"garbage")
     switch.poll()
     assert dropped == {"stranger": 3, "old switch message": 1, "malformed": 1}
+
+
+def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
+    """Both programs are started again by hand; meanwhile brakes hold the arm, and its peer holds."""
+    glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0}
+    scenario = load_scenario("two_sites", {**OUTSIDE, **glide, "duration_s": 6.0, "link.delay_ms": 50.0})
+    session = Session.whole(scenario, tmp_path, ends={})
+    poses: list[tuple[int, list[float]]] = []
+    arm = Pendulum((0.3, -0.1))
+
+    def drive(bus: Bus, clock: RelayClock) -> None:
+        braked(bus, clock, poses, arm)
+
+    session.stranger(drive, at_ns=A_SECOND + 200_250_000)
+    session.clocks["s"].dies_ns = 3 * A_SECOND
+    session.stranger(drive, at_ns=4 * A_SECOND + 250_000)
+    session.site("s", at_ns=4 * A_SECOND)
+    log = session.run()
+    assert [end for _, end in session.told] == ["killed", 0, 0]
+    ((first, _),) = log.starts["s"]
+    (gone,) = log.absences["s"]
+    before = [(now_ns, q) for now_ns, q in poses if now_ns < 4 * A_SECOND]
+    assert before[-1][0] <= 3 * A_SECOND + FRESH_NS  # its program ends with the site
+    part = log["s"]
+    again = part.tick >= first
+    assert part.q[again][0].tolist() == before[-1][1]
+    assert part.mode[-1] == log["m"].mode[-1] == "run"
+    assert set(log["m"].mode[gone[0] + 72 : first]) == {"hold"}
+    assert np.abs(np.diff(part.tau[again], axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
+    assert log.complete
+    result = verify(log)
+    assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
+    assert result.absences == [("s", *gone)]
 
 
 def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
