@@ -301,6 +301,7 @@ def test_a_switch_is_held_by_one_program_until_it_lets_go_or_is_silent() -> None
     assert dropped == {"stranger": 3, "old switch message": 1, "malformed": 1}
 
 
+@pytest.mark.long
 def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     """Both programs are started again by hand; meanwhile brakes hold the arm, and its peer holds."""
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0}
