@@ -46,6 +46,7 @@ if _TYPE_CHECKING:
     from .reporting.figures.registry import figure
     from .scenario import list_shipped, load_scenario, read_template
     from .scenario.describe import describe_scenario
+    from .scenario.measured_traces import import_trace
     from .studies.trials.trial import trials
     from .studies.trials.trial_runner import check
 
@@ -66,6 +67,7 @@ __all__ = [
     "export",
     "figure",
     "hand",
+    "import_trace",
     "info",
     "linear",
     "list_shipped",
@@ -99,6 +101,7 @@ _MODULES = {
     "doctor": "sites.running_session",
     "figure": "trilat_net.reporting.figures.registry",
     "hand": "sites.hand_session",
+    "import_trace": "trilat_net.scenario.measured_traces",
     "list_shipped": "trilat_net.scenario",
     "load_scenario": "trilat_net.scenario",
     "open_log": "trilat_net.log.log_reader",

@@ -42,6 +42,7 @@ from . import (
     stop,
     sweep,
     test,
+    trace,
     verify,
     watch,
 )
@@ -153,6 +154,9 @@ _SCENARIO = {
     "check": (scenario.scenario_check_command, "mine.toml"),
     "new": (scenario.scenario_new_command, "mine.toml"),
 }
+_TRACE = {
+    "import": (trace.trace_import_command, "irtt run.json.gz", "csv drive.txt --way half -o drive.csv"),
+}
 _SET = {
     "link": (set_command.set_link_command, "'m1->s' --delay 350ms --loss 5%"),
     "dominance": (set_command.set_dominance_command, "s m1=0.9 m2=0.1"),
@@ -175,6 +179,9 @@ app.add_typer(_group(_STUDIES))
 app.add_typer(
     _group(_SCENARIO, "scenario ", no_args_is_help=True, help="The shipped scenarios and your own."),
     name="scenario",
+)
+app.add_typer(
+    _group(_TRACE, "trace ", no_args_is_help=True, help="Delays that other programs measured."), name="trace"
 )
 app.add_typer(_CHANGES, name="set")
 app.add_typer(

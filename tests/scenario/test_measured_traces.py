@@ -1,0 +1,142 @@
+"""Traces of what irtt, ping and others measured: their own numbers, as they state them."""
+
+import gzip
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.delay_models import TraceDelay
+from trilat_net.scenario.measured_traces import import_trace
+
+RTT_NS = (17291970, 16870863, 16064572, 16259053, 16597560)
+SENT_NS = (22211105, 1022856655, 2022029432, 3022256680, 4022643932)
+IRTT_MEAN_NS, IRTT_DEVIATION_NS = 16616803, 488290
+"""Of five round trips that irtt measured, and its own statistics of them (README of clarkzjw/LENS)."""
+PING = """PING sat (2605:59c8:1000:962f::1) 56 data bytes
+[1700182800.410606] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=1 ttl=63 time=60.6 ms
+[1700182800.421290] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=2 ttl=63 time=56.9 ms
+[1700182800.442474] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=3 ttl=63 time=62.0 ms
+[1700182800.443000] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=3 ttl=63 time=62.5 ms (DUP!)
+[1700182800.475936] 64 bytes from 2605:59c8:1000:962f::1: icmp_seq=5 ttl=63 time=65.1 ms
+"""
+CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
+1722584108452 1722584108474 22 329247.4 -73
+1722584108506 1722584108539 33 329247.4 -73
+1722584108561 1722584119061 10500 329247.4 -73
+"""
+
+
+def trip(number: int, lost: str = "false") -> dict[str, Any]:
+    times = {"client": {"send": {"wall": 1707277440772833721, "monotonic": SENT_NS[number]}}}
+    delay = {} if lost != "false" else {"rtt": RTT_NS[number], "send": 10486437967, "receive": -10470921269}
+    return {"seqno": number, "lost": lost, "timestamps": times, "delay": delay}
+
+
+def irtt(folder: Path, *lost: int, zipped: bool = False) -> Path:
+    trips = [trip(n, "true_up" if n in lost else "false") for n in range(5)]
+    text = json.dumps({"stats": {}, "round_trips": trips}).encode()
+    path = folder / ("run.json.gz" if zipped else "run.json")
+    path.write_bytes(gzip.compress(text) if zipped else text)
+    return path
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_irtt_says_of_round_trips_what_the_trace_says_of_halves(tmp_path: Path, zipped: bool) -> None:
+    found = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
+    facts = found.to_dict()
+    assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
+    sample = facts["deviation_ms"] * math.sqrt(5 / 4)
+    assert sample == pytest.approx(0.5e-6 * IRTT_DEVIATION_NS, rel=1e-5)
+    assert [t_s for t_s, _ in found.points] == pytest.approx(
+        [(t - SENT_NS[0]) * 1e-9 for t in SENT_NS], abs=1e-6
+    )
+    assert import_trace(irtt(tmp_path), "irtt", way="whole").delay_ms == pytest.approx(
+        np.array(RTT_NS) * 1e-6
+    )
+
+
+def test_what_irtt_lost_is_lost_and_clocks_that_differ_are_told(tmp_path: Path) -> None:
+    found = import_trace(irtt(tmp_path, 1, 2), "irtt")
+    assert [math.isinf(ms) for _, ms in found.points] == [False, True, True, False, False]
+    assert (found.to_dict()["lost_percent"], found.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
+    with pytest.raises(ScenarioError, match="clocks do not agree"):
+        import_trace(irtt(tmp_path), "irtt", way="receive")
+    assert import_trace(irtt(tmp_path), "irtt", way="send").too_long == 5
+
+
+def test_a_ping_has_its_gaps_and_the_times_of_sending(tmp_path: Path) -> None:
+    path = tmp_path / "ping.txt"
+    path.write_text(PING)
+    found = import_trace(path, "ping")
+    assert [ms for _, ms in found.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
+    assert found.points[1][0] == pytest.approx(0.421290 - 0.0569 - (0.410606 - 0.0606), abs=1e-6)
+    path.write_text(PING.replace("[17001828", "x [17001828"))
+    assert [t for t, _ in import_trace(path, "ping", every_s=0.2).points] == pytest.approx(
+        [0.0, 0.2, 0.4, 0.6, 0.8]
+    )
+
+
+def test_a_ping_that_counts_from_zero_again_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "ping.txt"
+    lines = [f"64 bytes from 192.0.2.1: icmp_seq={n} ttl=63 time=2.0 ms" for n in (65534, 65535, 0, 2)]
+    path.write_text("\n".join(lines))
+    assert [ms for _, ms in import_trace(path, "ping").points] == [1.0, 1.0, 1.0, math.inf, 1.0]
+
+
+def test_a_table_of_the_form_of_cicv5g_makes_a_link(tmp_path: Path) -> None:
+    path = tmp_path / "drive.txt"
+    path.write_text(CICV5G)
+    found = import_trace(path, "csv", way="half")
+    assert found.points == ((0.0, 11.0), (0.054, 16.5), (0.109, 5250.0))
+    whole = import_trace(path, "csv")
+    assert whole.points == ((0.0, 22.0), (0.054, 33.0), (0.109, math.inf))
+    assert whole.too_long == 1
+    assert "1 took longer than 10 s and count as lost" in whole.summary()
+    trace = tmp_path / "drive.csv"
+    trace.write_text(whole.write_rows())
+    link = load_scenario("free", {"link": {"model": "trace", "file": str(trace)}}).links["m1->s"]
+    assert isinstance(link, TraceDelay)
+    assert link.points.tolist() == [[0, 22000], [54000, 33000], [109000, -1]]
+
+
+def test_a_column_says_its_unit_and_whether_it_is_a_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("timestamp_s,rtt_ms,uplink_ms\n0,20,12\n1,40,-1\n")
+    assert [ms for _, ms in import_trace(path, "csv").points] == [10.0, 20.0]
+    assert [ms for _, ms in import_trace(path, "csv", column="uplink_ms").points] == [12.0, math.inf]
+    path.write_text("timestamp,rtt\n0,20\n")
+    with pytest.raises(ScenarioError, match="'timestamp' names no unit"):
+        import_trace(path, "csv")
+
+
+@pytest.mark.parametrize(
+    ("form", "text", "said"),
+    [
+        ("irtt", "{}", "is not of the form irtt"),
+        ("irtt", "[1", "is not of the form irtt"),
+        ("ping", "nothing", "no line tells of an answer"),
+        ("csv", "a,b\n1,2\n", "has no column like t_ms"),
+        ("csv", "t_s,delay_ms\n0,x\n", "it reads '0,x'"),
+        ("csv", "t_s,delay_ms\n", "it has no samples"),
+    ],
+)
+def test_what_is_not_of_a_form_is_refused(tmp_path: Path, form: str, text: str, said: str) -> None:
+    path = tmp_path / "file"
+    path.write_text(text)
+    with pytest.raises(ScenarioError, match=said):
+        import_trace(path, form)
+
+
+def test_there_is_no_other_form_and_no_other_way(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="irtt, ping, csv"):
+        import_trace(tmp_path, "xml")
+    with pytest.raises(UsageError, match="half, whole"):
+        import_trace(tmp_path, "ping", way="send")
+    with pytest.raises(ScenarioError, match="cannot be read"):
+        import_trace(tmp_path / "nowhere", "csv")
