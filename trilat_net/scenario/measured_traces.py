@@ -116,8 +116,10 @@ def import_trace(
 ) -> MeasuredTrace:
     """Returns the trace of a file of `irtt client -o`, of `ping -D`, or of a table with a head.
 
-    >>> tn.import_trace("ping.txt", "ping").to_dict()["p50_ms"]
-    >>> Path("ping.csv").write_text(tn.import_trace("ping.txt", "ping").write_rows())
+    >>> with open("table.csv", "w") as table:
+    ...     _ = table.write("t_s,rtt_ms\\n0.0,20\\n0.1,40\\n")
+    >>> tn.import_trace("table.csv", "csv").delay_ms.tolist()
+    [10.0, 20.0]
 
     Args:
         path: the file; JSON may be gzipped.
