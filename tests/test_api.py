@@ -27,6 +27,7 @@ def test_what_a_key_completes_is_what_there_is() -> None:
 
 
 COUNTERPARTS = {
+    "import_trace": ["trace import"],
     "run": ["demo"],
     "start": ["live", "site", "record", "watch", "router", "replay"],
     "session": ["ping", "stop", "enable", "reset", "set link", "set dominance"],
