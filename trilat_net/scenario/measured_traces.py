@@ -117,7 +117,7 @@ def import_trace(
     """Returns the trace of a file of `irtt client -o`, of `ping -D`, or of a table with a head.
 
     >>> with open("table.csv", "w") as table:
-    ...     _ = table.write("t_s,rtt_ms\\n0.0,20\\n0.1,40\\n")
+    ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
     >>> tn.import_trace("table.csv", "csv").delay_ms.tolist()
     [10.0, 20.0]
 
