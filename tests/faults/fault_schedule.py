@@ -1,6 +1,6 @@
 """What goes wrong in a session, and when: drawn from a seed, or given.
 
-All of it happens in `TROUBLE_S` and has ended by `HEALED_S`; what is left of the session must be enough for
+All of it happens within the trouble of a timetable; what is left of the session after it must be enough for
 everybody to follow everybody again.
 """
 
@@ -12,11 +12,29 @@ from trilat_net.net.requests import ChangeRequest
 
 SITES = ("m1", "m2", "s")
 MEMBERS = (*SITES, "recorder")
-LENGTH_S = 5.0
-TROUBLE_S = (0.5, 1.6)
-"""Tick 0 is at 0 s."""
-HEALED_S = 1.8
 MOST_FAULTS = 4
+
+
+class Timetable(NamedTuple):
+    """When what may go wrong in a session; tick 0 is at 0 s.
+
+    Attributes:
+        length_s: of the session.
+        trouble_s: when faults begin.
+        healed_s: all have ended by then.
+        engaged_s: so long before the end everybody follows everybody again.
+        without: kinds of faults from which nobody would be back in time.
+    """
+
+    length_s: float
+    trouble_s: tuple[float, float]
+    healed_s: float
+    engaged_s: float
+    without: tuple[str, ...] = ()
+
+
+WHOLE = Timetable(5.0, (0.5, 1.6), 1.8, 0.2)
+SHORT = Timetable(1.1, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop"))
 
 
 class Fault(NamedTuple):
@@ -84,14 +102,15 @@ KINDS = {
 }
 
 
-def draw_faults(seed: int) -> list[Fault]:
+def draw_faults(seed: int, timetable: Timetable = WHOLE) -> list[Fault]:
     """The faults of a seed, in time."""
     rng = Random(seed)
-    names, weights = list(KINDS), [kind.weight for kind in KINDS.values()]
+    names = [name for name in KINDS if name not in timetable.without]
+    weights = [KINDS[name].weight for name in names]
     faults = []
     for kind in rng.choices(names, weights, k=rng.randint(1, MOST_FAULTS)):
-        at_s = round(rng.uniform(*TROUBLE_S), 4)
-        longest_s = HEALED_S - at_s
+        at_s = round(rng.uniform(*timetable.trouble_s), 4)
+        longest_s = timetable.healed_s - at_s
         for_s = round(min(longest_s, rng.choice([0.01, 0.03, 0.1, 0.5, 1.5]) * rng.uniform(0.5, 1.5)), 4)
         size = round(rng.uniform(*KINDS[kind].sizes), 4)
         faults.append(Fault(kind, at_s, for_s, KINDS[kind].of(rng), size))

@@ -1,5 +1,6 @@
 """A session of three sites and a recorder with faults, in one process, and what was published in it."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
 
-from .fault_schedule import HEALED_S, LENGTH_S, MEMBERS, SITES, Fault, order_of
+from .fault_schedule import MEMBERS, SITES, WHOLE, Fault, Timetable, order_of
 from .faulty_network import FaultyNetwork
 
 NEVER_NS = 2_000 * 10**9
@@ -34,7 +35,6 @@ LINK_S, RECONNECT_S, LOOKS_AGAIN_S = 0.03, 0.1, 0.25
 """Delay of the links; a connection that has ended is made again no sooner; an operator comes twice."""
 KEYS: dict[str, Any] = {
     "rate_hz": 1000,
-    "duration_s": LENGTH_S,
     "link": {"delay_ms": 1e3 * LINK_S},
     "on_stale.action": "glide",
     "on_stale.align_limit_rad": 3.0,
@@ -50,9 +50,9 @@ KEYS: dict[str, Any] = {
 }
 
 
-def make_scenario() -> Scenario:
+def make_scenario(timetable: Timetable = WHOLE) -> Scenario:
     """The paper's arms and law without hands, which wait, align, hold and come back."""
-    return load_scenario("free", KEYS)
+    return load_scenario("free", {"duration_s": timetable.length_s, **KEYS})
 
 
 @dataclass
@@ -74,6 +74,7 @@ class FaultSession(Session):
 
     faults: Sequence[Fault] = ()
     seed: int = 0
+    timetable: Timetable = WHOLE
     epoch_ns: int = 0
     plans: list[tuple[Fault, RelayClock, Interrupt, RelayClock]] = field(default_factory=list)
     """Sites that end before their time: the fault, clock and signals, and the clock of the next start."""
@@ -143,7 +144,7 @@ class FaultSession(Session):
             else:
                 clock.at(at_ns, lambda interrupt=interrupt: setattr(interrupt, "number", 15))
         for late_s in (0.0, LOOKS_AGAIN_S):
-            self.relay.happens(self._at(HEALED_S + late_s), self._let_go)
+            self.relay.happens(self._at(self.timetable.healed_s + late_s), self._let_go)
         for fault in self.faults:
             act = getattr(self, "_" + fault.kind.replace(" ", "_"), None)
             if act is not None:
@@ -261,7 +262,7 @@ class FaultSession(Session):
         patches = [
             mock.patch("sites.site_parts.new_boot", side_effect=boots),
             mock.patch("sites.site_parts.WARM_UP_TICKS", 2),
-            mock.patch("sites.retransmit_buffer.KEPT_S", round(LENGTH_S)),
+            mock.patch("sites.retransmit_buffer.KEPT_S", math.ceil(self.timetable.length_s)),
         ]
         for disk in (SmallDisk(int(fault.size)) for fault in self.faults if fault.kind == "full disk"):
             opened = partial(_file_on, disk)
@@ -290,9 +291,12 @@ def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:
     return file_on(disk, path)
 
 
-def run_faults(faults: Sequence[Fault], folder: Path, seed: int = 0) -> FaultSession:
+def run_faults(
+    faults: Sequence[Fault], folder: Path, seed: int = 0, timetable: Timetable = WHOLE
+) -> FaultSession:
     """A session with these faults, run to its end."""
-    session = FaultSession(make_scenario(), folder / "run.mcap", faults=faults, seed=seed)
+    scenario = make_scenario(timetable)
+    session = FaultSession(scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable)
     session.prepare()
     session.play()
     return session

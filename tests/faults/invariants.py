@@ -16,7 +16,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.net.messages import State
 from trilat_net.scenario import Scenario
 
-from .fault_schedule import LENGTH_S, SITES
+from .fault_schedule import SITES
 from .fault_session import FaultSession, Published
 
 SILENT_TICKS = 20
@@ -31,8 +31,6 @@ LEGAL = {
 """How a site may change its mode; every start begins with `waiting`."""
 STEP_SHARE = 1.1
 """Most that the torque may step between ticks, of what it does in the run without faults."""
-ENGAGED_S = 0.2
-"""So long before its end everybody follows everybody again."""
 RESIDUAL = 1e-9
 START_TICKS = 100
 
@@ -199,9 +197,10 @@ def allowed_step(scenario: Scenario, undisturbed_nm: float) -> float:
 def check_liveness(session: FaultSession) -> Iterator[str]:
     """I8: once everything is mended, everybody follows everybody again."""
     rate_hz = session.scenario.sites[SITES[0]].rate_hz
-    last = round(LENGTH_S * rate_hz)
+    timetable = session.timetable
+    last = round(timetable.length_s * rate_hz)
     for name, states in session.published.states.items():
-        modes = {state.mode for state in states if state.tick >= last - ENGAGED_S * rate_hz}
+        modes = {state.mode for state in states if state.tick >= last - timetable.engaged_s * rate_hz}
         if modes != {"run"}:
             yield f"{name} ends in {' and '.join(sorted(modes)) or 'silence'}"
 

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from .fault_schedule import Fault, describe, draw_faults
+from .fault_schedule import WHOLE, Fault, Timetable, describe, draw_faults
 from .fault_session import FaultSession, run_faults
 from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, find_rises, largest_steps
 
@@ -43,9 +43,9 @@ class Judged(NamedTuple):
         return "\n".join([describe(self.faults), *found])
 
 
-def judge_seed(seed: int, *, again: bool = True) -> Judged:
+def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
     """Judges the faults of a seed; `again` runs them twice and compares."""
-    return judge_faults(draw_faults(seed), seed, again=again)
+    return judge_faults(draw_faults(seed, timetable), seed, again=again, timetable=timetable)
 
 
 def time_seed(seed: int) -> tuple[Judged, float]:
@@ -55,18 +55,20 @@ def time_seed(seed: int) -> tuple[Judged, float]:
     return judge_seed(seed), time.process_time() - began_s
 
 
-def judge_faults(faults: Sequence[Fault], seed: int = 0, *, again: bool = False) -> Judged:
+def judge_faults(
+    faults: Sequence[Fault], seed: int = 0, *, again: bool = False, timetable: Timetable = WHOLE
+) -> Judged:
     """Judges some faults; chance in the network comes from the seed."""
-    undisturbed_nm = find_undisturbed_step()
+    undisturbed_nm = find_undisturbed_step(timetable)
     with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
-            session = run_faults(faults, Path(folder), seed)
+            session = run_faults(faults, Path(folder), seed, timetable)
             found = {name: list(check(session)) for name, check in INVARIANTS.items()}
             found[TORQUE] = list(check_torque(session, undisturbed_nm))
             digest = digest_session(session)
         if again:
             with tempfile.TemporaryDirectory() as folder:
-                if digest_session(run_faults(faults, Path(folder), seed)) != digest:
+                if digest_session(run_faults(faults, Path(folder), seed, timetable)) != digest:
                     found[AGAIN] = ["the same seed publishes or records other bytes"]
         violations = {name: texts for name, texts in found.items() if texts}
         rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
@@ -92,10 +94,11 @@ def collector_at_rest() -> Iterator[None]:
 
 
 @cache
-def find_undisturbed_step() -> float:
+def find_undisturbed_step(timetable: Timetable = WHOLE) -> float:
     """The largest step of a torque in the session without faults, after its first 0.1 s, N m."""
     with tempfile.TemporaryDirectory() as folder:
-        return max(largest_steps(run_faults((), Path(folder)).published, START_TICKS).values())
+        undisturbed = run_faults((), Path(folder), timetable=timetable)
+        return max(largest_steps(undisturbed.published, START_TICKS).values())
 
 
 def digest_session(session: FaultSession) -> str:
