@@ -14,21 +14,14 @@ from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, TickRecord
 from trilat_net.log.log_writer import LogParts
 from trilat_net.net.membership import Epoch
-from trilat_net.scenario import Scenario
 
 from .judged_seed import AGAIN, TORQUE
 
 
-def _with_setups(change: Callable[[SiteSetup, int], SiteSetup]) -> AbstractContextManager[Any]:
-    """Sites are built from other set-ups; the number says how often one was built before."""
-    build, built = Scenario.setup, 0
-
-    def setup(scenario: Scenario, site: str) -> SiteSetup:
-        nonlocal built
-        built += 1
-        return change(build(scenario, site), built)
-
-    return mock.patch.object(Scenario, "setup", setup)
+def _with_setups(change: Callable[[SiteSetup], SiteSetup]) -> AbstractContextManager[Any]:
+    """Sites are built from other set-ups than their scenario says."""
+    begin = Site.__init__
+    return mock.patch.object(Site, "__init__", lambda site, setup: begin(site, change(setup)))
 
 
 def _with_records(change: Callable[[TickRecord], TickRecord]) -> AbstractContextManager[Any]:
@@ -41,7 +34,7 @@ def _with_records(change: Callable[[TickRecord], TickRecord]) -> AbstractContext
 def waits_too_long() -> Iterator[None]:
     """A silence of 60 ms is no silence yet."""
 
-    def slower(setup: SiteSetup, _: int) -> SiteSetup:
+    def slower(setup: SiteSetup) -> SiteSetup:
         rule = setup.on_stale
         return setup._replace(on_stale=rule._replace(age_ns=3 * rule.age_ns))
 
@@ -53,7 +46,7 @@ def waits_too_long() -> Iterator[None]:
 def follows_at_once() -> Iterator[None]:
     """Sites begin to follow without waiting or aligning."""
 
-    def at_once(setup: SiteSetup, _: int) -> SiteSetup:
+    def at_once(setup: SiteSetup) -> SiteSetup:
         return setup._replace(on_stale=setup.on_stale._replace(action=StaleAction.USE))
 
     with _with_setups(at_once):
@@ -64,7 +57,7 @@ def follows_at_once() -> Iterator[None]:
 def jumps_back() -> Iterator[None]:
     """Held and let go, the reference is where the peers are at once."""
 
-    def faster(setup: SiteSetup, _: int) -> SiteSetup:
+    def faster(setup: SiteSetup) -> SiteSetup:
         return setup._replace(on_stale=setup.on_stale._replace(align_speed=1e9))
 
     with _with_setups(faster), mock.patch("trilat_net.core.session_life.MIN_ALIGN_NS", 1):
@@ -75,7 +68,7 @@ def jumps_back() -> Iterator[None]:
 def learns_the_wrong_way() -> Iterator[None]:
     """The estimate goes up the gradient."""
 
-    def wrong(setup: SiteSetup, _: int) -> SiteSetup:
+    def wrong(setup: SiteSetup) -> SiteSetup:
         gains = setup.gains
         return setup._replace(gains=gains._replace(Gamma=tuple(-gain for gain in gains.Gamma)))
 
