@@ -1,5 +1,6 @@
 """Bugs that are put into the program on purpose: each breaks one invariant, and the seeds must find it."""
 
+import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -55,10 +56,11 @@ def follows_at_once() -> Iterator[None]:
 
 @contextmanager
 def jumps_back() -> Iterator[None]:
-    """Held and let go, the reference is where the peers are at once."""
+    """Held and let go, the reference is where the peers are at once, and the torque what that asks for."""
 
     def faster(setup: SiteSetup) -> SiteSetup:
-        return setup._replace(on_stale=setup.on_stale._replace(align_speed=1e9))
+        unlimited = setup.limits._replace(tau_rate=(math.inf,))
+        return setup._replace(limits=unlimited, on_stale=setup.on_stale._replace(align_speed=1e9))
 
     with _with_setups(faster), mock.patch("trilat_net.core.session_life.MIN_ALIGN_NS", 1):
         yield
