@@ -14,6 +14,7 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.golden.surface import all_options
+from tests.json_outline import PAGE, build_page, is_documented
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.results import Result
@@ -120,6 +121,7 @@ def test_a_result_says_what_its_command_prints(command: str, file: Path) -> None
     assert "\n" not in repr(found)
     assert repr(found).startswith(f"<{type(found).__name__} ")
     assert _Texts(found._repr_html_()).words == found.summary().split()
+    assert is_documented(command, found.to_dict())
     frame = found.to_frame()
     assert len(frame) == len(found.to_rows()) > 0
 
@@ -182,3 +184,8 @@ def test_errors_name_pages_that_are_there() -> None:
     with pytest.raises(ScenarioError) as refused:
         tn.simulate("two_sites", {"control.law": "tests.laws:nobody"}, duration_s=0.1)
     assert Path(str(refused.value).rpartition("see ")[2]).is_file()
+
+
+@pytest.mark.long
+def test_the_page_of_keys_is_that_of_the_results() -> None:
+    assert PAGE.read_text(encoding="utf-8") == build_page()

@@ -1,0 +1,98 @@
+"""Writes docs/json.md: the keys and types of every result's JSON, as samples have them.
+
+python -m tests.json_outline
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import trilat_net as tn
+from trilat_net.results import Result
+
+PAGE = Path(__file__).parents[1] / "docs" / "json.md"
+GOLDEN = Path(__file__).parent / "golden"
+LOGS = (GOLDEN / "live-4g.mcap", GOLDEN / "live-paper.mcap", GOLDEN / "v3.mcap")
+OF_LOGS: dict[str, Callable[[Path], Result]] = {
+    "certify": tn.certify,
+    "metrics": tn.metrics,
+    "verify": tn.verify,
+    "log info": tn.info,
+    "log check": tn.check_file,
+    "sim": tn.open_log,
+    "compare": lambda file: tn.compare(file, LOGS[0]),
+    "rerun": lambda file: tn.rerun(file, ["s"], {"control.Kd": 5}),
+}
+OTHERS: dict[str, Callable[[], Result]] = {
+    "linear": lambda: tn.linear("p_d_margin", over=["control.d=0.3:1"]),
+    "test": lambda: tn.check("free", jobs=1),
+}
+HEAD = """# JSON of the commands
+
+What `--json` prints, and `to_dict()` returns in Python ([python.md](python.md)): keys and their types. `*`
+stands for a name, of a site, a link, a quantity, a channel; `[]` for every entry of a list. Keys end in their
+unit; a number that is not known is null, and one that no sample has stands as null alone. Keys may be added,
+none is taken away or changes its meaning. `trilat sweep`, `compare --tune` and `bench` have rows as in their
+files ([sweep.md](sweep.md), [fair-comparison.md](fair-comparison.md), [bench.md](bench.md)). The page is
+written by `python -m tests.json_outline`.
+"""
+_KINDS = {bool: "boolean", int: "number", float: "number", str: "text", type(None): "null"}
+_NAMED = re.compile(
+    r"\.(sites|links|walls|judged|records|parameters|channels|remarks|means|unknown|edges|q_rad|x|theta_hat"
+    r"|delay_in_use_ms|passive_qd_of_joint|versions|accounts|compression|attachments"
+    r"|beta_first|beta_last|parts_last_j|taken_j|given_j|causes_j|sites_unexplained_max_j|part|ended|torque_nm|weight"
+    r"|metadata|coverage|counts)$"
+)
+"""Tables whose keys are names."""
+
+
+def is_documented(command: str, value: Any) -> bool:
+    """True if the page has every key of a result, as it is, or with more below it."""
+    section = PAGE.read_text(encoding="utf-8").partition(f"## trilat {command}\n")[2].partition("\n## ")[0]
+    known = re.findall(r"^([^\s:]+): ", section, re.MULTILINE)
+    return all(
+        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known) for path in gather([value])
+    )
+
+
+def outline(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yields the path of every key that holds no further ones, and its type."""
+    if isinstance(value, dict) and value:
+        for key, below in value.items():
+            texts = path == ".session" and all(isinstance(one, str) for one in value.values())
+            named = texts or bool(_NAMED.search(path))
+            yield from outline(below, f"{path}.{'*' if named else key}")
+    elif isinstance(value, list | tuple) and value:
+        for below in value:
+            yield from outline(below, f"{path}[]")
+    else:
+        yield path, _KINDS.get(type(value), "table" if isinstance(value, dict) else "list")
+
+
+def gather(found: list[Any]) -> dict[str, str]:
+    """Returns the types of all keys of several samples."""
+    kinds: dict[str, set[str]] = {}
+    for one in found:
+        for path, kind in outline(one):
+            kinds.setdefault(path.removeprefix("."), set()).add(kind)
+    return {path: " or ".join(sorted(kinds[path])) for path in sorted(kinds)}
+
+
+def build_page() -> str:
+    """Returns the page."""
+    samples = {name: [find(log).to_dict() for log in LOGS] for name, find in OF_LOGS.items()}
+    for name in ("contact", "force_sharing"):
+        log = tn.simulate(name)
+        samples["metrics"].append(tn.metrics(log).to_dict())
+        samples["certify"].append(tn.certify(log).to_dict())
+    samples |= {name: [find().to_dict()] for name, find in OTHERS.items()}
+    parts = [HEAD]
+    for name, found in samples.items():
+        lines = [f"{path}: {kind}" for path, kind in gather(found).items()]
+        parts.append("\n".join([f"## trilat {name}", "", "```text", *lines, "```", ""]))
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(build_page(), encoding="utf-8")
