@@ -6,6 +6,7 @@ for no records from before it, and for all events, which say what was changed.
 """
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -16,6 +17,7 @@ from recorder.site_reception import SiteReception
 from trilat_net.analysis.certificate.running_energy import RunningEnergy
 from trilat_net.analysis.record_window import RecordWindow, make_windows
 from trilat_net.core.live_hand import TAKEN
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import topics
@@ -72,6 +74,8 @@ class SiteView:
         hand: the live hand that its scenario has there; None without one.
         holder: who took hold of its arm last.
         glides: true: its rule for stale peers is "glide".
+        layout: of its records, if it may go on without a lost one of its peers; else None.
+        peers: its peers, in scenario order.
     """
 
     def __init__(
@@ -83,8 +87,10 @@ class SiteView:
         hand: LiveHand | None = None,
         *,
         glides: bool = False,
+        layout: Layout | None = None,
+        peers: Sequence[str] = (),
     ) -> None:
-        self.glides = glides
+        self.glides, self.layout, self.peers = glides, layout, peers
         self.reception, self.window, self.hand = reception, window, hand
         self.holder = ""
         self.dropped: Counter[str] = Counter()
@@ -98,7 +104,8 @@ class SiteView:
         record = self.record
         if record is None or not self.glides:
             return None
-        return find_alarm(session, name, record.mode, record.mem, len(record.q_des))
+        lost = self.layout.find_lost(record.mem, self.peers) if self.layout is not None else ()
+        return find_alarm(session, name, record.mode, record.mem, len(record.q_des), lost)
 
     @property
     def complete(self) -> int:
@@ -200,6 +207,8 @@ class SessionView:
                 *(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name]),
                 find_live_hand(scenario.sites[name].hands),
                 glides=scenario.sites[name].on_stale.action == "glide",
+                layout=scenario.layout(name) if scenario.sites[name].on_stale.rule.degrades else None,
+                peers=scenario.peers(name),
             )
             for name in scenario.names
         }

@@ -340,14 +340,15 @@ class RunningSite:
 
     def _raise_alarm(self, output: TickRecord) -> None:
         """Says that the arm is stopped, or at most once a second that it holds; why, and what to do."""
-        session, mode = self._parts.options.session, output.mode
+        parts, mode, rule = self._parts, output.mode, self._parts.setup.on_stale
         second = output.t_ns // NS_PER_S
         if mode is Mode.HOLD and second <= self._held_s:
             return
         self._held_s = second if mode is Mode.HOLD else self._held_s
-        shared, glides = len(output.q_des), self._parts.setup.on_stale.action is StaleAction.GLIDE
-        alarm = (
-            find_alarm(session, self._parts.name, mode.name.lower(), output.mem, shared) if glides else None
-        )
-        if alarm is not None:
-            self._parts.say(f"*** {alarm}")
+        if rule.action is not StaleAction.GLIDE:
+            return
+        says_lost = rule.degrades and mode is Mode.RETURN
+        lost = parts.site.layout.find_lost(output.mem, parts.site.peers) if says_lost else ()
+        shown = (parts.options.session, parts.name, mode.name.lower(), output.mem, len(output.q_des), lost)
+        if (alarm := find_alarm(*shown)) is not None:
+            parts.say(f"*** {alarm}")

@@ -8,6 +8,7 @@ import trilat_net
 from tests.analysis import logs
 from tests.core.test_safeguards import stopped_log
 from trilat_net.analysis.health import summarise_clock
+from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import LifeReason, find_alarm
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.reporting import summary_text
@@ -69,6 +70,16 @@ def test_an_alarm_says_what_to_do(mode, reason, advice):
     alarm = find_alarm("x", "s", mode, [0.0, 0.0, 0.0, 0.0, 0.0, float(reason)], 2)
     assert (alarm is None) == (advice is None)
     assert alarm is None or alarm.advice.endswith(advice)
+
+
+def test_who_goes_on_without_a_peer_says_so():
+    layout = Layout()
+    mem = [0.0] * layout.life_memory(2) + [0.0, -1.0]
+    assert layout.find_lost(mem, ("m1", "m2")) == ["m2"]
+    alarm = find_alarm("x", "s", "run", mem, 2, layout.find_lost(mem, ("m1", "m2")))
+    assert alarm.word == "WITHOUT m2"
+    assert find_alarm("x", "s", "fault", mem, 2, ["m2"]).word == "FAULT"
+    assert layout.find_lost(mem[:4], ("m1", "m2")) == []
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 5, [0.0] * 5 + [1e9], [0.0] * 5 + [-1.0]])

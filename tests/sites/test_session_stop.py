@@ -178,7 +178,20 @@ def test_a_master_that_is_killed_is_done_without_and_taken_back(tmp_path: Path) 
     session = Session.whole(load_scenario("paper", rule), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4_000_000_000
     session.site("m1", at_ns=8_000_000_000)
+    raised: set[tuple[str, str]] = set()
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        watch = SessionWatch(bus, clock, SESSION)
+        while not watch.view.ended:
+            watch.update()
+            raised.update((name, alarm.word) for name, alarm in watch.alarms)
+            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+
+    session.stranger(look)
     log = session.run()
+    assert {("m2", "WITHOUT m1"), ("s", "WITHOUT m1")} <= raised
+    assert not [name for name, word in raised if word.startswith("WITHOUT") and name == "m1"]
+    assert any("s: *** WITHOUT m1" in line for line in session.said)
     assert [end for _, end in session.told] == ["killed", 0, 0, 0]
     for name in ("m2", "s"):
         reasons = [int(state.mem[5]) for state in log[name].states]

@@ -189,6 +189,11 @@ class Layout(NamedTuple):
         """
         return 2 * (self.shared + 1) + peers + self.joints + peers * degrades
 
+    def find_lost(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
+        """Returns the peers without which a site that degrades goes on, by a record's `mem`."""
+        end = self.life_memory(len(peers), degrades=True)
+        return [peer for peer, gone in zip(peers, mem[end - len(peers) : end], strict=False) if gone]
+
     @property
     def floats(self) -> int:
         """Length of a record's row of floats."""

@@ -314,14 +314,21 @@ _REMEDIES = {
 _ONCE_HEARD = "it goes on by itself once all its peers are heard"
 
 
-def find_alarm(session: str, site: str, mode: str, mem: Sequence[float], shared: int) -> LifeAlarm | None:
-    """Returns the alarm of a site under the rule `glide`, by a record with `shared` coordinates; or None."""
+def find_alarm(
+    session: str, site: str, mode: str, mem: Sequence[float], shared: int, lost: Sequence[str] = ()
+) -> LifeAlarm | None:
+    """Returns the alarm of a site under the rule `glide`, by a record with `shared` coordinates; or None.
+
+    `lost` are the peers that it goes on without.
+    """
     try:
         reason = LifeReason(int(mem[2 * shared + 1]))
     except (IndexError, ValueError, OverflowError):  # of another rule, or a stranger's
         return None
     if mode not in ("fault", "stopped", "hold") and (mode, reason) != ("waiting", LifeReason.ALIGN_LIMIT):
-        return None
+        names = ", ".join(lost)
+        advice = f"start {names} again: the share comes back by itself"
+        return LifeAlarm(f"WITHOUT {names}", "the others have its share", advice) if lost else None
     if mode == "fault":
         advice = f"{_REMEDIES.get(reason, '')}trilat reset --session {session} {site}"
     elif mode == "stopped":
