@@ -11,7 +11,7 @@ from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
-from trilat_net.net.message_numbers import count_messages, number_message, skipped_numbers
+from trilat_net.net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.wire import decode
@@ -67,12 +67,15 @@ class SiteReception:
         if before is not None:
             self.accounts = {**before.accounts, topics.EVENT: Account()}
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
-        self._gaps = {channel: StartGap(self.accounts[channel]) for channel in (topics.STATE, topics.LINK)}
         self.made: int | None = None
         self.heard_ns: int | None = None
         self._boot = boot
         self._rate_hz, self._layout = scenario.sites[name].rate_hz, scenario.layout(name)
         self.period_ns = 1_000_000_000 // self._rate_hz
+        self._gaps = {
+            channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
+            for channel in (topics.STATE, topics.LINK)
+        }
         self._ticks = scenario.ticks(name)
         self._event_room = EVENT_BYTES + round(EVENT_BYTES_PER_S * scenario.duration_s)
         self._most = {

@@ -3,7 +3,7 @@
 Each looks at what the sites published, on a way that no fault touches, or at the log.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from itertools import groupby, pairwise
 
 import msgspec
@@ -240,16 +240,18 @@ def check_log(session: FaultSession) -> Iterator[str]:
         return
     touched = any("recorder" in fault.of or fault.kind == "cut all" for fault in session.faults)
     for name in session.published.states:
-        lost = len(find_heard(session.published, name) - set(log[name].tick.tolist()))
+        there = set(log[name].tick.tolist())
+        lost = len(find_heard(session.published, name, there) - there)
         if lost != log.missing(name) or (lost and not touched):
             yield f"{name}: {lost} records are not in the log, which counts {log.missing(name)}"
 
 
-def find_heard(published: Published, name: str) -> set[int]:
+def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
     """The ticks of a site's records that are known of: of a start that was killed up to the newest that came
     to a site which is there when the next one begins.
 
-    What nobody heard of before its sender was killed is as if it had never been.
+    What nobody heard of before its sender was killed is as if it had never been, and so are the last 20 ms if
+    they are all that is not `there`.
     """
     starts = list(stretches(published.states[name]))
     heard = {state.tick for state in starts[-1]}
@@ -261,6 +263,8 @@ def find_heard(published: Published, name: str) -> set[int]:
                 if stretch[-1].tick >= following[0].tick:
                     came += [tick for state in stretch for peer, tick, _ in state.rx if peer == place]
         newest = max(tick for tick in came if tick <= start[-1].tick)
+        last = max((tick for tick in there if tick <= newest), default=-1)
+        newest = last if newest - last <= SILENT_TICKS else newest
         heard |= {state.tick for state in start if state.tick <= newest}
     return heard
 

@@ -143,6 +143,17 @@ def test_what_lies_between_two_starts_is_not_made_and_not_missing(
         assert account.unmade == unmade
 
 
+def test_what_was_under_way_as_its_sender_was_killed_is_not_made() -> None:
+    account = Account()
+    gap = StartGap(account, 2)
+    account.take(4)
+    gap.begin_anew(10, 0)
+    gap.hear_of(7)
+    assert (account.gaps, account.unmade) == ([[0, 3]], 5)
+    gap.hear_of(8)  # that is more than can have been under way
+    assert (account.gaps, account.unmade) == ([[0, 3], [5, 7]], 2)
+
+
 @pytest.mark.parametrize("order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join)
 def test_what_others_heard_of_a_killed_start_is_missing_in_whatever_order_it_is_learnt(
     order: Sequence[str],
@@ -151,7 +162,7 @@ def test_what_others_heard_of_a_killed_start_is_missing_in_whatever_order_it_is_
     account = Account()
     for number in range(5):
         account.take(number)
-    gap = StartGap(account)
+    gap = StartGap(account, 1)
     for told in order:
         if told == "join":
             gap.begin_anew(10, 0)
@@ -160,6 +171,6 @@ def test_what_others_heard_of_a_killed_start_is_missing_in_whatever_order_it_is_
                 account.take(number)
         else:
             gap.hear_of(int(told[-1]))
-    gap.begin_anew(10, 0)
+    gap.begin_anew(10, 0)  # said twice, it counts once
     assert (account.gaps, account.missing, account.unmade) == ([[5, 6]], 2, 3)
     assert account.expected == account.received + account.missing == 10

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError
 from ..net import topics
-from ..net.message_numbers import count_messages, number_message, skipped_numbers
+from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.messages import READABLE, Event
 from ..net.wire import decode
 from ..scenario import parse_embedded
@@ -234,24 +234,27 @@ class StartGap:
     """What one channel lacks between two starts of its sender, in whatever order others tell of it.
 
     The start before may have been killed, and has then not stated what it made: it made at least what others
-    have heard of.
+    have heard of. What was `under_way` to the recorder died with it, and is taken for not made.
     """
 
-    def __init__(self, account: Account) -> None:
-        self._account, self._heard = account, 0
-        self._begin = self._first = -1  # of what was not made, and of the later start
+    def __init__(self, account: Account, under_way: int) -> None:
+        self._account, self._under_way, self._heard = account, under_way, 0
+        self._silent = self._begin = (
+            self._first
+        ) = -1  # first that did not come, was not made, of the later start
 
     def begin_anew(self, first: int, made: int) -> None:
         """The later start begins with a number; the one before stated how many messages it made, or 0."""
         if self._first < 0:
-            self._first, made = first, max(made, min(self._heard, first))
-            self._begin = self._account.begin_anew(first, made)
+            self._first = first
+            self._silent = self._begin = self._account.begin_anew(first, made)
+            self.hear_of(self._heard)
 
     def hear_of(self, made: int) -> None:
         """Somebody knows of so many messages of the start before."""
         self._heard = max(self._heard, made)
         made = min(made, self._first)
-        if made > self._begin >= 0:
+        if made - self._silent > self._under_way and made > self._begin >= 0:
             self._account.restore(self._begin, made - 1)
             self._begin = made
 
@@ -415,7 +418,8 @@ class SessionAccounts:
             if topic in self._accounts and (
                 known or len(self._start_gaps) < MAX_STARTS * len(self._rates_hz)
             ):
-                yield channel, self._start_gaps.setdefault((topic, boot), StartGap(self._accounts[topic]))
+                gap = StartGap(self._accounts[topic], count_under_way(channel, self._rates_hz[site]))
+                yield channel, self._start_gaps.setdefault((topic, boot), gap)
 
     def _begin_anew(self, join: Event, made: int) -> None:
         """Takes what a site did not make between the ticks of one start and the first one of the next."""

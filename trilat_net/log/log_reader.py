@@ -29,6 +29,7 @@ from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import topics
+from ..net.message_numbers import count_under_way
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.wire import decode
 from ..results import Result
@@ -287,7 +288,9 @@ class Log(Result):
         found: list[tuple[int, int]] = []
         for first, boot in starts:
             heard = [e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot]
-            begin = max(int(made[made < first].max(initial=-1)) + 1, min(first, max(heard, default=0)))
+            begin, known = int(made[made < first].max(initial=-1)) + 1, min(first, max(heard, default=0))
+            if known - begin > count_under_way(topics.STATE, self[site].rate_hz):
+                begin = known
             if found and begin == found[-1][0]:  # the start in between made no tick
                 found.pop()
             if begin < first:

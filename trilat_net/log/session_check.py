@@ -19,7 +19,7 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import topics
-from ..net.message_numbers import count_messages, number_message, skipped_numbers
+from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.messages import (
     READABLE,
     SENT_TIME_SINCE,
@@ -206,7 +206,9 @@ class ChannelCheck:
             before = [(joins.get(one, 0), one) for one in self.accounts if joins.get(one, 0) < first]
             if site == self.member and first:
                 heard = number_message(self.kind, min(ticks, first), self.rate_hz)
-                self.accounts[max(before, default=(0, 0))[1]].expect(heard)
+                account = self.accounts[max(before, default=(0, 0))[1]]
+                if heard - account.last - 1 > count_under_way(self.kind, self.rate_hz):
+                    account.expect(heard)
 
     def leave_out(self, records: "ChannelCheck") -> None:
         """Counts nothing as missing of ticks of which the member's records say that it did not make them."""

@@ -20,6 +20,11 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     return -(-ticks // ticks_per_stats(rate_hz)) if channel == topics.LINK else ticks
 
 
+def count_under_way(channel: str, rate_hz: int) -> int:
+    """Returns how many messages that a site has sent may die with it when it is killed: those of 20 ms."""
+    return 1 if channel == topics.LINK else rate_hz // 50
+
+
 def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
     """Returns what a site does not publish that makes no ticks for so many before one, see `begin_anew`.
 
