@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long faults bench lock clean
+.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long faults docs bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -14,6 +14,7 @@ help:
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
+	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 
 demo: setup
@@ -59,7 +60,7 @@ compiled: setup
 sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
-test-long: $(VENV)/robots.stamp
+test-long: $(VENV)/robots.stamp $(VENV)/docs.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
@@ -80,6 +81,14 @@ lint: $(VENV)/dev.stamp
 faults: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.faults --seeds 2000 --write
 
+$(VENV)/docs.stamp: requirements/docs.lock $(VENV)/dev.stamp
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/docs.lock
+	@touch $@
+
+docs: $(VENV)/docs.stamp
+	$(BIN)/python docs/site/make_pages.py
+	cd build/site && ../../$(BIN)/zensical build --strict -f zensical.toml
+
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks
 
@@ -90,6 +99,8 @@ lock:
 		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group robots -c requirements/dev.lock -o requirements/robots.lock
+	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		--group docs -c requirements/dev.lock -o requirements/docs.lock
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,99 @@
+"""Gathers the pages of the site in build/site: those of docs, and references and a gallery made from the program.
+
+python docs/site/make_pages.py [--no-gallery]
+zensical build --strict -f build/site/zensical.toml
+"""
+
+import inspect
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import trilat_net as tn
+from trilat_net.reporting.figures.registry import write_figures
+
+ROOT = Path(__file__).resolve().parents[2]
+SITE = ROOT / "build" / "site"
+PAGES = SITE / "docs"
+LINK = re.compile(r"(?<=\]\()(?P<up>(?:\.\./)*)(?P<to>[\w./-]+?)(?P<at>#[\w-]+)?(?=\))")
+
+
+def main() -> None:
+    shutil.rmtree(SITE, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site"))
+    for name in ("CHANGELOG.md", "SECURITY.md", "LICENSE"):
+        shutil.copy(ROOT / name, PAGES / (name if name.endswith(".md") else f"{name}.md"))
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    write("index.md", LINK.sub(lambda one: one["to"].removeprefix("docs/") + (one["at"] or ""), readme))
+    for page in PAGES.glob("*.md"):  # what stands beside docs in the repository stands in it here
+        page.write_text(page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8")
+    write("reference/commands.md", list_commands())
+    write("reference/python.md", list_functions())
+    write("reference/scenario.md", show_template())
+    write("gallery.md", "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]))
+    shutil.copy(ROOT / "docs" / "site" / "zensical.toml", SITE)
+
+
+def write(name: str, text: str) -> None:
+    path = PAGES / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text.rstrip() + "\n", encoding="utf-8")
+
+
+def list_commands() -> str:
+    """Returns the help of every command, as Typer writes it."""
+    run = [
+        sys.executable,
+        "-m",
+        "typer",
+        "trilat_net.cli",
+        "utils",
+        "docs",
+        "--name",
+        "trilat",
+        "--title",
+        "Commands",
+    ]
+    return subprocess.run(run, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+
+
+def list_functions() -> str:
+    """Returns a place for the docstring of every public name."""
+    text = [
+        "# Python",
+        "[From Python](../python.md) says what there is; here is each function with its arguments.",
+    ]
+    for name in tn.__all__:
+        if name != "__version__":
+            made = getattr(tn, name)
+            text.append(f"::: {inspect.getmodule(made).__name__}.{made.__name__}")
+    return "\n\n".join(text)
+
+
+def show_template() -> str:
+    return f"# Scenario keys\n\n`trilat scenario new FILE` writes this text.\n\n```toml\n{tn.read_template()}\n```"
+
+
+def list_scenarios(*, pictures: bool) -> Iterator[str]:
+    """Yields a section per shipped scenario: what it shows, and a run of it in virtual time."""
+    for name in tn.list_shipped():
+        scenario = tn.load_scenario(name)
+        parts = [
+            f"## {name}",
+            scenario.title,
+            scenario.about.strip(),
+            f"    $ trilat sim {name} -o {name}.mcap",
+        ]
+        if pictures:
+            write_figures(
+                tn.simulate(name), PAGES / "gallery" / name, ["overview"], width_in=7.0, formats=["png"]
+            )
+            parts.append(f"![{name}: errors, speeds, torques and ages](gallery/{name}/overview.png)")
+        yield "\n\n".join(part for part in parts if part)
+
+
+if __name__ == "__main__":
+    main()
