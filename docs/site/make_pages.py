@@ -1,4 +1,4 @@
-"""Gathers the pages of the site in build/site: those of docs, and references and a gallery made from the program.
+"""Gathers the pages of the site in build/site: those of docs, and what is made from the program.
 
 python docs/site/make_pages.py [--no-gallery]
 zensical build --strict -f build/site/zensical.toml
@@ -22,6 +22,7 @@ LINK = re.compile(r"(?<=\]\()(?P<up>(?:\.\./)*)(?P<to>[\w./-]+?)(?P<at>#[\w-]+)?
 
 
 def main() -> None:
+    """Gathers all pages, and the settings of Zensical beside them."""
     shutil.rmtree(SITE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site"))
     for name in ("CHANGELOG.md", "SECURITY.md", "LICENSE"):
@@ -38,6 +39,7 @@ def main() -> None:
 
 
 def write(name: str, text: str) -> None:
+    """Writes a page."""
     path = PAGES / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text.rstrip() + "\n", encoding="utf-8")
@@ -74,7 +76,9 @@ def list_functions() -> str:
 
 
 def show_template() -> str:
-    return f"# Scenario keys\n\n`trilat scenario new FILE` writes this text.\n\n```toml\n{tn.read_template()}\n```"
+    """Returns the commented template of a scenario, which has all keys."""
+    said = "`trilat scenario new FILE` writes this text."
+    return f"# Scenario keys\n\n{said}\n\n```toml\n{tn.read_template()}\n```"
 
 
 def list_scenarios(*, pictures: bool) -> Iterator[str]:
