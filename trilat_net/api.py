@@ -136,7 +136,9 @@ def export(log: AnyLog, to: str, out: str | Path, *, force: bool = False) -> Pat
     return Path(out)
 
 
-def verify(log: AnyLog, *, virtual: bool = False, min_coverage: float = MIN_COVERAGE) -> LogCheckReport:
+def verify(
+    log: AnyLog, *, virtual: bool = False, min_coverage: float = MIN_COVERAGE, resume_every: int = 0
+) -> LogCheckReport:
     """Executes a log again and compares every computed field; the command is `trilat verify`.
 
     >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
@@ -146,11 +148,13 @@ def verify(log: AnyLog, *, virtual: bool = False, min_coverage: float = MIN_COVE
         log: the log, or its path.
         virtual: whether to compare with virtual time too.
         min_coverage: the least share of every site's ticks that must be judged to pass.
+        resume_every: at every tick that it divides a site starts afresh from the records, so that what a law
+            of one's own knows besides shows; 0: at none.
 
     Raises:
         LogError: the log cannot be read.
     """
-    return run_log_checks(_open(log), virtual=virtual, min_coverage=min_coverage)
+    return run_log_checks(_open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every)
 
 
 def certify(log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False) -> Certificate:

@@ -15,7 +15,8 @@ from trilat_net.execution import virtual
 from trilat_net.execution.verify import find_user_laws, verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import load_scenario, to_core_change
+from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
@@ -59,6 +60,34 @@ def test_a_memory_that_does_not_say_all_is_found_out(session: dict[str, str] | N
     verdict = verify(without_records({"s": range(50, 61)}, data, session))
     assert verdict.first is not None
     assert verdict.first.field.startswith(("theta_hat", "tau"))
+
+
+@pytest.mark.parametrize("law", [LAW, "adaptive"])
+def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
+    """Also after changes that were ordered while it ran, over a link whose delay varies."""
+    link = {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}
+    scenario = load_scenario("paper", {"duration_s": 0.3, "control.law": law, "link": link})
+    orders = [
+        {"link": "m1->s", "to": {"model": "constant", "delay_ms": 30.0}},
+        {"dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 0.1},
+    ]
+    changes = [
+        to_core_change(scenario, resolve_change(scenario, initial_link_tables(scenario), order, 10**8))
+        for order in orders
+    ]
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream, commands={"s": {50: changes}})
+    verdict = verify(opened(stream.getvalue()), resume_every=7)
+    assert verdict.identical == verdict.records == 900
+
+
+def test_what_a_law_keeps_besides_its_memory_shows_where_it_starts_afresh() -> None:
+    log = opened(own("tests.laws:Forgetful"))
+    assert verify(log).passed
+    assert verify(log, resume_every=1000).passed
+    found = verify(log, resume_every=40)
+    assert found.first is not None
+    assert found.first.tick == 40
 
 
 def test_a_changed_memory_shows_at_its_own_tick() -> None:

@@ -14,6 +14,15 @@ def verify_command(
         bool,
         typer.Option("--virtual", help="Compare with virtual time too, with and without the log's arrivals."),
     ] = False,
+    resume_every: Annotated[
+        int,
+        typer.Option(
+            "--resume-every",
+            metavar="N",
+            min=0,
+            help="Start sites afresh from the records every N ticks: shows what a law knows besides.",
+        ),
+    ] = 0,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -27,7 +36,9 @@ def verify_command(
     log = terminal.open_with_progress(*files)
     terminal.warn_user_laws(log)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
-        result = run_log_checks(log, virtual=virtual, progress=progress, min_coverage=min_coverage)
+        result = run_log_checks(
+            log, virtual=virtual, progress=progress, min_coverage=min_coverage, resume_every=resume_every
+        )
     terminal.print_result(result, as_json=as_json)
     if not result.passed:
         raise typer.Exit(1)

@@ -81,7 +81,12 @@ class LogCheckReport(Result):
 
 
 def run_log_checks(
-    log: Log, *, virtual: bool, progress: Progress | None = None, min_coverage: float = MIN_COVERAGE
+    log: Log,
+    *,
+    virtual: bool,
+    progress: Progress | None = None,
+    min_coverage: float = MIN_COVERAGE,
+    resume_every: int = 0,
 ) -> LogCheckReport:
     """Executes a log again, and compares it with virtual time if `virtual` is set.
 
@@ -91,7 +96,7 @@ def run_log_checks(
         LogError: a record cannot be read.
         ScenarioError: the file of a user law does not exist.
     """
-    result = verify(log, progress, min_coverage=min_coverage)
+    result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
     return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 

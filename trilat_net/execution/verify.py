@@ -154,7 +154,10 @@ class SiteVerifier:
         result: VerifyResult,
         starts: Sequence[tuple[int, int]] = (),
         absences: Sequence[tuple[int, int]] = (),
+        resume_every: int = 0,
     ) -> None:
+        self._resume_every, self._first = resume_every, 0
+        self._taken: list[CoreChange] = []
         self._setup = setup = scenario.setup(site_log.name)
         self._site, self._channel = Site(setup), setup.channel
         self._starts = {boot: first for first, boot in starts}
@@ -190,6 +193,8 @@ class SiteVerifier:
                 self._certain = False
             expected = state.tick + 1
             try:
+                if self._resume_every and state.tick % self._resume_every == 0:
+                    self._start_afresh(n, state)
                 resumes = not self._certain and not self._law_failed and n - 2 >= self._began
                 if resumes and self._inputs.can_resume(n, apart=self._apart):
                     for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
@@ -224,9 +229,21 @@ class SiteVerifier:
         if absent < first:
             self._result.absences.append((self._log.name, absent, first - 1))
         self._inputs.take_changes(first - 1)  # the start before took them in
-        self._site, self._certain = Site(self._setup), True
+        self._site, self._certain, self._first = Site(self._setup), True, first
+        self._taken.clear()
         self._site.begin_at(first)
         return first
+
+    def _start_afresh(self, n: int, state: State) -> None:
+        """Has record n made by a site that knows the records before it alone, if they tell enough."""
+        known = self._certain and n - 2 >= self._began
+        if not known or self._law_failed or not self._inputs.can_resume(n, apart=self._apart):
+            return
+        self._site, self._certain = Site(self._setup), False
+        if self._first:
+            self._site.begin_at(self._first)
+        for change in self._taken:
+            self._site.order(change, state.t_ns)
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
         """Returns the difference of a record that another start, or another site, made; else None."""
@@ -273,6 +290,7 @@ class SiteVerifier:
             except ScenarioError:
                 valid = "a change of one of its links or of its shares"
                 return changes, RecordDifference(self._log.name, named, "cmd", text, valid)
+        self._taken += changes[:MAX_RAMPS]
         return changes[:MAX_RAMPS], None
 
     def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
@@ -287,13 +305,21 @@ class SiteVerifier:
         return state.rx, None
 
 
-def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = MIN_COVERAGE) -> VerifyResult:
+def verify(
+    log: Log,
+    progress: Progress | None = None,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    resume_every: int = 0,
+) -> VerifyResult:
     """Executes every site of a log again; `progress` gets the records done and their total.
 
     Args:
         log: the log.
         progress: called now and then.
         min_coverage: the least share of every site's ticks that must be judged to pass.
+        resume_every: at every tick that it divides a site starts afresh from the records, so that what a law
+            knows besides shows; 0: at none.
 
     Raises:
         LogError: a record cannot be read.
@@ -303,7 +329,8 @@ def verify(log: Log, progress: Progress | None = None, *, min_coverage: float = 
     with process.pause_gc():
         sites = log.executed_sites
         total = sum(len(log[name]) for name in sites)
-        _execute_sites(log, sites, result, None if progress is None else lambda done: progress(done, total))
+        report = None if progress is None else lambda done: progress(done, total)
+        _execute_sites(log, sites, result, report, resume_every)
         others = [name for name in log.sites if name not in sites]
         if others and (source := open_rerun_source(log)) is not None:
             for name in others:
@@ -324,12 +351,17 @@ def _begin(log: Log, min_coverage: float) -> VerifyResult:
 
 
 def _execute_sites(
-    log: Log, sites: Sequence[str], result: VerifyResult, report: Callable[[int], None] | None = None
+    log: Log,
+    sites: Sequence[str],
+    result: VerifyResult,
+    report: Callable[[int], None] | None = None,
+    resume_every: int = 0,
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
     for name in sites:
         read = (log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result)
-        SiteVerifier(*read, log.starts.get(name, ()), log.absences.get(name, ())).run(report)
+        own = (log.starts.get(name, ()), log.absences.get(name, ()))
+        SiteVerifier(*read, *own, resume_every).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
