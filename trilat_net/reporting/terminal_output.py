@@ -78,11 +78,6 @@ def print_error(text: object) -> None:
     err.print(f"error: {sanitize(text, _MAX_LETTERS)}", markup=False, soft_wrap=True)
 
 
-def print_check(passed: bool, text: object) -> None:
-    """Prints the result of a check."""
-    print_marked("[green]ok[/green]  " if passed else "[red]FAIL[/red]", text)
-
-
 def print_marked(mark: str, text: object) -> None:
     """Prints a line behind a mark, which is of Rich's markup."""
     out.print(f"{mark} {escape(sanitize(text, _MAX_LETTERS))}", soft_wrap=True)
