@@ -111,12 +111,17 @@ RESULTS: dict[str, Callable[[Path], Result]] = {
 
 
 @pytest.mark.parametrize("command", RESULTS)
-def test_a_result_says_what_its_command_prints(command: str, file: Path) -> None:
+def test_a_result_says_what_its_command_prints(
+    command: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a short name: the command lays out tables for the width of its terminal."""
+    monkeypatch.chdir(file.parent)
+    file = Path(file.name)
     more = {"compare": [file], "rerun": ["--replace", "s", "--set", "control.Kd=5"]}.get(command, [])
     found = RESULTS[command](file)
-    printed = trilat(*command.split(), file, *more, cwd=file.parent)
+    printed = trilat(*command.split(), file, *more, cwd=Path.cwd())
     assert found.summary().split() == (printed.out + printed.err).split()
-    as_json = json.loads(trilat(*command.split(), file, *more, "--json", cwd=file.parent).out)
+    as_json = json.loads(trilat(*command.split(), file, *more, "--json", cwd=Path.cwd()).out)
     assert {**as_json, "file": None} == {**json.loads(json.dumps(found.to_dict())), "file": None}
     assert "\n" not in repr(found)
     assert repr(found).startswith(f"<{type(found).__name__} ")

@@ -106,6 +106,7 @@ def test_a_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Pa
 JITTER = ("--set", "link.model=uniform", "--set", "link.delay_ms=50", "--set", "link.half_width_ms=40")
 
 
+@pytest.mark.long
 def test_a_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> None:
     sim = ("sim", "two_sites", "--duration", "1", "--set", "rate_hz=200", "-o", "run.mcap")
     trilat(*sim, *JITTER, cwd=tmp_path).succeeds()

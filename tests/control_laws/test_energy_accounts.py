@@ -13,8 +13,8 @@ from trilat_net.execution.verify import verify
 from trilat_net.scenario.describe import describe_law_conditions
 
 SEEDS = [
-    *range(1, 4),
-    *(pytest.param(seed, marks=pytest.mark.long) for seed in range(4, 51)),
+    1,
+    *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 51)),
 ]
 
 

@@ -125,3 +125,15 @@ def test_a_site_still_does_not_come_late() -> None:
     session.start("s")
     with pytest.raises(SessionError, match="is running"):
         session.rounds(30)
+
+
+def test_a_site_that_begins_anew_too_is_not_waited_for() -> None:
+    """Who is met under another boot, while the old one's token is not there, has gone before anybody came."""
+    session, epoch = running()
+    session.kill("s")
+    session.start(RECORDER)
+    anew = {"member": "s", "boot": 99, "running": False, "boots": {}}
+    session.members[RECORDER].joining.membership.take(
+        msgspec.structs.replace(session.members["m1"].publisher.info, **anew), invited=False
+    )
+    assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})

@@ -109,6 +109,7 @@ def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
     return np.concatenate([qdd, -np.asarray(gains.Gamma) * gradient])
 
 
+@pytest.mark.long
 def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
     """With hands on the joints and on the end effector, and walls of any direction, one of them touched."""
     rng = np.random.default_rng(14)

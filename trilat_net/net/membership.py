@@ -137,7 +137,7 @@ class Membership:
 
     Attributes:
         met: identities of the others, by name.
-        gone: boots of the members that have disappeared.
+        alive, gone: boots of the members that are present, and of those that have disappeared.
     """
 
     def __init__(
@@ -150,6 +150,7 @@ class Membership:
         late: LateSites = NEVER_LATE,
     ) -> None:
         self.met: dict[str, Info] = {}
+        self.alive: set[str] = set()
         self.gone: set[str] = set()
         self._session, self._publisher, self._sites = session, publisher, tuple(sites)
         self._late = late
@@ -192,6 +193,11 @@ class Membership:
             if name != self.own.member and name not in self.met and name not in self._late.without
         ]
 
+    def begins_anew(self, name: str, boot: int) -> bool:
+        """True if another start of a member is here, and the one of this boot is not."""
+        met = self.met.get(name)
+        return met is not None and met.boot != boot and str(boot) not in self.alive
+
     def running(self) -> list[Info]:
         """Returns the sites of a running session that were met, of those that agree on its members."""
         infos = [
@@ -215,6 +221,7 @@ class Membership:
             if parts.member == topics.RECORDER:
                 (self._recorders.add if alive else self._recorders.discard)(parts.boot)
             (self.gone.discard if alive else self.gone.add)(parts.boot)
+            (self.alive.add if alive else self.alive.discard)(parts.boot)
             met = self.met.get(parts.member)
             if not alive and met is not None and str(met.boot) == parts.boot:
                 del self.met[parts.member]

@@ -117,8 +117,12 @@ class SessionJoin:
         """
         if self._met_ns is None:
             self._met_ns = now_ns
-        boots, gone = running[0].boots, self.membership.gone
-        sites = {name for name in boots if str(boots[name]) not in gone} - {topics.RECORDER, self._own.member}
+        found = self.membership
+        sites = {
+            name
+            for name, boot in running[0].boots.items()
+            if str(boot) not in found.gone and not found.begins_anew(name, boot)
+        } - {topics.RECORDER, self._own.member}
         if {info.member for info in running} < sites and now_ns - self._met_ns < LATE_GATHER_NS:
             return None
         own = self._own.clock

@@ -23,7 +23,7 @@ def run(law: str) -> Log:
 
 
 @pytest.mark.parametrize(
-    "law", [pytest.param(law, marks=pytest.mark.long if law == "wave" else ()) for law in LAWS]
+    "law", [pytest.param(law, marks=pytest.mark.long if law != "tanks" else ()) for law in LAWS]
 )
 def test_the_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
     log = run(law)
@@ -38,6 +38,7 @@ def test_the_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -
     assert work > 0.05
 
 
+@pytest.mark.long
 def test_a_figure_shows_them_over_time() -> None:
     drawn = figure(run("wave"), "observed_energy")
     lines, known, stored, given = drawn.axes

@@ -56,6 +56,7 @@ print(len(trilat_net.check(sys.argv[1], seeds=[1, 2, 3], jobs=2).results), "held
 """
 
 
+@pytest.mark.long
 def test_it_works_in_a_script_without_a_guarded_main_part(quick_file: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
