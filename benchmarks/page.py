@@ -32,17 +32,21 @@ POINTER_P50_MS, POINTER_P95_MS, LATENESS_RATIO, SERVER_PERCENT = 60.0, 120.0, 1.
 _TIP = """(() => { const card = trilat.parts.arms.cards[0], box = card.canvas.getBoundingClientRect();
 const tip = card.project(trilat.frame.sites[card.name].points.at(-1)), ratio = card.canvas.width / box.width;
 return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; })()"""
+_STAMP = """trilat.parts.arms.cards[0].canvas.addEventListener("pointerrawupdate",
+(event) => { trilat.moved = performance.timeOrigin + event.timeStamp; })"""
 _READY = "Boolean(trilat.frame?.t > 2 && trilat.takesPart && trilat.parts.arms.cards[0].project)"
 
 
 def run() -> list[str]:
-    took_ms = measure_pointer()
+    took_ms, asked_ms = measure_pointer()
     p50, p95 = np.percentile(took_ms, (50, 95))
+    whole = np.percentile(asked_ms, (50, 95))
     late_us, alone_us, server = measure_load()
     ratio = late_us / alone_us
     return [
         f"pointer to arm, {len(took_ms)} moves: p50 {p50:.1f} ms (at most {POINTER_P50_MS:g}), "
         f"p95 {p95:.1f} ms (at most {POINTER_P95_MS:g})",
+        f"the same from Playwright's order on: p50 {whole[0]:.1f} ms, p95 {whole[1]:.1f} ms",
         f"lateness p99: {late_us:.0f} us with two pages, {alone_us:.0f} us with none, "
         f"{ratio:.2f} of it (at most {LATENESS_RATIO:g})",
         f"the page's server: {server:.1f} % of a core (at most {SERVER_PERCENT:g})",
@@ -136,11 +140,14 @@ class TargetWatch(threading.Thread):
             hand = self._onlooker.in_force
             if hand is not None and hand.source and hand.target != last:
                 last = hand.target
-                self.changed_s.append(time.monotonic())
+                self.changed_s.append(time.time())
 
 
-def measure_pointer() -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
-    """From a pointer that moves in chromium to a record whose hand goes elsewhere, ms."""
+def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+    """To a record whose hand goes elsewhere, ms: from a pointer's move in chromium, and from its order on.
+
+    Chromium stamps a move when it reaches it; Playwright and its pipe are no part of a user's way.
+    """
     with (
         tempfile.TemporaryDirectory() as name,
         live_session(Path(name) / "run") as (address, _),
@@ -152,6 +159,7 @@ def measure_pointer() -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
         while not page.evaluate(_READY):
             time.sleep(0.1)
         x, y = page.evaluate(_TIP)
+        page.evaluate(_STAMP)
         with trilat_net.hand("play-demo", "m1", source="onlooker") as onlooker:
             watch = TargetWatch(onlooker)
             watch.start()
@@ -162,14 +170,16 @@ def measure_pointer() -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
             watch.ended.set()
             watch.join()
         browser.close()
-        return np.array(took_ms)
+        return np.array(took_ms).T
 
 
-def move_once(page: Page, watch: TargetWatch, x: float, y: float) -> float:
-    """Moves the pointer by a little and waits until the arm's hand has followed, at most 2 s."""
+def move_once(page: Page, watch: TargetWatch, x: float, y: float) -> tuple[float, float]:
+    """Moves the pointer by a little and waits until the arm's hand has followed, at most 2 s; see above."""
     time.sleep(0.3)
-    seen, began_s = len(watch.changed_s), time.monotonic()
+    seen, began_s = len(watch.changed_s), time.time()
     page.mouse.move(x, y)
-    while len(watch.changed_s) == seen and time.monotonic() - began_s < 2.0:
+    while len(watch.changed_s) == seen and time.time() - began_s < 2.0:
         time.sleep(0.001)
-    return (watch.changed_s[seen] - began_s if len(watch.changed_s) > seen else 2.0) * 1e3
+    moved_s = page.evaluate("trilat.moved") / 1e3
+    followed_s = watch.changed_s[seen] if len(watch.changed_s) > seen else began_s + 2.0
+    return (followed_s - moved_s) * 1e3, (followed_s - began_s) * 1e3
