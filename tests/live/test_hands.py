@@ -141,7 +141,7 @@ def test_a_minute_of_two_programs_a_page_and_ten_changes_is_verified_and_repeate
     assert sum(len(log.changes(name)) for name in PAPER) == 10
     found = trilat_net.certify(log)
     assert found.balance is not None
-    assert np.abs(found.balance.residual).max() < BROKEN_BALANCE_SHARE * found.balance.V.max()
+    assert np.abs(found.balance.residual).max() < BROKEN_BALANCE_SHARE * found.balance.scale
 
 
 LINKS = [("m1", "s"), ("m2", "s"), ("s", "m1"), ("s", "m2"), ("m1", "m2"), ("m2", "m1")]
