@@ -11,7 +11,7 @@ from ..scenario.expect import END_WINDOW_S
 from . import health
 from .json_values import JsonObject, finite_or_none
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
-from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_s
+from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_of_all_s, settling_time_s
 from .timeline import diverged_at_s, find_mode_intervals, list_changes
 
 
@@ -24,7 +24,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "scenario": _describe_scenario(log),
         "session": {**log.session, "complete": log.complete},
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),
-        "settle_s": None if None in settled else max(settled),
+        "settle_s": settling_time_of_all_s(settled),
         "settle_below_rad": SETTLED_ERROR_RAD,
         "max_error_end_rad": max(largest, default=None),
         "records": sum(site["records"] for site in sites.values()),

@@ -4,7 +4,7 @@ Invariant: one definition of each signal, for figures, page, summary and metrics
 environment are those ON the arm, the negative of the record's tau_x of Eq. (8).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 
 import numpy as np
@@ -67,9 +67,15 @@ def sites_with_operator(log: Log) -> list[str]:
     return [name for name in log.sites if log.scenario.sites[name].hands or np.any(log[name].tau_x)]
 
 
+def largest_magnitude(values: Array) -> Array:
+    """Returns the largest absolute value of each row, shape (K,)."""
+    found: Array = np.abs(values).max(axis=1, initial=0.0)
+    return found
+
+
 def largest_remaining_error(part: SiteLog) -> Array:
     """Returns the largest error of any joint from each record to the last, shape (K,), rad."""
-    largest = np.abs(joint_errors(part)).max(axis=1, initial=0.0)
+    largest = largest_magnitude(joint_errors(part))
     return np.maximum.accumulate(largest[::-1])[::-1]
 
 
@@ -81,6 +87,12 @@ def settling_time_s(part: SiteLog) -> float | None:
     if not len(above):
         return 0.0
     return None if above[-1] == len(part) - 1 else float(part.t_s[above[-1]])
+
+
+def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
+    """Returns when the last of some sites has settled, s; None if one has not."""
+    settled = [at_s for at_s in times_s if at_s is not None]
+    return max(settled) if len(settled) == len(times_s) else None
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:

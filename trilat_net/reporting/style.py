@@ -133,6 +133,11 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
     axes.plot(trace.t_s, trace.values[:, 0], **options)
 
 
+def positive(values: Array) -> Array:
+    """Returns what a logarithmic axis can show of values; NaN for the others."""
+    return np.where(values > 0.0, values, np.nan)
+
+
 SPREAD_BUCKETS = 120
 SPREAD: dict[str, Any] = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
 """The line that stands for a spread in a legend."""

@@ -20,6 +20,7 @@ from ...analysis.site_signals import (
     joint_angles,
     joint_error_rates,
     joint_errors,
+    largest_magnitude,
     largest_remaining_error,
     operator_displacement,
     parameter_estimates,
@@ -196,7 +197,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             remaining = largest_remaining_error(log[site])
-            positive = np.where(remaining > 0.0, remaining, np.nan)
+            positive = style.positive(remaining)
             plot.trace(settling, site, positive)
             low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
         settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
@@ -220,8 +221,8 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             line = style.site_line(log, site)
-            size = np.abs(joint_errors(log[site])).max(axis=1, initial=0.0)
-            positive = np.where(size > 0.0, size, np.nan)
+            size = largest_magnitude(joint_errors(log[site]))
+            positive = style.positive(size)
             plot.trace(axes, site, positive)
             if size.any():
                 least, most = np.nanpercentile(positive, (2.0, 100.0)).tolist()

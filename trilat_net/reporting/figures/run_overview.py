@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from ...analysis import site_signals
 from ...analysis.certificate.stability_certificate import certify
+from ...analysis.site_signals import largest_magnitude, settling_time_of_all_s
 from ...analysis.timeline import recorded_end_s
 from ...core.vectors import Array
 from ...errors import UsageError
@@ -39,11 +40,6 @@ class _Panel(NamedTuple):
     log_scale: bool = False
 
 
-def _largest(values: Array) -> Array:
-    found: Array = np.abs(values).max(axis=1, initial=0.0)
-    return found
-
-
 def _oldest_sample_ms(log: Log, site: str) -> Array:
     ages_ms = site_signals.sample_ages_ms(log, site)
     found: Array = np.where(np.isnan(ages_ms), -np.inf, ages_ms).max(axis=1, initial=-np.inf)
@@ -52,10 +48,13 @@ def _oldest_sample_ms(log: Log, site: str) -> Array:
 
 _PANELS = (
     _Panel(
-        "largest error", site_signals.shared_unit, lambda log, site: _largest(log[site].e), log_scale=True
+        "largest error",
+        site_signals.shared_unit,
+        lambda log, site: largest_magnitude(log[site].e),
+        log_scale=True,
     ),
-    _Panel("largest speed", lambda _: "rad/s", lambda log, site: _largest(log[site].qd)),
-    _Panel("largest torque", lambda _: "N m", lambda log, site: _largest(log[site].tau)),
+    _Panel("largest speed", lambda _: "rad/s", lambda log, site: largest_magnitude(log[site].qd)),
+    _Panel("largest torque", lambda _: "N m", lambda log, site: largest_magnitude(log[site].tau)),
     _Panel("oldest sample", lambda _: "ms", _oldest_sample_ms),
 )
 
@@ -69,7 +68,7 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             columns = {site: panel.column(log, site) for site in log.sites}
             _scale(axes, panel, [*columns.values()])
             for site, values in columns.items():
-                plot.trace(axes, site, _positive(values) if panel.log_scale else values)
+                plot.trace(axes, site, style.positive(values) if panel.log_scale else values)
             plot.mark(axes, log.sites)
         entries = style.site_legend_entries(log, log.sites)
         plot.finish(panels[3:] if form.narrow else panels[2:], entries, title=_describe(log, form))
@@ -95,7 +94,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
             envelopes = {name: _find_envelope(panel, log) for name, log in logs.items()}
             _scale(axes, panel, [values for _, values in envelopes.values()])
             for name, (t_s, values) in envelopes.items():
-                axes.plot(t_s, _positive(values) if panel.log_scale else values, **lines[name])
+                axes.plot(t_s, style.positive(values) if panel.log_scale else values, **lines[name])
             axes.set_xlim(0.0, end_s)
         for axes in panels[3:] if form.narrow else panels[2:]:
             axes.set_xlabel("time (s)")
@@ -128,10 +127,6 @@ def _find_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
     return 0.5 * (edges[1:] + edges[:-1]), found
 
 
-def _positive(values: Array) -> Array:
-    return np.where(values > 0.0, values, np.nan)
-
-
 def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
     known = np.concatenate([values[np.isfinite(values)] for values in columns])
     most = float(known.max(initial=0.0))
@@ -144,8 +139,7 @@ def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
 
 def _describe(log: Log, form: FigureSize) -> str:
     """Returns the run's title and how it ended."""
-    settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
-    last = None if None in settled else max((at for at in settled if at is not None), default=None)
+    last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
     when = "not settled" if last is None else f"settled at {last:.1f} s"
     words = f"{log.scenario.title or log.scenario.name}: {certify(log).stability}, {when}"
     return "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))
