@@ -4,8 +4,10 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import trilat_net as tn
 from tests.cli.running import trilat
 from trilat_net.log.log_reader import open_log
 
@@ -30,6 +32,7 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
     log = open_log(tmp_path / "spring.mcap")
     assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
+    assert max(np.abs(log[name].q[:1000]).max() for name in log.scenario.names) < 1e-12, "they sink"
     checked = trilat(*verify, cwd=tmp_path)
     assert checked.code == 0
     assert "6000/6000 records identical" in checked.out
@@ -38,6 +41,22 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     shown = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
     shown.succeeds()
     assert open_log(tmp_path / "slave.mcap").scenario.sites["m1"].control.Kd == (3.0, 3.0)
+
+
+@pytest.mark.long
+def test_the_law_of_the_page_holds_the_arms_together_as_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "holding_laws.py").write_text(block("python"))
+    log = tn.simulate("paper", {"control.law": "holding_laws:Spring", "control.K": 80})
+    assert tn.certify(log).stability == "stable"
+    errors = np.abs(np.stack([log[name].e for name in log.scenario.names]))
+    rest = np.stack([log[name].q[-1] for name in log.scenario.names])
+    for said, measured in (("%.3f rad from", errors.max()), ("at (%.3f, %.3f) rad", rest.mean(axis=0))):
+        assert said % (measured if measured.ndim == 0 else tuple(measured)) in DOC.read_text()
+    assert errors[:, -1].max() < 1e-6
+    assert np.ptp(rest, axis=0).max() < 1e-6
 
 
 def test_what_a_page_says_of_a_law_is_what_a_law_gets() -> None:
