@@ -93,7 +93,7 @@ def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -
     # at the first tick without a new sample, what is in use stays, and so does qd_des
     stale = np.zeros(len(steps), dtype=bool)
     stale[2099:2120] = True
-    assert np.abs(steps - means)[~stale].max() <= 1e-6
+    assert np.abs(steps - means)[~stale].max() <= 2e-6  # h^3/12 of a torque's rate through its peer's inertia
     assert np.abs(np.diff(part.qd_des, axis=0))[~stale].max() <= 0.06
 
 

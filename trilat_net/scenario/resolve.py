@@ -42,7 +42,7 @@ from .fields import (
 from .imported_law import LAW_PATH_PATTERN, hash_law_source, read_law_sends
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
-from .scenario_types import SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
+from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -254,6 +254,8 @@ def _resolve_site(
     )
     if model is not None and model.chain is not None:
         site["limits"] = {**_chain_limits(model), **site["limits"]}
+    if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
+        site["limits"] = {"tau_rate_limit_nm_s": GLIDE_TAU_RATE_NM_S, **site["limits"]}
     site.setdefault("role", "master")
     site.setdefault("rate_hz", tables.get("rate_hz", 1000))
     _draw_site(site, path, draws)

@@ -85,6 +85,10 @@ SpeedLimit = Annotated[float, Meta(gt=0.0, le=10_000.0)]
 SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MAX_JOINTS)]
 
 
+GLIDE_TAU_RATE_NM_S = 1000.0
+"""Under the rule "glide" a torque changes by 1 N m a millisecond at most, as Franka's arms ask for it."""
+
+
 class Limits(Frozen, frozen=True):
     """The limits of a site.
 
@@ -93,7 +97,8 @@ class Limits(Frozen, frozen=True):
             left out, a chain has the efforts that its file states.
         qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so too. Under the
             rule "glide" the site is in fault in its place, and the run goes on.
-        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s.
+        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s. Left out,
+            there is none, but under the rule "glide" it is `GLIDE_TAU_RATE_NM_S`.
         qd_des_limit_rad_s: largest speed of the reference, rad/s; in task space m/s.
         q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is in fault.
         q_max_rad: largest angle, likewise.
