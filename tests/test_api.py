@@ -45,6 +45,7 @@ COUNTERPARTS = {
     "load_scenario": ["scenario show"],
     "describe_scenario": ["scenario check"],
     "read_template": ["scenario new"],
+    "new_law": ["new law"],
     "create_keys": ["keys new"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],

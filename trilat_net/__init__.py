@@ -46,6 +46,7 @@ if _TYPE_CHECKING:
     from .reporting.figures.registry import figure
     from .scenario import list_shipped, load_scenario, read_template
     from .scenario.describe import describe_scenario
+    from .scenario.law_skeleton import new_law
     from .scenario.measured_traces import import_trace
     from .studies.trials.trial import trials
     from .studies.trials.trial_runner import check
@@ -74,6 +75,7 @@ __all__ = [
     "load_scenario",
     "margin",
     "metrics",
+    "new_law",
     "open_log",
     "read_member_keys",
     "read_template",
@@ -104,6 +106,7 @@ _MODULES = {
     "import_trace": "trilat_net.scenario.measured_traces",
     "list_shipped": "trilat_net.scenario",
     "load_scenario": "trilat_net.scenario",
+    "new_law": "trilat_net.scenario.law_skeleton",
     "open_log": "trilat_net.log.log_reader",
     "read_member_keys": "trilat_net.net.member_keys",
     "read_template": "trilat_net.scenario",

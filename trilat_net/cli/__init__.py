@@ -30,6 +30,7 @@ from . import (
     live,
     log,
     metrics,
+    new,
     ping,
     record,
     replay,
@@ -154,6 +155,7 @@ _SCENARIO = {
     "check": (scenario.scenario_check_command, "mine.toml"),
     "new": (scenario.scenario_new_command, "mine.toml"),
 }
+_NEW = {"law": (new.new_law_command, "mylaw.py")}
 _TRACE = {
     "import": (trace.trace_import_command, "irtt run.json.gz", "csv drive.txt --way half -o drive.csv"),
 }
@@ -179,6 +181,9 @@ app.add_typer(_group(_STUDIES))
 app.add_typer(
     _group(_SCENARIO, "scenario ", no_args_is_help=True, help="The shipped scenarios and your own."),
     name="scenario",
+)
+app.add_typer(
+    _group(_NEW, "new ", no_args_is_help=True, help="A control law of your own, with its test."), name="new"
 )
 app.add_typer(
     _group(_TRACE, "trace ", no_args_is_help=True, help="Delays that other programs measured."), name="trace"

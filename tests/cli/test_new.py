@@ -1,0 +1,41 @@
+"""`trilat new law`: a skeleton that works, and its test, which passes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.cli.running import trilat
+
+
+def test_the_skeleton_is_a_law_and_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = trilat("new", "law", "soft_law.py", cwd=tmp_path)
+    assert made.code == 0
+    assert "--set control.law=soft_law:SoftLaw" in made.out
+    assert "pytest test_soft_law.py" in made.out
+    monkeypatch.chdir(tmp_path)
+    log = tn.simulate("free", {"control.law": "soft_law:SoftLaw"}, duration_s=0.5)
+    apart = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
+    assert apart[1] < 0.6 * apart[0]
+    trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("soft_law.py", "exists")
+    (tmp_path / "soft_law.py").unlink()
+    trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
+    trilat("new", "law", "numpy.py", cwd=tmp_path).refuses("Python has a module numpy already")
+    trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("as in mylaw.py or my_law.py")
+
+
+@pytest.mark.long
+def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
+    law, test = tn.new_law(tmp_path / "stiff.py")
+    assert "class Stiff:" in law.read_text()
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test.name]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "4 passed" in done.stdout
+    law.write_text(law.read_text().replace('remembers = ("error",)', "remembers = ()"))
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert "1 failed" in done.stdout, "a memory that does not say all is found out"
+    assert "FAILED test_stiff.py::test_its_memory_is_all_that_it_keeps" in done.stdout
