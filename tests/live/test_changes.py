@@ -2,10 +2,12 @@
 
 import pytest
 
+import trilat_net as tn
 from tests.cli.running import trilat
 from trilat_net.core.ticks import Mode
+from trilat_net.errors import RunFailed
 
-from .processes import PAPER, Session, Stage, connections
+from .processes import PAPER, Session, Stage, connections, executed_again, whole
 
 SCRIPT = """
 timeline=[
@@ -50,3 +52,29 @@ def test_what_is_set_while_it_runs_is_answered_recorded_and_reproduced(stage: St
     assert [len(log.changes(name)) for name in PAPER] == [0, 0, 2]
     said = [event.command for event in log.events if event.kind == "change"]
     assert said == [taken[tick] for tick in sorted(taken)]
+
+
+@pytest.mark.long
+def test_python_changes_stops_measures_and_ends_a_session_as_the_commands_do(stage: Stage) -> None:
+    glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
+    running = Session(stage, "paper", PAPER, "--duration", "60", *glide)
+    running.all()
+    running.begun()
+    running.recording()
+    session = tn.session("t", connect=running.endpoints)
+    assert "it holds from tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
+    assert "it holds from tick" in session.set_dominance("s", {"m1": 0.9, "m2": 0.1}, ramp_s=0.5)
+    with pytest.raises(RunFailed, match="sum to 1"):
+        session.set_dominance("s", {"m1": 0.9, "m2": 0.2})
+    with pytest.raises(RunFailed, match="reset is for a site in fault"):
+        session.reset("s")
+    assert "s: stop at tick" in session.stop("s")[0]
+    assert "s: enable at tick" in session.enable("s")[0]
+    assert {row["member"] for row in session.ping(count=5).to_rows()} >= set(PAPER)
+    session.end()
+    running.ends_well()
+    log = whole(running.log, in_full=False)
+    executed_again(log)
+    taken = [text for texts in log.changes("s").values() for text in texts]
+    for kind, text in zip(("link", "dominance", "stop", "enable"), taken, strict=True):
+        assert f'"{kind}"' in text
