@@ -291,6 +291,18 @@ def test_a_site_that_comes_back_does_not_wait_for_one_that_leaves_meanwhile(tmp_
     assert log.starts.keys() == {"m1"}
 
 
+@pytest.mark.parametrize("later_ms", [60, 140])
+def test_of_two_sites_that_come_back_together_each_takes_in_the_other(later_ms: int, tmp_path: Path) -> None:
+    """Who comes second learns of the first start from those that admit both, who know it only since."""
+    session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
+    for name, wait_ms in (("m2", 0), ("m1", later_ms)):
+        session.interrupt(name, 3 * S + wait_ms * 1_000_000, 15)
+        session.site(name, at_ns=3 * S + (140 + wait_ms) * 1_000_000)
+    log = session.run()
+    assert {name: log[name].mode[-1] for name in log.sites} == dict.fromkeys(("m1", "m2", "s"), "run")
+    assert verify(log).passed
+
+
 def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: Path) -> None:
     """Its token went, as that of a process that is stopped for longer than its lease does."""
     session = Session.whole(gliding(8.0), tmp_path, ends={})

@@ -58,6 +58,7 @@ class SessionJoin:
         self.refusal = ""
         self._coming: tuple[Event, Epoch] | None = None
         self._admitted: set[str] = set()
+        self._starts: dict[str, int] = {}  # of others that were admitted meanwhile
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self.membership = Membership(bus, clock, session, publisher, sites, late)
         self.pinger = Pinger(bus, clock, session)
@@ -154,7 +155,7 @@ class SessionJoin:
                 if self._admitted < {info.member for info in running}:
                     return None
                 epochs = {info.member: info.epoch_mono_ns for info in running} | {own.member: told.mono_ns}
-                boots = {**running[0].boots, own.member: own.boot}
+                boots = {**running[0].boots, **self._starts, own.member: own.boot}
                 return told._replace(boots=boots, epochs=epochs, first=event.ticks)
         since_ns = now_ns - epoch.mono_ns
         first = first_tick_at(since_ns + EPOCH_AHEAD_NS + 2 * slowest_ns, rate_hz)
@@ -199,6 +200,8 @@ class SessionJoin:
             if event.kind == "epoch":
                 self._consider(event)
                 continue
+            if event.kind == "admit" and event.about in event.boots:
+                self._starts[event.about] = event.boots[event.about]
             if self._coming is not None:
                 self._note_answer(event)
             announced = self._announced
