@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..analysis.timeline import recorded_end_s
@@ -153,6 +155,14 @@ def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
     )
     axes.fill_between(at_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0)
     axes.plot(at_s, middle, **options)
+
+
+def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Labels a logarithmic axis with plain numbers: these steps of every decade, and no others."""
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(LogLocator(subs=range(1, 10)))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def set_time_axis(log: Log, row: Sequence[Axes]) -> None:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
 from ...analysis.delivery import count_sent, predict_delivery, read_arrivals
 from ...analysis.link_summary import has_one_constant_delay, sample_ages_ns
@@ -89,7 +88,7 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
         grid[0, 0].set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
         if x_ms[0] > 0.0:
             grid[0, 0].set_xscale("log")
-            grid[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            style.set_plain_log_axis(grid[0, 0].xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0))
         entries = [(f"age, {text}", options) for text, options in _senders(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
@@ -161,7 +160,7 @@ def _age_axis(axes: Axes, values: Array) -> None:
     known = values[np.isfinite(values)]
     if needs_log_axis(known):
         axes.set(yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max())))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        style.set_plain_log_axis(axes.yaxis, (1.0, 3.0))
     else:
         axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
 

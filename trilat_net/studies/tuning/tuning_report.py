@@ -17,7 +17,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ...analysis.json_values import JsonObject
 from ...files import write_whole
@@ -287,10 +286,7 @@ def draw_front(tuned: TuningResult) -> Figure:
         elif min(shown) > 0.0:
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
-                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
-                axis.set_minor_locator(LogLocator(subs=range(1, 10)))
-                axis.set_minor_formatter(NullFormatter())
+                style.set_plain_log_axis(axis)
         look: dict[str, Any] = {"labelspacing": 0.3, "columnspacing": 0.8, "handlelength": 1.2}
         handles = [*drawn, *stars]
         figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look)
