@@ -4,11 +4,13 @@ python -m tests.json_outline
 """
 
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import trilat_net as tn
+from tests.sites.visits import ping_sites
 from trilat_net.results import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -24,25 +26,53 @@ OF_LOGS: dict[str, Callable[[Path], Result]] = {
     "compare": lambda file: tn.compare(file, LOGS[0]),
     "rerun": lambda file: tn.rerun(file, ["s"], {"control.Kd": 5}),
 }
-OTHERS: dict[str, Callable[[], Result]] = {
-    "linear": lambda: tn.linear("p_d_margin", over=["control.d=0.3:1"]),
-    "test": lambda: tn.check("free", jobs=1),
+EXTERNAL = GOLDEN.parents[1] / "examples" / "external_arm.toml"
+"""A scenario of which theory knows no delay margin."""
+OTHERS: dict[str, Callable[[Path], list[Result]]] = {
+    "linear": lambda _: [tn.linear("p_d_margin", over=["control.d=0.3:1"])],
+    "test": lambda _: [tn.check("free", jobs=1)],
+    "sweep": lambda folder: [
+        tn.sweep("contact", ["link.delay_ms=20,200"], laws=["p_f"], out=folder / "contact", jobs=1),
+        tn.sweep("jitter", ["control.d=0,3"], seeds=2, duration_s=20, out=folder / "jitter", jobs=1),
+    ],
+    "sweep --margin": lambda _: [
+        tn.margin("p_d_margin", f"control.d={span}", tolerance=0.2, duration_s=4, jobs=1)
+        for span in ("0.2:3", "2:3")
+    ],
+    "compare --tune": lambda _: [
+        tn.tune("jitter", ["p_d", "pd_d"], budget=12, seeds=2, duration_s=20, jobs=1)
+    ],
+    "bench": lambda folder: [
+        tn.bench(
+            tasks=["free", "contact"],
+            laws=["p_d", "wave"],
+            links=["rtt68-loss10"],
+            seeds=2,
+            out=folder / "bench",
+            jobs=1,
+        )
+    ],
+    "ping": lambda _: [ping_sites()],
+    "ping --benchmark": lambda _: [
+        tn.ping_benchmark("p_d_margin", duration_s=2),
+        tn.ping_benchmark(EXTERNAL, duration_s=2),
+    ],
 }
 HEAD = """# JSON of the commands
 
 What `--json` prints, and `to_dict()` returns in Python ([python.md](python.md)): keys and their types. `*`
 stands for a name, of a site, a link, a quantity, a channel; `[]` for every entry of a list. Keys end in their
 unit; a number that is not known is null, and one that no sample has stands as null alone. Keys may be added,
-none is taken away or changes its meaning. `trilat sweep`, `compare --tune` and `bench` have rows as in their
-files ([sweep.md](sweep.md), [fair-comparison.md](fair-comparison.md), [bench.md](bench.md)). The page is
-written by `python -m tests.json_outline`.
+none is taken away or changes its meaning. Of `trilat sweep` a run has a column per axis besides, and of
+`compare --tune` a law the gains that it has ([sweep.md](sweep.md), [fair-comparison.md](fair-comparison.md),
+[bench.md](bench.md)). The page is written by `python -m tests.json_outline`.
 """
 _KINDS = {bool: "boolean", int: "number", float: "number", str: "text", type(None): "null"}
 _NAMED = re.compile(
     r"\.(sites|links|walls|judged|records|parameters|channels|remarks|means|unknown|edges|q_rad|x|theta_hat"
     r"|delay_in_use_ms|passive_qd_of_joint|versions|accounts|compression|attachments"
     r"|beta_first|beta_last|parts_last_j|taken_j|given_j|causes_j|sites_unexplained_max_j|part|ended|torque_nm|weight"
-    r"|metadata|coverage|counts)$"
+    r"|metadata|coverage|counts|laws|gains|gains\[\]\.gains|outcomes|tau_limit_nm)$"
 )
 """Tables whose keys are names."""
 
@@ -86,7 +116,8 @@ def build_page() -> str:
         log = tn.simulate(name)
         samples["metrics"].append(tn.metrics(log).to_dict())
         samples["certify"].append(tn.certify(log).to_dict())
-    samples |= {name: [find().to_dict()] for name, find in OTHERS.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        samples |= {name: [one.to_dict() for one in find(Path(folder))] for name, find in OTHERS.items()}
     parts = [HEAD]
     for name, found in samples.items():
         lines = [f"{path}: {kind}" for path, kind in gather(found).items()]

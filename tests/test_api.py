@@ -41,6 +41,7 @@ COUNTERPARTS = {
     "export": ["log export"],
     "view": ["log view"],
     "check": ["test"],
+    "ping_benchmark": ["ping"],
     "list_shipped": ["scenario list"],
     "load_scenario": ["scenario show"],
     "describe_scenario": ["scenario check"],
@@ -68,7 +69,8 @@ def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
     assert doctest.DocTestParser().get_examples(text), f"{name} shows no example"
 
 
-SLOW = {"bench", "check", "certify", "hand", "linear", "margin", "report", "run", "sweep", "tune"}
+SLOW = {"bench", "check", "certify", "hand", "linear", "margin", "ping_benchmark", "report", "run"}
+SLOW |= {"sweep", "tune"}
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from sites.hand_session import hand
     from sites.live_run import run
+    from sites.network_benchmark import ping_benchmark
     from sites.running_session import doctor, session, start
 
     from .api import (
@@ -77,6 +78,7 @@ __all__ = [
     "metrics",
     "new_law",
     "open_log",
+    "ping_benchmark",
     "read_member_keys",
     "read_template",
     "recover",
@@ -108,6 +110,7 @@ _MODULES = {
     "load_scenario": "trilat_net.scenario",
     "new_law": "trilat_net.scenario.law_skeleton",
     "open_log": "trilat_net.log.log_reader",
+    "ping_benchmark": "sites.network_benchmark",
     "read_member_keys": "trilat_net.net.member_keys",
     "read_template": "trilat_net.scenario",
     "rerun": "trilat_net.execution.rerun",

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_outline import is_documented
+
 from .running import trilat
 
 SOME = ("--study", "round-trips", "--task", "contact", "--law", "p_d", "--link", "rtt8,rtt68-loss10")
@@ -17,6 +19,7 @@ def test_a_part_of_the_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> N
     assert done.code == 0
     assert "note: 2 cells, 3 runs, into runs/bench-round-trips" in done.err
     facts = json.loads(done.out)
+    assert is_documented("bench", facts)
     assert [place["runs"] for place in facts["places"]] == [1, 2]
     folder = tmp_path / "runs" / "bench-round-trips"
     with (folder / "places.csv").open() as stream:

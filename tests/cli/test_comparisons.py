@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_outline import is_documented
 from tests.studies.tuning.experiments import TRIO
 
 from .running import trilat
@@ -63,6 +64,7 @@ def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
     again = trilat("compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs).succeeds()
     assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
+    assert is_documented("compare --tune", json.loads(again))
     trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses("fronts: holds something", "--force")
 
 

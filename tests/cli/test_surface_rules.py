@@ -10,11 +10,13 @@ import pytest
 
 import trilat_net as tn
 from tests.golden.surface import all_options
+from tests.json_outline import is_documented
 
 from .running import PLAIN, trilat
 
 OPTIONS = {name: names for name, names in all_options().items() if name != "trilat"}
 COMMANDS = [name for name in OPTIONS if not any(other.startswith(f"{name} ") for other in OPTIONS)]
+GOLDEN_LOG = Path(__file__).parents[1] / "golden" / "live-paper.mcap"
 NO_RESULT = {
     *(f"trilat {name}" for name in ("site", "record", "watch", "router", "log view")),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
@@ -45,6 +47,7 @@ def test_the_version_is_that_of_the_package() -> None:
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
         ("figure run.mcap se", {"settling"}),
         ("site --scenario two_sites ", {"m", "s"}),
+        (f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}),
     ],
 )
 def test_a_shell_completes(words: str, found: set[str]) -> None:
@@ -80,6 +83,7 @@ def test_a_sweep_is_json_while_its_lines_go_aside(tmp_path: Path) -> None:
     first = trilat("sweep", "p_d_margin", *over, "--json", cwd=tmp_path)
     again = trilat("sweep", "grid", "--json", cwd=tmp_path)
     assert json.loads(first.out) == json.loads(again.out)
+    assert is_documented("sweep", json.loads(again.out))
     assert "2 runs of 2 cells" in first.err
     cell = json.loads(trilat("sweep", "grid", "--cell", "1", "--json", cwd=tmp_path).out)
     assert cell == json.loads(first.out)["runs"][1:]

@@ -1,34 +1,13 @@
 """A visitor sees who is there and where their clocks stand; nobody sees the visitor."""
 
-from sites.session_ping import GATHER_NS, SessionPing
+from sites.session_ping import GATHER_NS
+from tests.json_outline import is_documented
 from tests.net.parties import SESSION, Member, Party, told
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
-from trilat_net.net.messages import VERSION, LinkStats
 from trilat_net.net.wire import encode
 
-S = 1_000_000_000
-
-
-class Visit:
-    """A probe of a party, on the party's clock."""
-
-    def __init__(self, party: Party, count: int = 10) -> None:
-        self._party = party
-        self.begun_ns = party.clock.monotonic_ns()
-        self.probe = SessionPing(party.network.join(), party.clock, SESSION, count)
-
-    def look(self, timeout_ns: int = S) -> SessionPing:
-        """Looks until it is over, while the members do what they do."""
-        for n in range(2_000_000_000):
-            if self.probe.over(timeout_ns, self.begun_ns):
-                break
-            self.probe.poll()
-            if n % 10 == 0:
-                for member in self._party.members.values():
-                    member.poll()
-            self._party.clock.sleep_until(self._party.clock.monotonic_ns() + 2_000_000)
-        return self.probe
+from .visits import S, Visit, link_stats, ping_sites
 
 
 def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
@@ -81,10 +60,7 @@ def test_sites_that_run_say_how_their_links_are() -> None:
     party = Party(("m", "s"))
     party.start("m")
     visit = Visit(party)
-    counts = {name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")}
-    zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
-    own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
-    stats = LinkStats(**own, **counts, **zeros, delay_us={"s": 120})
+    stats = link_stats()
     for junk in (b"", b"\xc1", bytes(70_000)):
         party.say("m", junk, topics.LINK)
         party.say("m", junk, topics.INFO)
@@ -106,3 +82,7 @@ def test_it_waits_a_little_for_the_others() -> None:
         if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHER_NS // 3:
             member = party.member("s")
     assert {reach.info.member for reach in visit.probe.reached()} == {"m", "s"}
+
+
+def test_its_json_is_as_documented() -> None:
+    assert is_documented("ping", ping_sites().to_dict())

@@ -51,7 +51,7 @@ def linear_command(
     any verdict.
     """
     if picture is not None:
-        _check_picture(picture, force=force)
+        options.check_picture(picture, force=force)
     from ..theory.linear_analysis import analyse_linearly
 
     wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
@@ -72,17 +72,6 @@ def _pose(text: str | None) -> tuple[float, ...] | None:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
-
-
-def _check_picture(path: Path, *, force: bool) -> None:
-    from ..files import refuse_existing
-    from ..reporting.style import FIGURE_FORMATS
-
-    if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
-        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FIGURE_FORMATS)}")
-    refuse_existing(path, force=force)
-    if not path.parent.is_dir():
-        raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
 def _draw(found: "LinearAnalysis", what: LinearFigure, path: Path) -> None:

@@ -39,6 +39,8 @@ def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
     from ..scenario import load_scenario
 
     files = context.params.get("files") or []
+    if "files" in context.params and not files:  # before an option without its value they are not parsed
+        files = [Path(word) for word in context.args]
     try:
         names = open_log(*files).sites if files else load_scenario(context.params["scenario"]).names
     except (TrilatError, KeyError, TypeError):
@@ -194,6 +196,18 @@ MinCoverageOption = Annotated[
 MIN_COVERAGE = 0.999
 """As in `log.integrity`, which takes long to import."""
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
+
+
+def check_picture(path: Path, *, force: bool) -> None:
+    """Refuses the path of a figure that cannot be written."""
+    from ..files import refuse_existing
+    from ..reporting.style import FIGURE_FORMATS
+
+    if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
+        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FIGURE_FORMATS)}")
+    refuse_existing(path, force=force)
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
 def load_chosen_scenario(

@@ -46,6 +46,7 @@ _COMPOSERS = {
     "LogMetrics": "metrics_text:compose_metrics",
     "DoctorReport": "session_text:compose_doctor",
     "FileOverview": "overview_tables:compose_overview",
+    "NetworkBenchmark": "session_text:compose_benchmark",
     "PingReport": "session_text:compose_ping",
     "Recovery": "checks_text:compose_recovery",
     "Rerun": "rerun_text:compose_rerun",

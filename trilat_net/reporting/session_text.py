@@ -51,3 +51,43 @@ def _clock(member: dict[str, Any]) -> str:
     if "offset_ns" not in member:
         return "another clock"
     return f"{member['offset_ns'] / 1e9:.6f} s +- {member['bound_us']:.0f}"
+
+
+def compose_benchmark(found: Result) -> Iterator[Block]:
+    """Yields a row per size, rate and transport, and per transport whether that is good enough."""
+    facts = found.to_dict()
+    needs, name = facts["needs"], facts["scenario"]
+    yield "one way is half a round trip, the far end's handling with it; times in us"
+    rows = []
+    for row in facts["rows"]:
+        times = row["one_way_us"] or {}
+        shown = [f"{times[key]:.0f}" if key in times else "" for key in ("p50", "p99", "max")]
+        own = (row["bytes"], row["rate_hz"]) == (needs["sample_bytes"], needs["rate_hz"])
+        counts = [row["bytes"], f"{row['rate_hz']:g}", row["sent"], row["lost"]]
+        rows.append([row["transport"], *map(str, counts), *shown, name if own else ""])
+    headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "is that of")
+    yield TextTable(headers, rows, align="lrrrrrrrl", units=("", "", "Hz"))
+    yield f"{name}: {needs['words']}"
+    for one in facts["transports"]:
+        yield MarkedText(
+            MARKS["ok" if one["good"] else "fail"], f"{one['transport']}: {_judgement(one, needs)}"
+        )
+
+
+def _judgement(one: dict[str, Any], needs: dict[str, Any]) -> str:
+    """Returns in words whether a network is good enough over one transport."""
+    if one["p99_ms"] is None:
+        return "nothing came back"
+    parts = [f"p99 {one['p99_ms']:.3g} ms"]
+    if needs["held_ms"]:
+        held = f"the {needs['held_ms']:g} ms for which links hold samples"
+        parts[0] += f" {'hides in' if one['hidden'] else 'exceeds'} {held}"
+    parts.append(f"samples are in use {one['age_ms']:.4g} ms old")
+    if one["spare_ms"] is not None:
+        parts.append(f"{one['spare_ms']:.4g} ms to spare")
+    elif needs["stable_ms"] is not None:
+        parts.append("at which the loop is not stable")
+    if one["lost_share"]:
+        parts.append(f"{100 * one['lost_share']:.2g} % lost")
+    parts.append(f"a play-out of {one['playout_ms']} ms would hold every one of these samples")
+    return ", ".join(parts[:-1]) + "; " + parts[-1]

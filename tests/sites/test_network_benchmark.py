@@ -1,0 +1,156 @@
+"""The benchmark of a network: what it measures over networks that are known, and what it makes of that."""
+
+import json
+import threading
+
+import pytest
+
+import trilat_net as tn
+from sites.network_benchmark import (
+    SESSION,
+    NearEnd,
+    answer_benchmarks,
+    find_needs,
+    judge_network,
+    ping_benchmark,
+    run_far_end,
+)
+from tests.cli.running import trilat
+from tests.json_outline import is_documented
+from trilat_net.net import topics
+from trilat_net.net.bus import LocalNetwork
+from trilat_net.net.connection import find_free_endpoints
+from trilat_net.results import Result
+
+from .relay import Relay
+
+MS = 1_000_000
+
+
+class SlowFarEnd:
+    """Sends back every sample but some, a time after it came."""
+
+    def __init__(self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0) -> None:
+        relayed, self.came = LocalNetwork(), 0
+        answer_benchmarks(relayed.join(), "far")
+        forward = relayed.join()
+        to_near = network.join().publisher(topics.key(SESSION, "far", topics.SAMPLE))
+        forward.tap("**", lambda _, payload: relay.happens(relay.now_ns + trip_ns, lambda: to_near(payload)))
+        ask = forward.publisher(topics.key(SESSION, "near", topics.SAMPLE))
+
+        def take(_: str, payload: bytes) -> None:
+            self.came += 1
+            if not (lost_every and self.came % lost_every == 0):
+                ask(payload)
+
+        network.join().tap(topics.key(SESSION, "near", topics.SAMPLE), take)
+
+
+@pytest.mark.parametrize("trip_ms", [0.4, 35.0])
+def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
+    relay, network = Relay(), LocalNetwork()
+    far = SlowFarEnd(relay, network, round(trip_ms * MS), lost_every=10)
+    network.join().publisher(topics.key(SESSION, "other", topics.SAMPLE))(b"junk")
+
+    def run(clock):
+        near = NearEnd(network.join(), clock, "near")
+        met = near.meet()
+        begun_ns = clock.monotonic_ns()
+        trips_s = near.measure(500, 1000, 0.2)
+        return met, trips_s, clock.monotonic_ns() - begun_ns
+
+    relay.add("near", run)
+    met, trips_s, took_ns = relay.run()["near"]
+    assert met
+    assert far.came == 200 + far.came % 200
+    lost = [trip for trip in trips_s if trip != trip]
+    assert (len(trips_s), len(lost)) == (200, 20)
+    assert trips_s[trips_s == trips_s] == pytest.approx(trip_ms / 1e3, rel=1e-12)
+    assert took_ns <= 700 * MS + 35 * MS
+
+
+def test_nobody_there_is_said() -> None:
+    relay, network = Relay(), LocalNetwork()
+    relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").meet())
+    assert relay.run()["near"] is False
+
+
+def row(needs, p99_ms: float, lost: int = 0) -> dict:
+    times = {"p50": 500 * p99_ms, "p99": 1e3 * p99_ms, "max": 2e3 * p99_ms}
+    own = {"transport": "tcp", "bytes": needs.sample_bytes, "rate_hz": 1000.0, "sent": 1000}
+    return {**own, "lost": lost, "one_way_us": times}
+
+
+def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
+    """P+d at 200 ms holds up to 229.8 ms, docs/linear.md, and its links hide what is shorter than theirs."""
+    needs = find_needs(tn.load_scenario("p_d_margin"))
+    margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
+    assert needs.stable_ms == [[1e3 * one["from_s"], 1e3 * one["to_s"]] for one in margin]
+    edge_ms = needs.stable_ms[0][1]
+    assert edge_ms == pytest.approx(229.8, abs=0.05)
+    hidden = judge_network(needs, row(needs, 150.0))
+    assert hidden["hidden"]
+    assert (hidden["good"], hidden["age_ms"]) == (True, 200.0)
+    assert hidden["spare_ms"] == pytest.approx(edge_ms - 200.0)
+    near = judge_network(needs, row(needs, 228.4))
+    assert (near["good"], near["hidden"], near["age_ms"]) == (True, False, 229.0)
+    assert not judge_network(needs, row(needs, 230.0))["good"]
+    assert not judge_network(needs, row(needs, 150.0, lost=2))["good"]
+    assert not judge_network(needs, {**row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
+
+
+def test_a_play_out_is_what_a_measured_link_adds() -> None:
+    needs = find_needs(tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40}))
+    assert (needs.playout_ms, needs.held_ms, needs.in_use_ms) == (40.0, 40.0, None)
+    assert judge_network(needs, row(needs, 12.3))["age_ms"] == 40.0
+    assert judge_network(needs, row(needs, 41.3))["age_ms"] == 42.0
+    assert judge_network(needs, row(needs, 41.3))["playout_ms"] == 83
+
+
+@pytest.mark.parametrize(
+    ("words", "fact"),
+    [
+        (["--figure", "a.png"], "--figure: only with --benchmark"),
+        (["--benchmark", "free", "--count", "9"], "--count: not with --benchmark"),
+        (["--answer", "tcp/127.0.0.1:1", "--json"], "--json: not with --answer"),
+        (["--answer", "tls/127.0.0.1:1"], "takes keys"),
+        (["--answer", "tcp/0.0.0.0:1"], "--insecure"),
+        (["--benchmark", "nothing"], "nothing"),
+        (["--benchmark", "free", "--figure", "a.gif"], "a.gif"),
+        (["--benchmark", "free", "--seconds", "0"], "--seconds"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(words: list[str], fact: str, tmp_path) -> None:
+    trilat("ping", *words, cwd=tmp_path).refuses(fact)
+
+
+def check_result(found: Result, transports: list[str]) -> None:
+    facts = found.to_dict()
+    assert [one["transport"] for one in facts["transports"]] == transports
+    assert len(facts["rows"]) == 6 * len(transports)
+    assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
+    own = [one for one in facts["rows"] if one["bytes"] == facts["needs"]["sample_bytes"]]
+    assert all(one["one_way_us"]["p50"] > 0 for one in own)
+    assert is_documented("ping --benchmark", facts)
+    assert len(found.to_frame()) == len(facts["rows"])
+
+
+def test_it_measures_loopback() -> None:
+    ended = threading.Event()
+    (endpoint,) = find_free_endpoints(1)
+    far = threading.Thread(target=run_far_end, args=([endpoint], None, ended.is_set))
+    far.start()
+    try:
+        check_result(ping_benchmark("p_d_margin", duration_s=1.0, connect=[endpoint]), ["tcp"])
+    finally:
+        ended.set()
+        far.join()
+
+
+@pytest.mark.long
+def test_the_command_measures_all_transports_and_draws(tmp_path) -> None:
+    words = ["--benchmark", "p_d_margin", "--seconds", "3", "--figure", "network.png", "--json"]
+    facts = json.loads(trilat("ping", *words, cwd=tmp_path).out)
+    assert [one["transport"] for one in facts["transports"]] == ["tcp", "tls", "quic"]
+    assert (tmp_path / "network.png").stat().st_size > 10_000
+    assert is_documented("ping --benchmark", facts)
