@@ -7,6 +7,7 @@ error is one sentence.
 
 import errno
 import gc
+import inspect
 import os
 import sys
 from typing import Annotated, Any
@@ -101,7 +102,9 @@ def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any
     group = typer.Typer(**options)
     for name, (run, *examples) in commands.items():
         epilog = "\n\n".join(f"Example: trilat {words}{name} {example}".rstrip() for example in examples)
-        group.command(name, epilog=epilog)(run)
+        paragraphs = inspect.cleandoc(run.__doc__).split("\n\n")  # else lines break where the source's do
+        text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
+        group.command(name, help=text, epilog=epilog)(run)
     return group
 
 
