@@ -144,7 +144,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("log-tools.md", "links of a site up to 64 MiB", 64, scenario_reader.MAX_LINKS_BYTES / 2**20),
     ("log-tools.md", "of more than 65 536 only", 65_536, site_log.MAX_DECODED_RECORDS),
     ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, difference.TOLERANCE),
-    ("log-tools.md", "sleep until 150 us before", 150, pace.SPIN_NS / 1e3),
+    ("log-tools.md", "sleeps until 150 us before", 150, pace.SPIN_NS / 1e3),
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),
     ("maps/README.md", "took at most 60 s", 60, live_confirmation.MAX_SESSION_S),
