@@ -59,7 +59,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "150 ms before the epoch", 150, session.DECIDE_NS / 1e6),
     ("design.md", "at most 5 s from the last question", 5, shutdown.LINGER_NS / 1e9),
     ("design.md", "and 2 s more", 2, shutdown.LEAVE_TIMEOUT_NS / 1e9),
-    ("design.md", "It holds from 100 ms later", 100, change_server.AHEAD_MS),
+    ("design.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("design.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
     ("external-arm.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
