@@ -304,7 +304,7 @@ LAB: dict[str, Make] = {
     "only the first decays: {} rad at 38 s": lambda: seen("jitter", "error_peak_rad", (38, 40, "")),
     "against {} rad at a constant 200 ms": lambda: seen("jitter", "error_peak_rad", (38, 40, ""), **CONSTANT),
     "the age in use is {} ms on average": lambda: [age()],
-    "order makes it {} ms": lambda: [age(link__order="in_order")],
+    "the order makes it {} ms": lambda: [age(link__order="in_order")],
     "to choose from: {} ms": lambda: [age(rate_hz=100)],
     "so {} rad, and the run ends at {}.": lambda: anchored(0.2, 20),
     "At 400 ms it is {}, and {}.": lambda: anchored(0.4, 40),
