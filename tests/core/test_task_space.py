@@ -8,10 +8,18 @@ from scipy.spatial.transform import Rotation
 
 from tests.core.chain_references import chain_references
 from trilat_net.core.chain import ChainJoint, place_joints
-from trilat_net.core.rotation import arctan, rotation_matrix, rotation_vector, turn_between
+from trilat_net.core.rotation import (
+    arctan,
+    rotation_matrix,
+    rotation_vector,
+    turn_between,
+    turn_rate,
+    turning_velocity,
+)
 from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
 from trilat_net.core.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup, TaskSetup
-from trilat_net.core.task_space import update_pose, update_task_errors, update_wrench
+from trilat_net.core.task_space import REST_S, update_pose, update_task_errors, update_wrench
+from trilat_net.core.ticks import Mode
 from trilat_net.core.vectors import Array, Row
 
 CHAIN = chain_references()["arm7"].chain
@@ -74,6 +82,17 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
     assert np.abs(np.array(turn_between(rows, rotation_matrix((0.0, 0.0, 0.0))))).max() <= np.pi
 
 
+@given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 1e-6]))
+def test_the_velocity_of_a_turn_is_the_limit_of_differences_and_is_undone(
+    vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
+) -> None:
+    turn = (shorter * vector[0], shorter * vector[1], shorter * vector[2])
+    after, before = (Rotation.from_rotvec(np.array(turn) + h * np.array(rate)) for h in (1e-5, -1e-5))
+    velocity = turning_velocity(turn, rate)
+    assert np.array(velocity) == pytest.approx((after * before.inv()).as_rotvec() / 2e-5, abs=1e-8)
+    assert turn_rate(turn, velocity) == pytest.approx(rate, abs=1e-11)
+
+
 @given(x=st.floats(0.0, 1.0))
 def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
     assert arctan(x) == pytest.approx(np.arctan(x), abs=3e-16)
@@ -105,10 +124,18 @@ def test_r_is_what_the_task_asks_and_the_posture_does_not_disturb_it(seed: int) 
     assert np.abs(s.J @ s.r - (s.xd + s.Lambda * s.e)).max() <= 1e-9
 
 
+@pytest.mark.parametrize("mode", [Mode.RUN, Mode.HOLD, Mode.RETURN])
 @tasks
-def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(task: TaskSetup) -> None:
-    """Along a motion whose reference stands: v at a little before and after, and a between them."""
+def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
+    task: TaskSetup, mode: Mode
+) -> None:
+    """Along a motion whose reference stands: v at a little before and after, and a between them.
+
+    In a hold a joint pose that is held takes the place of the posture, afterwards the posture its place.
+    """
     arrays = build(task)
+    growing = {Mode.RUN: 0.0, Mode.HOLD: 1.0 / REST_S, Mode.RETURN: -1.0 / REST_S}[mode]
+    arrays.site[0].mode, arrays.site[0].q_rest = mode, np.linspace(-0.2, 0.3, 7)
     q, h = np.array(arrays.site[0].q), 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
     x = np.array(place(arrays, q, qd).x)
@@ -116,6 +143,7 @@ def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
     found = []
     for sign in (-1.0, 0.0, 1.0):
         s = place(arrays, q + sign * h * qd, qd)
+        s.rest_share = (0.4 + sign * h * growing) * (mode != Mode.RUN)
         s.q_des, s.qd_des = x, 0.0
         update_task_errors(s)
         found.append((np.array(s.v), np.array(s.a)))

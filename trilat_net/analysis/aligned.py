@@ -22,6 +22,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
 from ..scenario import Scenario
 from ..scenario.scenario_types import Limits
+from .following import read_rest
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
@@ -30,6 +31,8 @@ _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 STOPPED_MODES = ("fault", "stopped")
 """Modes in which the torque is not that of the law."""
+RESTING_MODES = ("waiting", "hold")
+"""Modes in which a site in task space holds its joint pose."""
 RESUMING_S = 2.0 * BLEND_S
 """For so long after these it may not be that of the law alone."""
 
@@ -55,6 +58,7 @@ class AlignedRecords(NamedTuple):
         axes: see `SiteLog`.
         hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
         stopped: True in one of the `STOPPED_MODES`, and for `RESUMING_S` afterwards; empty: never.
+        rest: in task space under the rule `glide` the joint pose that is held, see `following.read_rest`.
     """
 
     site: str
@@ -76,6 +80,7 @@ class AlignedRecords(NamedTuple):
     axes: tuple[float, ...] = ()
     hand: Array = _NONE
     stopped: Bools = _NO_ROWS
+    rest: Array = _NONE
 
     @property
     def shared(self) -> Array:
@@ -192,6 +197,10 @@ def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | N
     stopped = _find_stopped(part.mode[rows], tick, part.rate_hz)[before]
     follows &= find_unlimited(scenario.sites[part.name].limits, part.qd_des[rows])[before]
     columns = {name: getattr(part, name)[rows] for name in names}
+    if part.layout.task and scenario.sites[part.name].on_stale.action == "glide":
+        place = part.layout.rest_columns(len(part.peers))
+        mem = np.array([part.mem[row][place] for row in rows])
+        columns["rest"] = read_rest(mem, np.isin(part.mode[rows], RESTING_MODES))
     for name, values in columns.items():
         columns[name] = (
             values[: len(grid)]

@@ -12,7 +12,15 @@ import numpy as np
 
 from ..net.messages import TASK_VECTORS, State
 from ..scenario import Scenario
-from .aligned import RECORD_COLUMNS, RESUMING_S, STOPPED_MODES, AlignedRecords, find_unlimited
+from .aligned import (
+    RECORD_COLUMNS,
+    RESTING_MODES,
+    RESUMING_S,
+    STOPPED_MODES,
+    AlignedRecords,
+    find_unlimited,
+)
+from .following import read_rest
 
 KEPT_S = 12.0
 """Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
@@ -32,7 +40,12 @@ class RecordWindow:
         self.peers, self._axes = scenario.peers(site), scenario.arms[site].axes
         layout = scenario.layout(site)
         names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()), *(("hand",) if layout.hand else ()))
-        ends = list(accumulate(layout.lengths()[name] for name in names))
+        lengths = layout.lengths()
+        self._rest = slice(0)
+        if layout.task and scenario.sites[site].on_stale.action == "glide":
+            names, self._rest = (*names, "rest"), layout.rest_columns(len(self.peers))
+            lengths["rest"] = layout.joints + 2
+        ends = list(accumulate(lengths[name] for name in names))
         self._columns = {name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)}
         self._kept = max(8, round(kept_s * self.rate_hz))
         self._floats = np.zeros((2 * self._kept, ends[-1]))
@@ -53,7 +66,11 @@ class RecordWindow:
             self._move(record.tick - self._kept + 1)
         row = record.tick - self.first
         for name, columns in self._columns.items():
-            self._floats[row, columns] = getattr(record, name)
+            if name != "rest":
+                self._floats[row, columns] = getattr(record, name)
+        if "rest" in self._columns:
+            mem, rests = np.array([record.mem[self._rest]]), np.array([record.mode in RESTING_MODES])
+            self._floats[row, self._columns["rest"]] = read_rest(mem, rests)[0]
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
         if record.mode in STOPPED_MODES:
             self._stopped_at = max(self._stopped_at, record.tick)

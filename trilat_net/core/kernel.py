@@ -100,12 +100,12 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
     """Ends stage 6: the torque of a site without its law, and none that changes faster than it may.
 
     In FAULT and STOPPED no law acts; one that is plugged in does not while the site waits or holds, unless it
-    says that it holds by its reference.
+    says that it holds by its reference, which in task space is not all of the arm.
     """
     if s.on_stale == _GLIDE:
         if s.mode != _FAULT and s.mode != _DIVERGED and not is_torque_finite(s):
             latch(tick_ns(k - 1, s.rate_hz), s, _FAULT, _NOT_FINITE)
-        pauses = s.law == _OWN and s.holds == 0
+        pauses = s.law == _OWN and (s.holds == 0 or s.task != 0)
         if s.mode == _FAULT or s.mode == _STOPPED or (pauses and (s.mode == _HOLD or s.mode == _WAITING)):
             _put_known_gravity(s, chain, s.u)
             fall_back(t_ns, s)

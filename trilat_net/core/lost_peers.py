@@ -5,7 +5,10 @@ is dropped without whom those that are left would not all reach each other, nor 
 then the site holds. The reference never jumps: the site aligns with what is left, and with who is back.
 """
 
+from .chain import add, scale, three
 from .jit import leaf
+from .rotation import length, rotation_matrix, turn_between
+from .task_space import has_orientation, straight_coordinates
 from .ticks import LifeReason
 from .vectors import Row, RowArray
 
@@ -38,9 +41,31 @@ def _can_go_without(lost: int, t_ns: int, site: Row, links: RowArray) -> bool:
 
 
 @leaf
+def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
+    """True if this peer's share turns the reference by no more than an alignment may.
+
+    The turn between two orientations is no longer than the difference of their vectors from the own one.
+    """
+    own, whole, sum_of_turns = rotation_matrix(three(site.x[3:])), 0.0, (0.0, 0.0, 0.0)
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        if link.gone == 0.0:
+            turn = turn_between(own, rotation_matrix(three(link.q[3:])))
+            sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
+            whole += link.alpha
+    link = links[back]
+    turn = turn_between(own, rotation_matrix(three(link.q[3:])))
+    away = add(turn, scale(-1.0 / whole, sum_of_turns))
+    near: bool = length(away) * link.alpha / (whole + link.alpha) <= site.align_limit
+    return near
+
+
+@leaf
 def _is_near(back: int, site: Row, links: RowArray) -> bool:
     """True if the reference with this peer is no farther from that without it than an alignment may go."""
-    for i in range(site.q_des.shape[0]):
+    if has_orientation(site) and not _is_turned_little(back, site, links):
+        return False
+    for i in range(straight_coordinates(site)):
         rest = whole = 0.0
         for j in range(links.shape[0]):
             link: Row = links[j]

@@ -1,18 +1,22 @@
 """Rotations as vectors: axis times angle, rad, by plain arithmetic with the same bits on every machine.
 
 Invariant: a rotation vector is at most half a turn long; `rotation_matrix` and `rotation_vector` undo each
-other. The arc tangent is that of S. Moshier's Cephes library.
+other. The arc tangent is that of S. Moshier's Cephes library. A turn of which only the vector changes has
+the angular velocity J(vector) vector', with J the left Jacobian of the rotation group (J. Sola, J. Deray and
+D. Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv 1812.01537, Eq. 145, 146).
 """
 
 import math
 
-from .chain import Matrix, Three, scale
+from .chain import Matrix, Three, add, cross, dot, scale
 from .jit import leaf
 from .sincos import sincos
 from .vectors import Array
 
 _SMALL = 1e-8
 """Below this, a sine is its angle to the last bit."""
+_SHORT = 0.02
+"""Below this, rad, the first terms of a series are exact to the last bit, and closed forms are not."""
 
 
 @leaf
@@ -104,3 +108,50 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
         row[0] * b[0] + row[1] * b[1] + row[2] * b[2],
         row[0] * c[0] + row[1] * c[1] + row[2] * c[2],
     )
+
+
+@leaf
+def add_turn(turn: Three, vector: Three) -> Three:
+    """Returns the orientation `vector` turned by another rotation vector, in base axes."""
+    return turn_between(rotation_matrix(turn), rotation_matrix(scale(-1.0, vector)))
+
+
+@leaf
+def rotate_by(turn: Three, vector: Three) -> Three:
+    """Returns a vector turned by a rotation vector."""
+    x, y, z = rotation_matrix(turn)
+    return _times_rows(vector, x, y, z)
+
+
+@leaf
+def length(vector: Three) -> float:
+    """Returns the length of a vector."""
+    return math.sqrt(dot(vector, vector))
+
+
+@leaf
+def turning_velocity(turn: Three, rate: Three) -> Three:
+    """Returns the angular velocity of a turn whose vector has this derivative."""
+    angle = length(turn)
+    a2 = angle * angle
+    if angle < _SHORT:
+        by_cross, by_twice = 0.5 - a2 / 24.0 + a2 * a2 / 720.0, 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
+    else:
+        s, c = sincos(angle)
+        by_cross, by_twice = (1.0 - c) / a2, (angle - s) / (a2 * angle)
+    across = cross(turn, rate)
+    return add(rate, add(scale(by_cross, across), scale(by_twice, cross(turn, across))))
+
+
+@leaf
+def turn_rate(turn: Three, velocity: Three) -> Three:
+    """Returns the derivative of a turn's vector at this angular velocity: undoes `turning_velocity`."""
+    angle = length(turn)
+    a2 = angle * angle
+    if angle < _SHORT:
+        by_twice = 1.0 / 12.0 + a2 / 720.0 + a2 * a2 / 30240.0
+    else:
+        s, c = sincos(0.5 * angle)
+        by_twice = (1.0 - 0.5 * angle * c / s) / a2
+    across = cross(turn, velocity)
+    return add(velocity, add(scale(-0.5, across), scale(by_twice, cross(turn, across))))

@@ -6,8 +6,11 @@ that of the tick before by no more than its rate allows. Without limits, and in 
 
 from math import inf, isfinite
 
+from .chain import put_three, scale, three
 from .control import limit_torque
 from .jit import leaf
+from .rotation import add_turn, rotation_matrix, turn_between
+from .task_space import has_orientation, rest_velocity, straight_coordinates
 from .vectors import Row
 
 BLEND_S = 0.1
@@ -17,9 +20,12 @@ BLEND_S = 0.1
 @leaf
 def limit_reference(k: int, site: Row) -> None:
     """Holds the reference back to its limit of speed, from the own pose on; and makes up for it so."""
-    for i in range(site.shared):
-        if k == site.first:
+    if k == site.first:
+        for i in range(site.shared):
             site.q_followed[i] = site.x[i] if site.task else site.q[i]
+    if has_orientation(site) and site.qd_des_limit[3] < inf:
+        _limit_turn(site)
+    for i in range(min(site.shared, straight_coordinates(site))):
         limit = site.qd_des_limit[i]
         if limit == inf:
             continue
@@ -30,6 +36,24 @@ def limit_reference(k: int, site: Row) -> None:
             site.qd_des[i] = limit if forward else -limit
         else:
             site.qd_des[i] = min(max(site.qd_des[i], -limit), limit)
+
+
+@leaf
+def _limit_turn(site: Row) -> None:
+    """Holds the orientation of the reference back to the limit of its speed about each axis."""
+    before = rotation_matrix(three(site.q_followed[3:]))
+    turn = turn_between(rotation_matrix(three(site.q_des[3:])), before)
+    share = 1.0
+    for i in range(3):
+        most = site.qd_des_limit[3 + i] / site.rate_hz
+        if abs(turn[i]) * share > most:
+            share = most / abs(turn[i])
+    if share < 1.0:
+        put_three(site.q_des[3:], add_turn(scale(share, turn), three(site.q_followed[3:])))
+        put_three(site.qd_des[3:], scale(share * site.rate_hz, turn))
+    for i in range(3, 6):
+        limit = site.qd_des_limit[i]
+        site.qd_des[i] = min(max(site.qd_des[i], -limit), limit)
 
 
 @leaf
@@ -45,11 +69,14 @@ def is_torque_finite(site: Row) -> bool:
 def fall_back(t_ns: int, site: Row) -> None:
     """Writes the torque of a site without its law: from the last one to `u`, which is gravity, less B qd.
 
-    A torque that is no number is none.
+    In task space it goes back to the joint pose that it holds. A torque that is no number is none.
     """
     share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
     for i in range(site.joints):
-        goal = limit_torque(site.u[i] - site.damping[i] * site.qd[i], site.tau_limit[i])
+        speed = site.qd[i]
+        if site.rest_share > 0.0:
+            speed -= rest_velocity(site, i)
+        goal = limit_torque(site.u[i] - site.damping[i] * speed, site.tau_limit[i])
         if not isfinite(goal):
             goal = 0.0
         site.tau[i] = site.tau_held[i] + share * (goal - site.tau_held[i])

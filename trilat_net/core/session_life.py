@@ -7,7 +7,9 @@
 Invariant: the reference and its derivative never jump, and the second is the derivative of the first. Held,
 the rate of the reference falls to zero over the time after which a peer counts as silent, and the reference
 is its integral; while the site aligns, the way from the peers' reference falls to zero with its rate, no
-faster than `align_speed` beyond what it had. A peer that holds or aligns itself is followed like any other.
+faster than `align_speed` beyond what it had. Of an orientation the way is the rotation vector of the turn
+from the peers' to the own one, and a rate is an angular velocity. A peer that holds or aligns itself is
+followed like any other.
 FAULT and STOPPED are latched: the torque goes over from the last one to damping and gravity (`safeguards`),
 and afterwards in the same way back to that of the law; meanwhile the reference is the own pose, and estimates
 stay as they are. No message of a peer leads there or back. A switch that is held again ends what its release
@@ -16,7 +18,18 @@ began, but no stop by order.
 
 from math import isfinite
 
+from .chain import Three, add, put_three, subtract, three
 from .jit import leaf
+from .rotation import (
+    add_turn,
+    length,
+    rotate_by,
+    rotation_matrix,
+    turn_between,
+    turn_rate,
+    turning_velocity,
+)
+from .task_space import has_orientation, keep_rest, straight_coordinates
 from .ticks import LifeOrder, LifeReason, Mode, tick_ns
 from .vectors import Row, RowArray, put
 
@@ -63,20 +76,47 @@ def _enter(t_ns: int, mode: int, reason: int, site: Row) -> None:
 
 
 @leaf
-def _find_held(t_ns: int, site: Row, i: int) -> tuple[float, float]:
-    """Returns where the held reference is and its rate: the rate falls to zero over the time of silence."""
+def _find_fall(t_ns: int, site: Row, i: int) -> tuple[float, float]:
+    """Returns how far the reference has gone since it is held, and its rate, which falls to zero."""
     fall_s = site.stale_ns * 1e-9
     since_s = min((t_ns - site.return_from_ns) * 1e-9, fall_s)
     rate = site.qd_held[i] * (1.0 - since_s / fall_s)
-    return site.q_held[i] + 0.5 * (site.qd_held[i] + rate) * since_s, rate
+    return 0.5 * (site.qd_held[i] + rate) * since_s, rate
+
+
+@leaf
+def _find_held(t_ns: int, site: Row, i: int) -> tuple[float, float]:
+    """Returns where the held reference is and its rate."""
+    way, rate = _find_fall(t_ns, site, i)
+    return site.q_held[i] + way, rate
+
+
+@leaf
+def _find_held_orientation(t_ns: int, site: Row) -> tuple[Three, Three]:
+    """Returns the orientation of the held reference and its angular velocity."""
+    x, wx = _find_fall(t_ns, site, 3)
+    y, wy = _find_fall(t_ns, site, 4)
+    z, wz = _find_fall(t_ns, site, 5)
+    return add_turn((x, y, z), three(site.q_held[3:])), (wx, wy, wz)
+
+
+@leaf
+def _find_turn(t_ns: int, site: Row) -> tuple[Three, Three]:
+    """Returns the turn from the peers' orientation to the held one, and the derivative of its vector."""
+    held, velocity = _find_held_orientation(t_ns, site)
+    turn = turn_between(rotation_matrix(held), rotation_matrix(three(site.q_des[3:])))
+    carried = rotate_by(turn, three(site.qd_des[3:]))
+    return turn, turn_rate(turn, subtract(velocity, carried))
 
 
 @leaf
 def _align_s(site: Row) -> float:
     """Returns how long the way that is left at its beginning, `q_held`, takes."""
     way = 0.0
-    for i in range(site.q_held.shape[0]):
+    for i in range(straight_coordinates(site)):
         way = max(way, abs(site.q_held[i]))
+    if has_orientation(site):
+        way = max(way, length(three(site.q_held[3:])))
     takes_s: float = max(MIN_ALIGN_NS * 1e-9, 1.5 * way / site.align_speed)
     return takes_s
 
@@ -84,14 +124,22 @@ def _align_s(site: Row) -> float:
 @leaf
 def _begin_aligning(t_ns: int, site: Row, reason: int) -> None:
     """Begins to align from the held reference, if the peers are no farther than the limit."""
-    for i in range(site.q_held.shape[0]):
+    turn = rate = (0.0, 0.0, 0.0)
+    if has_orientation(site):
+        turn, rate = _find_turn(t_ns, site)
+    near = length(turn) <= site.align_limit
+    for i in range(straight_coordinates(site)):
         q, _ = _find_held(t_ns, site, i)
-        if not abs(q - site.q_des[i]) <= site.align_limit:
-            site.reason = _ALIGN_LIMIT
-            return
-    for i in range(site.q_held.shape[0]):
+        near = near and abs(q - site.q_des[i]) <= site.align_limit
+    if not near:
+        site.reason = _ALIGN_LIMIT
+        return
+    for i in range(straight_coordinates(site)):
         q, qd = _find_held(t_ns, site, i)
         site.q_held[i], site.qd_held[i] = q - site.q_des[i], qd - site.qd_des[i]
+    if has_orientation(site):
+        put_three(site.q_held[3:], turn)
+        put_three(site.qd_held[3:], rate)
     put(site.tau_held, site.tau_before)
     _enter(t_ns, _ALIGN, reason, site)
 
@@ -102,6 +150,8 @@ def _wait(t_ns: int, site: Row, reason: int) -> None:
     for i in range(site.q_held.shape[0]):
         site.q_held[i] = site.x[i] if site.task else site.q[i]
         site.qd_held[i] = 0.0
+    put(site.q_rest, site.q)
+    site.rest_share = 1.0 if site.task else 0.0
     put(site.tau_held, site.tau_before)
     _enter(t_ns, _WAITING, reason, site)
 
@@ -119,6 +169,8 @@ def _hold(before_ns: int, site: Row, reason: int) -> None:
     """Begins to hold the reference that was in force at the tick before."""
     put(site.q_held, site.q_followed)
     put(site.qd_held, site.qd_followed)
+    if site.rest_share == 0.0:
+        put(site.q_rest, site.q)
     put(site.tau_held, site.tau_before)
     _enter(before_ns, _HOLD, reason, site)
 
@@ -212,20 +264,46 @@ def update_session_life(t_ns: int, before_ns: int, site: Row, links: RowArray) -
     if site.order != 0 or site.skipped != 0:
         _obey(t_ns, before_ns, site)
     _update_mode(t_ns, before_ns, site, links)
+    keep_rest(site)
     if site.mode == _RUN:
         return
     if site.mode == _FAULT or site.mode == _STOPPED:
         for i in range(site.q_held.shape[0]):
             site.q_des[i] = site.x[i] if site.task else site.q[i]
             site.qd_des[i] = 0.0
-        return
-    if site.mode != _ALIGN:
-        for i in range(site.q_held.shape[0]):
+    elif site.mode == _ALIGN:
+        _put_aligning(t_ns, site)
+    else:
+        for i in range(straight_coordinates(site)):
             site.q_des[i], site.qd_des[i] = _find_held(t_ns, site, i)
-        return
-    takes_s = _align_s(site)
+        if has_orientation(site):
+            held, velocity = _find_held_orientation(t_ns, site)
+            put_three(site.q_des[3:], held)
+            put_three(site.qd_des[3:], velocity)
+
+
+@leaf
+def _find_way(t_ns: int, takes_s: float, site: Row, i: int) -> tuple[float, float]:
+    """Returns what is left of the way from the peers' reference, and its rate."""
     x = (t_ns - site.return_from_ns) * 1e-9 / takes_s
-    for i in range(site.q_held.shape[0]):
-        way, rate = site.q_held[i], takes_s * site.qd_held[i]
-        site.q_des[i] += way * (1.0 - x * x * (3.0 - 2.0 * x)) + rate * x * (1.0 - x) * (1.0 - x)
-        site.qd_des[i] += (rate * (1.0 - x) * (1.0 - 3.0 * x) - way * 6.0 * x * (1.0 - x)) / takes_s
+    way, rate = site.q_held[i], takes_s * site.qd_held[i]
+    left = way * (1.0 - x * x * (3.0 - 2.0 * x)) + rate * x * (1.0 - x) * (1.0 - x)
+    return left, (rate * (1.0 - x) * (1.0 - 3.0 * x) - way * 6.0 * x * (1.0 - x)) / takes_s
+
+
+@leaf
+def _put_aligning(t_ns: int, site: Row) -> None:
+    """Adds what is left of the way to the peers' reference, and its rate."""
+    takes_s = _align_s(site)
+    for i in range(straight_coordinates(site)):
+        left, rate = _find_way(t_ns, takes_s, site, i)
+        site.q_des[i] += left
+        site.qd_des[i] += rate
+    if has_orientation(site):
+        x, wx = _find_way(t_ns, takes_s, site, 3)
+        y, wy = _find_way(t_ns, takes_s, site, 4)
+        z, wz = _find_way(t_ns, takes_s, site, 5)
+        turn = (x, y, z)
+        carried = rotate_by(turn, three(site.qd_des[3:]))
+        put_three(site.q_des[3:], add_turn(turn, three(site.q_des[3:])))
+        put_three(site.qd_des[3:], add(turning_velocity(turn, (wx, wy, wz)), carried))

@@ -33,7 +33,7 @@ _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
     *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
-    *("q_min", "q_max", "tau_rate", "tau_held", "damping"),
+    *("q_min", "q_max", "tau_rate", "tau_held", "damping", "q_rest"),
 )
 _PER_COORDINATE = (
     *(
@@ -74,7 +74,7 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
     """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
     fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")]
     fields += [
-        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit")),
+        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit", "rest_share")),
         ("lengths", "f8", (2,)),
     ]
     fields += [("k", "i8"), ("t_s", "f8"), ("h_s", "f8"), ("M", "f8", (layout.joints, layout.joints))]

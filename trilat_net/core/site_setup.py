@@ -66,7 +66,7 @@ class StaleRule(NamedTuple):
             so long.
         return_ns: duration of the return to the peers, ns.
         align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place m/s).
-        align_limit: of GLIDE, the longest way that it goes by itself, rad (m).
+        align_limit: of GLIDE, the longest way that it goes by itself, rad (of a place m).
         degrades: of GLIDE, true: it goes on without a peer that is lost, see `lost_peers`.
     """
 
@@ -185,9 +185,16 @@ class Layout(NamedTuple):
     def life_memory(self, peers: int, *, degrades: bool = False) -> int:
         """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`.
 
-        Of one that degrades the last of them are `gone` of its peers.
+        In task space there are the share and the joint pose of `rest_columns`. Of one that degrades the last
+        of them are `gone` of its peers.
         """
-        return 2 * (self.shared + 1) + peers + self.joints + peers * degrades
+        end: int = self.rest_columns(peers).stop
+        return end + peers * degrades
+
+    def rest_columns(self, peers: int) -> slice:
+        """Returns where `mem` has the share of the joint pose that is held, and the pose, if there is one."""
+        first = 2 * (self.shared + 1) + peers + self.joints
+        return slice(first, first + (1 + self.joints) * self.task)
 
     def find_lost(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
         """Returns the peers without which a site that degrades goes on, by a record's `mem`."""

@@ -93,12 +93,12 @@ class Site:
         self._hand = self._arrays.actors[live[0]] if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
-        self._glides = setup.on_stale.action is StaleAction.GLIDE
+        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
         own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
-        self._held_fields = (*own, self._links["used_ns"], self._links["gone"])
-        self._degrades = setup.on_stale.degrades
+        rest = s["rest_share"], s["q_rest"][0]
+        self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
     def order(self, command: CoreChange, t_ns: int) -> None:
@@ -238,13 +238,14 @@ class Site:
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
-        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone = self._held_fields
+        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone, share, pose = self._held_fields
         held = [*q_held.tolist(), float(return_from_ns.item())]
         if not self._glides:
             return held
         heard = map(float, used_ns.tolist())
         lost = gone.tolist() if self._degrades else ()
-        return [*held, *qd_held.tolist(), float(reason.item()), *heard, *tau_held.tolist(), *lost]
+        rest = (share.item(), *pose.tolist()) if self.layout.task else ()
+        return [*held, *qd_held.tolist(), float(reason.item()), *heard, *tau_held.tolist(), *rest, *lost]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""
@@ -290,6 +291,8 @@ class Site:
             peers, joints = len(self.peers), self.layout.joints
             self._links["used_ns"], s.tau_held = rest[:peers], rest[peers : peers + joints]
             rest = rest[peers + joints :]
+            if self.layout.task:
+                s.rest_share, s.q_rest, rest = rest[0], rest[1 : 1 + joints], rest[1 + joints :]
             if self._degrades:
                 self._links["gone"], rest = rest[:peers], rest[peers:]
             s.order = s.skipped = 0

@@ -63,7 +63,7 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     if e.shape[1] > _PLACE and len(e):
         from scipy.spatial.transform import Rotation  # a fifth of a second, which few logs need
 
-        here, there = (Rotation.from_rotvec(v[:, _PLACE:]) for v in (x, x_des))
+        here, there = (Rotation.from_rotvec(v[:, _PLACE:].copy()) for v in (x, x_des))
         e[:, _PLACE:] = (here * there.inv()).as_rotvec()
     e *= np.array(axes)
     return e

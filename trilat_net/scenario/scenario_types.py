@@ -55,8 +55,8 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         age_ms: the age beyond which it is too old, ms; not of "glide".
         return_s: duration of the return once a fresh sample is in use, s; not of "glide".
         silence_ms: of "glide", the time without a new sample in use after which a peer is silent, ms.
-        align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; in task space m/s.
-        align_limit_rad: of "glide", the longest way that it goes by itself, rad; in task space m.
+        align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; of a place m/s.
+        align_limit_rad: of "glide", the longest way that it goes by itself, rad; of a place m.
         on_lost: of "glide", "hold": holds while a peer is silent; "degrade": goes on without a master
             that is, as long as the others reach each other.
     """
@@ -99,7 +99,7 @@ class Limits(Frozen, frozen=True):
             rule "glide" the site is in fault in its place, and the run goes on.
         tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s. Left out,
             there is none, but under the rule "glide" it is `GLIDE_TAU_RATE_NM_S`.
-        qd_des_limit_rad_s: largest speed of the reference, rad/s; in task space m/s.
+        qd_des_limit_rad_s: largest speed of the reference, rad/s; of a place m/s.
         q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is in fault.
         q_max_rad: largest angle, likewise.
     """

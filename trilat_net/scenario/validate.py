@@ -329,11 +329,6 @@ def _check_limits(scenario: Scenario, name: str) -> None:
             f"is kept under on_stale.action = 'glide' alone, and here that is {site.on_stale.action!r}",
             path=f"{path}.{stated}",
         )
-    if site.limits.qd_des_limit_rad_s is not None and site.task.space == "pose":
-        raise ScenarioError(
-            "goes along differences of coordinates, and orientations have none: leave it out",
-            path=f"{path}.qd_des_limit_rad_s",
-        )
     if not np.all(np.less(low, high)):
         raise ScenarioError("must be above q_min_rad everywhere", path=f"{path}.q_max_rad")
     start = np.array(site.q0_rad)
@@ -442,13 +437,8 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 
 def _check_glide(scenario: Scenario, name: str) -> None:
-    """Refuses a silence that is shorter than the time between two samples, and tasks with an orientation."""
+    """Refuses a silence that is shorter than the time between two samples."""
     rule, path = scenario.sites[name].on_stale, f"sites.{name}.on_stale"
-    if scenario.sites[name].task.space == "pose":
-        raise ScenarioError(
-            "glide goes along differences of coordinates, and orientations have none: choose hold",
-            path=f"{path}.action",
-        )
     slowest_hz = min(scenario.sites[one].rate_hz for one in (name, *scenario.peers(name)))
     if rule.silence_ms < 2e3 / slowest_hz:
         raise ScenarioError(

@@ -171,7 +171,7 @@ class SiteMotion:
     def follows(self) -> Following:
         """How an error of the reference becomes motion and torque of the joints."""
         at, c = self.records, self.constants
-        return follow_rows(c.arm, at.q, at.qd, c.Lambda)
+        return follow_rows(c.arm, at.q, at.qd, c.Lambda, at.rest)
 
     @cached_property
     def r(self) -> Array:

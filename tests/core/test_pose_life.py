@@ -1,0 +1,187 @@
+"""The rule `glide` of a pose, against SciPy's rotations, and joints that a task leaves free in a hold."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+import trilat_net
+from tests.core.test_task_space import POSE, build
+from tests.task_arms import planar_task, posed_arms
+from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.core.session_life import update_session_life
+from trilat_net.core.site_setup import StaleAction
+from trilat_net.core.ticks import Mode, tick_ns
+from trilat_net.core.vectors import Array, Row
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import parse_scenario
+
+SPEED = 0.8
+OWN = Rotation.from_rotvec([0.4, -0.9, 0.3])
+PEERS = Rotation.from_rotvec([-0.2, 0.5, 1.4])
+
+
+def drive(spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks: int) -> dict[str, Array]:
+    """The reference of a site whose peers turn with this angular velocity, and are heard in some ticks.
+
+    While they are not, their reference stays where it was, as a sample in use does.
+    """
+    arrays = build(POSE)
+    s: Row = arrays.site[0]
+    link: Row = arrays.links[0]
+    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = StaleAction.GLIDE, 20_000_000, SPEED, 3.0
+    s.x[3:] = OWN.as_rotvec()
+    rows = []
+    last = 0
+    for k in range(ticks):
+        t_ns = tick_ns(k, 1000)
+        if any(first <= k < end for first, end in heard):
+            link.used, link.used_ns, last = k, t_ns, k
+        s.q_followed, s.qd_followed = np.array(s.q_des), np.array(s.qd_des)
+        there = Rotation.from_rotvec(np.array(spin) * last * 1e-3) * PEERS
+        s.q_des[:3], s.qd_des[:3] = 0.05, 0.0
+        s.q_des[3:], s.qd_des[3:] = there.as_rotvec(), spin
+        update_session_life(t_ns, tick_ns(k - 1, 1000), s, arrays.links)
+        rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *there.as_rotvec()))
+    table = np.array(rows)
+    return {"mode": table[:, 0], "turn": table[:, 1:4], "rate": table[:, 4:7], "peers": table[:, 7:]}
+
+
+def steps(turns: Array) -> Array:
+    """The turn from each orientation to the next."""
+    found = Rotation.from_rotvec(turns.copy())
+    return np.asarray((found[1:] * found[:-1].inv()).as_rotvec())
+
+
+def test_the_way_to_peers_at_rest_is_the_shortest_turn_at_the_speed_that_is_allowed() -> None:
+    run = drive((0.0, 0.0, 0.0), [(50, 5000)], 4000)
+    aligning = np.flatnonzero(run["mode"] == Mode.RETURN)
+    way = (OWN * PEERS.inv()).magnitude()
+    takes = 1.5 * way / SPEED * 1e3
+    assert len(aligning) == int(np.ceil(takes))
+    x = (aligning - aligning[0]) / takes
+    wanted = Slerp([0.0, 1.0], Rotation.concatenate([OWN, PEERS]))(x * x * (3.0 - 2.0 * x))
+    found = Rotation.from_rotvec(run["turn"][aligning])
+    assert (found * wanted.inv()).magnitude().max() <= 1e-12
+    assert np.linalg.norm(run["rate"], axis=1).max() == pytest.approx(SPEED, rel=1e-6)
+
+
+def test_neither_the_orientation_nor_its_velocity_jumps_while_peers_turn_and_fall_silent() -> None:
+    """Waits, aligns, follows, holds, and is back over a long way: to the third order of the tick."""
+    spin = (0.7, -1.1, 0.6)
+    run = drive(spin, [(50, 3500), (4600, 9000), (9100, 12000)], 12000)
+    modes = run["mode"].astype(int)
+    edges = [modes[0], *modes[1:][np.diff(modes) != 0]]
+    cycle = [Mode.RETURN, Mode.RUN, Mode.HOLD]
+    assert edges == [Mode.WAITING, *cycle, *cycle, *cycle[:2]]
+    frozen = np.zeros(len(modes) - 1, dtype=bool)
+    for end in (3500, 9000):  # samples in use stay for 20 ms, and so do their velocities
+        frozen[end - 1 : end + 20] = True
+    off = steps(run["turn"]) - 0.5e-3 * (run["rate"][1:] + run["rate"][:-1])
+    assert np.abs(off)[~frozen].max() <= 1e-7
+    jumps = np.linalg.norm(np.diff(run["rate"], axis=0), axis=1)
+    assert jumps.max() <= np.linalg.norm(spin) / 20.0 + 1e-9
+    holding = modes == Mode.HOLD
+    assert np.abs(run["rate"][3600:4600]).max() == 0.0
+    assert np.ptp(run["turn"][3600:4600], axis=0).max() <= 1e-12
+    assert holding[3521:4600].all()
+    following = modes == Mode.RUN
+    apart = Rotation.from_rotvec(run["turn"][following]) * Rotation.from_rotvec(run["peers"][following]).inv()
+    assert apart.magnitude().max() <= 1e-12
+
+
+def test_farther_than_the_limit_is_not_gone_to_by_the_whole_turn() -> None:
+    """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
+    arrays = build(POSE)
+    s: Row = arrays.site[0]
+    link: Row = arrays.links[0]
+    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = StaleAction.GLIDE, 20_000_000, SPEED, 1.1
+    link.used, link.used_ns = 0, 0
+    s.q_des[3:] = 1.8 / np.sqrt(3.0)
+    update_session_life(0, 0, s, arrays.links)
+    assert s.mode == Mode.WAITING
+    s.q_des[3:] = 1.0 / np.sqrt(3.0)
+    update_session_life(tick_ns(1, 1000), 0, s, arrays.links)
+    assert s.mode == Mode.RETURN
+
+
+GLIDES = """[on_stale]
+action = "glide"
+align_speed_rad_s = 1.0
+align_limit_rad = 2.5
+[link]
+outages_s = [[2.0, 4.0]]"""
+
+
+@functools.cache
+def posed() -> Log:
+    """Three arms that agree on a pose, none of which hears another from 2.04 to 4.04 s."""
+    text = posed_arms(5.0).replace("[link]", GLIDES)
+    far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
+    text = text.replace("posture_rate_1_s = 0.6, scale = 1.1 }", f"posture_rate_1_s = 0.6, {far}")
+    return trilat_net.simulate(parse_scenario(text))
+
+
+@pytest.mark.long
+def test_arms_that_hold_a_pose_hold_their_joints_and_follow_again() -> None:
+    """The elbow of the slave is on its way to a posture on the other side as the links are cut.
+
+    What is left is gravity that is not learnt yet.
+    """
+    log = posed()
+    for site in log.sites:
+        part = log[site]
+        held = np.flatnonzero(part.mode == "hold")
+        assert held[0] == 2060
+        assert set(part.mode[-200:]) == {"run"}
+        at_entry, kept = part.q[held[0]], part.q[3500:4040]
+        assert np.abs(kept - at_entry).max() <= 0.03, site
+        assert np.abs(part.qd[4000:4040]).max() <= 0.01, site
+    before = np.abs(log["s"].qd[1900:2000]).max()
+    assert before > 0.05
+    assert verify(log).identical == 15_000
+
+
+@pytest.mark.long
+def test_a_held_arm_of_seven_joints_comes_back_when_it_is_pushed_where_the_task_leaves_it_free() -> None:
+    """By the motion in which its end effector stays; it goes back by 2/s, to within the lag at the cut."""
+    text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
+    text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
+    text = text.replace("Gamma = 1.0\n", "").replace("posture_rate_1_s = 0.6", "posture_rate_1_s = 0.0")
+    push = '{ kind = "pulse", start_s = 2.5, end_s = 3.5, peak_nm = [7.7, 0.0, -5.8, 0.0, -1.9, 0.0, 1.7] }'
+    text = text.replace("q0_rad = [0.0, -0.3", f"hands = [{push}]\nq0_rad = [0.0, -0.3")
+    part = trilat_net.simulate(parse_scenario(text))["s"]
+    first = int(np.argmax(part.mode == "hold"))
+    assert np.abs(part.q[5999] - part.q[first]).max() <= 0.02
+    off = np.abs(part.q[first:6000] - part.q[5999]).max(axis=1)
+    assert off.max() >= 0.2
+    assert np.abs(part.x[first:6000, :3] - part.x[first, :3]).max() <= 0.03
+    falls = off[3700 - first : 4700 - first : 500]
+    assert falls[:-1] / falls[1:] == pytest.approx(np.exp(0.5 * 2.0), rel=0.2)
+
+
+@pytest.mark.long
+def test_references_of_poses_in_a_session_are_integrals_of_their_velocities() -> None:
+    """Where the reference is that of peers alone it is so only once these agree, see `task_space`."""
+    log = posed()
+    for site in log.sites:
+        part = log[site]
+        rest = np.isin(part.mode, ["waiting", "hold"])
+        rest = rest[1:] & rest[:-1]
+        off = steps(part.q_des[:, 3:]) - 0.5e-3 * (part.qd_des[1:, 3:] + part.qd_des[:-1, 3:])
+        assert np.abs(off)[rest].max() <= 1e-9
+        assert np.linalg.norm(steps(part.q_des[:, 3:]), axis=1).max() <= 3e-3
+        assert np.abs(np.diff(part.qd_des[:, 3:], axis=0)).max() <= 0.1
+
+
+@pytest.mark.long
+def test_energies_close_over_a_hold_in_task_space_and_the_storage_falls() -> None:
+    """r has the joint pose that is held in it: V is balanced with it as with the posture."""
+    text = planar_task(4.0).replace("[link]", GLIDES.replace("[2.0, 4.0]", "[1.0, 2.5]"))
+    log = trilat_net.simulate(parse_scenario(text))
+    assert {"hold", "run", "return", "waiting"} <= set(log["s"].mode)
+    balance = compute_energy_balance(compute_site_energies(log))
+    assert np.abs(balance.residual).max() <= 1e-5 * np.abs(balance.V).max()
+    assert verify(log).differing == 0
