@@ -57,30 +57,30 @@ def _run(folder: "BenchFolder", jobs: int | None, on: str | None) -> "BenchResul
 
 def bench_command(
     study: Annotated[
-        str, typer.Option("--study", metavar="full|small|round-trips", help="Which part of the suite.")
+        str, typer.Option("--study", metavar="full|small|round-trips", help="Part of the suite to run.")
     ] = "full",
-    small: Annotated[bool, typer.Option("--small", help="As --study small: some minutes.")] = False,
+    small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,
     task: Annotated[
-        str | None, typer.Option("--task", metavar="TASK,TASK...", help="Some tasks alone.")
+        str | None, typer.Option("--task", metavar="TASK,TASK...", help="Only these tasks.")
     ] = None,
-    law: Annotated[str | None, typer.Option("--law", metavar="LAW,LAW...", help="Some laws alone.")] = None,
+    law: Annotated[str | None, typer.Option("--law", metavar="LAW,LAW...", help="Only these laws.")] = None,
     link: Annotated[
         str | None, typer.Option("--link", metavar="LINK,LINK...", help="Other links, as in rtt68-loss10,4g.")
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", metavar="N", help="How many; default: the study's.")
+        int | None, typer.Option("--seeds", metavar="N", help="Number of seeds; default: the study's.")
     ] = None,
     cell: Annotated[
         str | None,
         typer.Option("--cell", metavar="TASK/LAW/LINK", help="Print the commands that make logs of a cell."),
     ] = None,
     tune: Annotated[
-        bool, _option("--tune", help="Tune the laws again, and keep their gains with the suite.")
+        bool, _option("--tune", help="Tune the laws again, and store their gains with the suite.")
     ] = False,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder; a suite in it goes on. Default: runs/bench-STUDY."
+            "--out", "-o", metavar="DIR", help="Folder; continues a suite in it. Default: runs/bench-STUDY."
         ),
     ] = None,
     jobs: options.JobsOption = None,
@@ -89,7 +89,7 @@ def bench_command(
 ) -> None:
     """Runs control laws on the same tasks over the same links: errors, effort, transparency, passivity.
 
-    Each law has the gains that one procedure found for it. What is done is kept: the same command goes on.
+    One procedure tuned the gains of every law. Finished runs are kept: the same command continues.
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
     from ..studies.bench.bench_figures import write_bench

@@ -15,11 +15,11 @@ def certify_command(
 ) -> None:
     """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
 
-    Nothing is executed, but with --own-laws the energies of laws from outside; docs/certificate.md defines
-    every word and every key of the JSON.
+    Executes nothing but, with --own-laws, the methods by which imported laws declare their energies.
+    docs/certificate.md defines every word and every key of the JSON.
 
-    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged), or open, each with
-    its word and reasons. 2: no log.
+    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
+    the reasons. 2: no log.
     """
     from ..theory.end_pose import certify_with_roots
 

@@ -63,14 +63,14 @@ def compare_command(
     ] = None,
     tune: Annotated[
         str | None,
-        _option("--tune", metavar="SCENARIO", help="Compare laws instead, tuned alike in this scenario."),
+        _option("--tune", metavar="SCENARIO", help="Compare tuned control laws in this scenario instead."),
     ] = None,
     law: Annotated[
         str | None,
         _option(
             "--law",
             metavar="LAW,LAW...",
-            help="Which laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
+            help="Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
             "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
             "authority, impedance, smith.",
         ),
@@ -101,9 +101,9 @@ def compare_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares logs side by side, with the differences of their experiments; or laws, each tuned alike.
+    """Compares logs and the differences of their experiments; or control laws, all tuned by one procedure.
 
-    Nothing is ranked: arms that hang, or that nobody pushed, have small errors too.
+    Ranks nothing: arms that hang, or that no operator moves, also have small errors.
     """
     if tune is None:
         for name in options.given_options(context):

@@ -24,7 +24,7 @@ def linear_command(
     pose: Annotated[
         str | None,
         typer.Option(
-            "--pose", metavar="Q1,Q2,...", help="All sites here, rad, estimates true; default: a run's end."
+            "--pose", metavar="Q1,Q2,...", help="Pose of all sites, rad, true theta; default: a run's end."
         ),
     ] = None,
     roots: Annotated[int, typer.Option("--roots", metavar="N", help="Number of roots to print.")] = 6,
@@ -33,10 +33,10 @@ def linear_command(
         typer.Option("--over", metavar="KEY=LOW:HIGH", help="Find where stability changes; repeatable."),
     ] = None,
     ports: Annotated[
-        bool, typer.Option("--ports/--no-ports", help="Impedances that operators feel, and passivity.")
+        bool, typer.Option("--ports/--no-ports", help="Print what operators feel, and passivity.")
     ] = True,
     picture: Annotated[
-        Path | None, typer.Option("--figure", metavar="FILE", help="Draw it: .png, .svg or .pdf.")
+        Path | None, typer.Option("--figure", metavar="FILE", help="Draw a figure: .png, .svg or .pdf.")
     ] = None,
     what: Annotated[
         LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")

@@ -64,7 +64,7 @@ SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the sce
 DurationOption = Annotated[
     float | None, typer.Option("--duration", metavar="S", help="Override the duration of the run, s.")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace what exists.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ListenOption = Annotated[
     list[str] | None,
     typer.Option("--listen", metavar="EP", help="Endpoint to listen at, as in tcp/192.0.2.1:7447."),
@@ -171,11 +171,11 @@ class Accepted(StrEnum):
 
 AcceptOption = Annotated[
     list[Accepted] | None,
-    typer.Option("--accept", help="Exit 0 for a bounded oscillation, or an open judgement, too; repeatable."),
+    typer.Option("--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."),
 ]
 OwnLawsOption = Annotated[
     bool,
-    typer.Option("--own-laws", help="Run code of laws from outside for the energies that they declare."),
+    typer.Option("--own-laws", help="Run code of imported laws for the energies that they declare."),
 ]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
@@ -189,7 +189,7 @@ MinCoverageOption = Annotated[
     typer.Option(
         "--min-coverage",
         metavar="SHARE",
-        help="Least share of every site's ticks that must be judged to pass.",
+        help="Least share of every site's ticks that must be judged for a pass.",
         callback=check_range(0.0, 1.0, "a share"),
     ),
 ]

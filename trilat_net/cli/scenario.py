@@ -41,7 +41,7 @@ def scenario_check_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks a scenario, and prints its consequences."""
+    """Checks a scenario, and prints what follows from it."""
     from ..scenario.describe import describe_scenario
     from ..scenario.validate import check_outside_arms
 

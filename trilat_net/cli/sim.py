@@ -22,7 +22,7 @@ def sim_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs the same experiment in virtual time, into the same kind of log."""
+    """Runs an experiment in virtual time, and writes the same kind of log as a live session."""
     from ..execution.virtual import record_virtual
     from ..log.ros2.viz_channels import parse_viz_rate
 

@@ -281,7 +281,7 @@ def sweep_command(
         typer.Option(
             "--longest",
             metavar="S",
-            help="Longest run of an undecided cell, s; default: eight times the others.",
+            help="Longest run of an undecided cell, s; default: eight times the duration.",
         ),
     ] = None,
     output: Annotated[
@@ -306,7 +306,7 @@ def sweep_command(
     on: options.OnOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Run an oversized sweep.")] = False,
     overrides: options.SetOption = None,
-    mapped: Annotated[bool, _option("--map", help="Draw the stability map and lines of theory.")] = False,
+    mapped: Annotated[bool, _option("--map", help="Draw the stability map with theory lines.")] = False,
     width: Annotated[
         float | None,
         _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column."),
@@ -336,7 +336,7 @@ def sweep_command(
 ) -> None:
     """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
-    Finished runs are kept however the sweep ends: the same command with the same -o, or --resume, continues.
+    Finished runs are kept, however the sweep ends: --resume, or the same command with the same -o, continues.
     """
     from ..studies.sweep import open_sweep_folder, plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range

@@ -26,19 +26,19 @@ def test_command(
         list[str] | None,
         typer.Argument(
             metavar="[SCENARIO]...",
-            help="Names or paths; none: all that are shipped with \\[expect].",
+            help="Names or paths; default: all shipped scenarios with \\[expect].",
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
     live: Annotated[
         bool,
         typer.Option(
-            "--live/--virtual", help="Live over a network, one after the other, or in virtual time."
+            "--live/--virtual", help="Run live over a network, one after the other, or in virtual time."
         ),
     ] = False,
     seeds: Annotated[
         str | None,
-        typer.Option("--seeds", metavar="LIST", help="As in 1..20 or 1,5,9; default: the scenario's."),
+        typer.Option("--seeds", metavar="LIST", help="Seeds, as in 1..20 or 1,5,9; default: the scenario's."),
     ] = None,
     junit: Annotated[
         Path | None, typer.Option("--junit", metavar="FILE", help="Write the results as JUnit XML as well.")
@@ -48,7 +48,7 @@ def test_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    r"""Runs scenarios and checks their \[expect]: which held, by what margin, how to repeat the others."""
+    r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what failed."""
     from ..files import write_whole
     from ..net.clock import SystemClock
     from ..studies.executor import check_workers

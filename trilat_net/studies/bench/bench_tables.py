@@ -151,16 +151,16 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     plan = results.plan
     seeds = max(len(cell.seeds) for cell in plan.cells)
     yield f"{plan.study}: {STUDIES[plan.study].about}"
-    yield f"{len(plan.cells)} cells, {len(results.runs)} runs: one where nothing is drawn, else {seeds} seeds"
+    yield f"{len(plan.cells)} cells, {len(results.runs)} runs: one per cell without randomness, else {seeds}"
     for task in dict.fromkeys(cell.task for cell in plan.cells):
         yield f"{task}: {TASKS[task].about}"
     for law, form in list_laws(results):
         if form == "two":
-            yield f"{law} is for two sites: it runs in tasks of one user, without a second one"
+            yield f"{law} is for two sites: it runs in the tasks of one user, without the second"
     unsettled = dict.fromkeys(str(cell.tuned) for cell in plan.cells if not cell.tuned.settled)
     if unsettled:
         names = ", ".join(unsettled)
-        yield f"of these no candidate was stable at the pose, and the least error is used: {names}"
+        yield f"no candidate was stable at the pose; the gains with the least error are used: {names}"
 
 
 def tabulate_gains(results: BenchResults) -> TextTable:
