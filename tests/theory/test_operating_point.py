@@ -51,7 +51,7 @@ def test_what_varies_is_said_with_its_mean() -> None:
     [
         ({"link.model": "measured"}, ["links.", ".model", "its delay is not known"]),
         ({"sites.s.plant": "external"}, ["sites.s.plant", "plant = 'simulated'"]),
-        ({"control.law": "tests.laws:Adaptive"}, [".control.law", "an imported law", "p_d"]),
+        ({"control.law": "tests.plugged_laws:Line"}, [".control.law", "sends vectors of its own"]),
     ],
 )
 def test_what_has_no_linear_loop_is_refused(overrides: dict[str, object], facts: list[str]) -> None:

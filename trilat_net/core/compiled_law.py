@@ -293,6 +293,11 @@ class CompiledLaw:
             self._stage(k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent)
         except Exception as error:  # whatever the law raises
             raise self.find_failure(error) or error from None
+        return self.memory
+
+    @property
+    def memory(self) -> list[float]:
+        """What the law remembers now."""
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 

@@ -15,7 +15,7 @@ from .law_channel import SentVector
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import tick_ns
-from .user_law import LawInput, PeerView, UserLaw, call_law, restore_law
+from .user_law import LawInput, PeerView, UserLaw, call_law, read_memory, restore_law
 from .vectors import Array, Row, RowArray
 
 
@@ -106,6 +106,11 @@ class PlainLaw:
         self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
         self._views["theta_hat"][:], self._sent[:] = results.theta_hat, results.sent
         return results.memory
+
+    @property
+    def memory(self) -> list[float]:
+        """What the law remembers now."""
+        return read_memory(self._law)
 
     def recall(self, memory: Sequence[float]) -> None:
         """Restores the law from its memory."""

@@ -249,6 +249,12 @@ class FusedRun:
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
+    def memories(self) -> list[Array]:
+        """What the laws of sites remember after the last tick; of one that is not plugged in nothing."""
+        laws = [self._laws.get(i) for i in range(len(self._progress))]
+        return [np.array([] if law is None else law.memory, dtype=np.float64) for law in laws]
+
+    @property
     def tau_x(self) -> list[Array]:
         """The exogenous torque of each site's last record, shape (n,) each, N m."""
         return [

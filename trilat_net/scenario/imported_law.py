@@ -9,7 +9,7 @@ import ast
 import hashlib
 import importlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -277,6 +277,15 @@ def name_law_class(kind: type) -> str:
             f"%%writefile mylaws.py, and import it from there; see {find_page('own-controller.md')}"
         )
     return f"{module}:{name}"
+
+
+def name_law_classes(value: Any) -> Any:
+    """Returns a value of a scenario with every class in it by its name, see `name_law_class`."""
+    if isinstance(value, type):
+        return name_law_class(value)
+    if isinstance(value, Mapping):
+        return {key: name_law_classes(one) for key, one in value.items()}
+    return value
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import ScenarioError
 from .delay_models import DELAY_MODELS
 from .fields import TomlTable, check_keys, field_names, suggest_nearest
-from .imported_law import ImportedLaw, name_law_class
+from .imported_law import ImportedLaw, name_law_classes
 from .laws import LAWS
 from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
@@ -201,9 +201,7 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
     """Returns overrides as keys and values; a text is KEY=VALUE, whose value is TOML or a bare word."""
     if isinstance(overrides, Mapping):
-        return [
-            (key, name_law_class(one) if isinstance(one, type) else one) for key, one in overrides.items()
-        ]
+        return list(name_law_classes(overrides).items())
     pairs = []
     for text in overrides:
         key, equals, value = text.partition("=")

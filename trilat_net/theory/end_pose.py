@@ -53,7 +53,7 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _no_roots("commands changed the loop while it ran")
     scenario, mean_s = _fix_delays(log)
     try:
-        conditions = derive_operating_conditions(scenario)
+        conditions = derive_operating_conditions(scenario, own_laws=False)
         for at, age_s in mean_s.items():
             conditions.age_s[at] = age_s
         q, theta_hat = _choose_state(scenario, parts)

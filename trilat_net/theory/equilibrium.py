@@ -6,6 +6,7 @@ simulation supplies starting values only.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import msgspec
@@ -18,6 +19,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
+from ..scenario.imported_law import ImportedLaw
 from ..scenario.operators import Chirp, Multisine
 from .characteristic_roots import limit_blas_threads
 from .linear_loop import (
@@ -27,6 +29,7 @@ from .linear_loop import (
     gather_site_arguments,
     linearise_loop,
 )
+from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
     describe_switching_points,
@@ -49,6 +52,7 @@ _NEWTON_RESIDUAL = 1e-11
 _GAUSS_NEWTON_STEPS = 60
 _MAX_STEP = 0.3
 _MAX_HALVINGS = 20
+_SETTLING_TICKS = 20_000
 _FLAT = 1e-8
 """A singular value this small, relative to the largest, belongs to a direction of further equilibria."""
 
@@ -60,7 +64,7 @@ class EquilibriumRun(NamedTuple):
         at_rest: True if it ended at an equilibrium; otherwise the pose is the mean over its last quarter.
         diverged: True if a site left its limits.
         q: joint angles, shape (N, n), rad; of shorter arms followed by zeros.
-        theta_hat: estimates, shape (N, P), so as well.
+        theta_hat: estimates, shape (N, P), so as well; of a law of one's own its memory.
     """
 
     t_s: float
@@ -90,6 +94,10 @@ def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
     diverged = run.diverged_s is not None
     at_rest = not diverged and speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
     q, theta_hat = (run.q, run.theta_hat) if at_rest else (values.mean(axis=0) for values in states)
+    laws = [spec.control for spec in scenario.sites.values()]
+    if any(isinstance(law, ImportedLaw) for law in laws):
+        rows = zip(laws, theta_hat, run.memories, strict=True)
+        theta_hat = pad_rows([own if isinstance(law, ImportedLaw) else row for law, row, own in rows])
     return EquilibriumRun(run.ran_s, speed_rad_s, at_rest, diverged, q, theta_hat)
 
 
@@ -150,7 +158,7 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         loop = linearise_loop(conditions, rest, every_estimate=True)
         effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
         # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
-        free = [n for n, name in enumerate(loop.names) if ".qd" not in name and np.any(effects[n])]
+        free = [n for n, name in enumerate(loop.names) if not _is_speed(name) and np.any(effects[n])]
         step = np.zeros(len(loop.names))
         step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
         share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
@@ -164,6 +172,11 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
             break
         rest, residual = tried, after
     return rest._replace(residual=float(np.abs(residual).max()))
+
+
+def _is_speed(state: str) -> bool:
+    """True of the name of a joint's velocity, as "m1.qd2"."""
+    return state.rpartition(".")[2].rstrip("0123456789") == "qd"
 
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
@@ -293,18 +306,41 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
     """
     sites = derive_operating_conditions(scenario).sites
-    known = all(site.gains.law is Law.KNOWN and not site.actors for site in sites)
-    return predict_equilibrium(scenario) if known else find_equilibrium(scenario)
+    if any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites):
+        return find_equilibrium(scenario)
+    if all(site.gains.law is Law.KNOWN for site in sites):
+        return predict_equilibrium(scenario)
+    with suppress(ScenarioError):  # a law of one's own need not carry gravity
+        return predict_equilibrium(scenario)
+    return find_equilibrium(scenario)
 
 
 def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None = None) -> Array:
-    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters."""
-    truth = [site.theta for site in conditions.sites]
-    rows = [
-        own[: len(site.theta)] if has_estimate(site) else np.broadcast_to(site.gains.known, site.theta.shape)
-        for site, own in zip(conditions.sites, truth if theta_hat is None else theta_hat, strict=True)
-    ]
+    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters.
+
+    Of a law of one's own it is the memory, by default that at the beginning.
+    """
+    rows = []
+    for n, site in enumerate(conditions.sites):
+        given = None if theta_hat is None else theta_hat[n]
+        if isinstance(site.own, NumericLaw):
+            rows.append(site.own.complete(given))
+        elif has_estimate(site):
+            rows.append(site.theta if given is None else given[: len(site.theta)])
+        else:
+            rows.append(np.broadcast_to(site.gains.known, site.theta.shape))
     return pad_rows(rows)
+
+
+def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: int) -> Equilibrium:
+    """Returns an equilibrium with what laws of one's own remember after so many ticks at its pose."""
+    theta_hat = rest.theta_hat.copy()
+    for n, (site, x) in enumerate(
+        zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True)
+    ):
+        if isinstance(site.own, NumericLaw):
+            theta_hat[n, : len(site.own.memory)] = site.own.settle(x, ticks)
+    return rest._replace(theta_hat=theta_hat)
 
 
 def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
@@ -330,6 +366,7 @@ def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equi
     _refuse_singular_poses(conditions, rest)
     if conditions.has_forms:
         return rest
+    rest = _settle_memories(conditions, rest, _SETTLING_TICKS)
     return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
 
 
@@ -377,6 +414,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         "to the mean of its last quarter"
     )
     start = Equilibrium(end.q, _complete_estimates(conditions, end.theta_hat), how, 0.0)
+    start = _settle_memories(conditions, start, 1)
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 

@@ -21,6 +21,7 @@ from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, linearise_loop
+from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .site_dynamics import share_own_pose
@@ -189,9 +190,11 @@ def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
     """Returns an analysis as plain values."""
     names, conditions, rest = analysis.scenario.names, analysis.conditions, analysis.rest
     layouts = [site.layout for site in conditions.sites]
+    learns = [not isinstance(site.own, NumericLaw) for site in conditions.sites]
     q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
     theta_hat = [
-        own[: layout.parameters].tolist() for own, layout in zip(rest.theta_hat, layouts, strict=True)
+        own[: layout.parameters * one].tolist()
+        for own, layout, one in zip(rest.theta_hat, layouts, learns, strict=True)
     ]
     poses = dict(zip(names, (pose.tolist() for pose in analysis.end_effectors), strict=True))
     return {

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ..core.exogenous import TorqueKind
+from ..core.site_setup import Law
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
@@ -20,7 +21,7 @@ from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import choose_equilibrium, find_equilibrium, find_mean_pose, follow_equilibrium
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import has_estimate, place_arm
+from .site_dynamics import place_arm
 from .tick_map import compute_decisive_spectrum
 
 EDGE_SCAN_POINTS = 24
@@ -81,6 +82,7 @@ def find_growth_at(scenario: Scenario, q: Array, theta_hat: Array) -> float:
     NaN without such a rest. Angles have shape (N, n), rad, estimates (N, P).
     """
     try:
+        derive_operating_conditions(scenario, own_laws=False)  # the memory of such a law is not given
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "", 0.0))
         root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
     except ScenarioError:
@@ -271,6 +273,6 @@ def find_root_crossings(
 def _assume_equilibrium(scenario: Scenario, before: Equilibrium | None) -> tuple[Equilibrium, str]:
     """Returns an equilibrium without a run if possible: at the mean start pose, or near that before."""
     sites = derive_operating_conditions(scenario).sites
-    if any(map(has_estimate, sites)) and not any(site.actors for site in sites):
+    if any(site.gains.law is Law.ADAPTIVE for site in sites) and not any(site.actors for site in sites):
         return find_equilibrium(scenario, find_mean_pose(scenario)), ASSUMED_EQUILIBRIUM_REMARK
     return choose_equilibrium(scenario) if before is None else follow_equilibrium(scenario, before), ""

@@ -23,6 +23,7 @@ from scipy.linalg import block_diag, qr
 from ..core.vectors import Array
 from ..scenario import Scenario
 from ..scenario.linear_form import LinearForm, Place
+from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
     COMPLEX_STEP,
@@ -134,6 +135,11 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     reflected = [one.reflected for one in conditions.rates(arguments)]
     for x, site, felt in zip(arguments, conditions.sites, conditions.alpha @ reflected, strict=True):
         x[lay_out_arguments(site).peer_torque] = felt
+    for i, (x, site) in enumerate(zip(arguments, conditions.sites, strict=True)):
+        at, others = lay_out_arguments(site), [j for j in range(len(arguments)) if j != i]
+        for place in range(at.peers):
+            j, rest_qd = others[place], np.zeros(at.coordinates)
+            x[at.of_peer(place)] = np.r_[rest.q[j][: at.coordinates], rest_qd, -reflected[j]]
     return arguments
 
 
@@ -181,12 +187,23 @@ def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) ->
 def couple_sites(
     conditions: OperatingConditions, rest: Equilibrium, sites: list[SiteJacobian]
 ) -> dict[tuple[int, int], Array]:
-    """Returns the effect of what j sent on what comes to i, shape (3 m, 3 m), by (i, j)."""
+    """Returns the effect of what j sent on what comes to i, shape (3 m, 3 m), by (i, j).
+
+    To a law of one's own it comes once more, by itself.
+    """
     references = differentiate_references(conditions, rest)
     coupling = {}
-    for i, j in zip(*np.nonzero(conditions.alpha), strict=True):
-        share = conditions.alpha[i, j] * np.eye(sites[i].at.coordinates)
-        coupling[int(i), int(j)] = block_diag(references[int(i), int(j)], share, share)
+    for i, j in conditions.pairs:
+        at, zero = sites[i].at, np.zeros((sites[i].at.coordinates,) * 2)
+        share = conditions.alpha[i, j] * np.eye(at.coordinates)
+        whole = block_diag(references.get((i, j), zero), share, share)
+        if at.peers:
+            alone = np.zeros((at.peers, len(whole), len(whole)))
+            alone[j - (j > i)] = np.diag(
+                np.repeat([1.0, 1.0, -1.0], at.coordinates)
+            )  # tau_x is not ON its arm
+            whole = np.vstack([whole, *alone])
+        coupling[i, j] = whole
     return coupling
 
 
@@ -221,7 +238,9 @@ def differentiate_rates(
             for by in rates:
                 by[:, : at.states] += by[:, at.q_des] @ of_own
         learnt = tuple(f"theta{p + 1}" for p in range(at.parameters))
-        if not has_estimate(site):
+        if isinstance(site.own, NumericLaw):
+            jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *site.own.names))
+        elif not has_estimate(site):
             jacobian = _replace_estimate(at, rates, np.zeros((0, at.parameters)), ())
         elif site.chain is None or every_estimate:
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))

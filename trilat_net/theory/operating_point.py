@@ -29,6 +29,7 @@ from ..scenario.linear_form import LinearForm, LinearSituation
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
+from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
 
 
@@ -87,6 +88,13 @@ class OperatingConditions(NamedTuple):
         return forms
 
     @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Who follows whom, as (i, j): by a dominance factor, or since a law of one's own sees every peer."""
+        sees = np.array([isinstance(site.own, NumericLaw) for site in self.sites])[:, np.newaxis]
+        linked = (self.alpha != 0.0) | (sees & ~np.eye(len(self.alpha), dtype=bool))
+        return [(int(i), int(j)) for i, j in zip(*np.nonzero(linked), strict=True)]
+
+    @property
     def has_forms(self) -> bool:
         """True if a law has states of its own, or sends more than samples have: then time is continuous."""
         return any(form is not None for form in self.find_forms())
@@ -111,13 +119,13 @@ class OperatingConditions(NamedTuple):
         return [evaluate_site_rates(site, own) for site, own in zip(self.sites, x, strict=True)]
 
 
-def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
-    """Returns the conditions at the end of a run.
+def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) -> OperatingConditions:
+    """Returns the conditions at the end of a run; `own_laws`: the code of imported laws may run.
 
     Raises:
-        ScenarioError: a law is imported, an arm is external, or a link is measured.
+        ScenarioError: a law has no linear loop, an arm is external, or a link is measured.
     """
-    gains = _find_linear_gains(scenario)
+    gains = _find_linear_gains(scenario, own_laws=own_laws)
     notes: list[str] = []
     sites = tuple(
         _select_final_actors(scenario, name, notes)._replace(gains=gains[name]) for name in scenario.names
@@ -125,12 +133,19 @@ def derive_operating_conditions(scenario: Scenario) -> OperatingConditions:
     alpha = _final_dominance(scenario, sites, notes)
     age_s, varying = np.zeros_like(alpha), []
     laws = tuple(spec.control for spec in scenario.sites.values())
+    sites = tuple(_make_own_law(scenario, site, alpha) for site in sites)
+    codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
+    for code in filter(None, dict.fromkeys(codes)):
+        owners = ", ".join(name for name, one in zip(scenario.names, codes, strict=True) if one == code)
+        notes.append(f"{code} of {owners} is differentiated numerically, its memory too: central differences")
     notes += [law.linear_note for law in laws if isinstance(law, PluggedLaw) and law.linear_note]
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
-    links = ~np.eye(len(alpha), dtype=bool) if conditions.has_forms else alpha != 0.0
+    pairs = conditions.pairs
+    if conditions.has_forms:
+        pairs = [(i, j) for i in range(len(alpha)) for j in range(len(alpha)) if i != j]
     if conditions.has_forms:
         notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
-    for i, j in zip(*np.nonzero(links), strict=True):
+    for i, j in pairs:
         age = _final_age(scenario, scenario.names[j], scenario.names[i], notes)
         age_s[i, j] = age.mean_s
         if age.most_s > age.least_s:
@@ -152,12 +167,25 @@ def is_constant_link(link: LinkBase) -> bool:
     return link.core().kind == DelayKind.CONSTANT and not link.loss and not link.measured
 
 
-def _find_linear_gains(scenario: Scenario) -> dict[str, Gains]:
+def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
+    """Returns a site whose law, if it is imported, is made, to be asked."""
+    law, i = scenario.sites[site.name].control, scenario.names.index(site.name)
+    if not isinstance(law, ImportedLaw):
+        return site
+    try:
+        return site._replace(own=NumericLaw(site, law.code, np.delete(alpha[i], i).tolist()))
+    except ScenarioError as error:
+        raise ScenarioError(error.problem, path=error.path, source=scenario.name) from None
+
+
+def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
     """Returns the gains of every site, of a plugged law those of its small motions."""
     found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
         law, theta = spec.control, scenario.arms[name].theta
         gains = law.linear_gains(theta) if isinstance(law, PluggedLaw) else law.gains(theta)
+        if own_laws and isinstance(law, ImportedLaw):
+            gains = law.gains(theta)
         if gains is None:
             code = f"{law.code} is an imported law" if isinstance(law, ImportedLaw) else "is a law"
             why = law.explain_no_linear_form() if isinstance(law, PluggedLaw) else ""

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
+from .numeric_law import NumericLaw
 from .textbook_arm import Numbers, PlacedArm, PlacedChain, multiply_columns
 from .textbook_task import Following, follow_in_task, follow_joints, share_pose
 
@@ -31,11 +32,13 @@ class ArgumentLayout(NamedTuple):
         joints: length of each part but the estimate and what comes from peers.
         parameters: length of the estimate.
         shared: length of what comes from peers, of each of its three parts; 0: as many as there are joints.
+        peers: of a law of one's own, which sees each peer by itself too, how many there are.
     """
 
     joints: int
     parameters: int
     shared: int = 0
+    peers: int = 0
 
     @property
     def q(self) -> slice:
@@ -64,8 +67,8 @@ class ArgumentLayout(NamedTuple):
 
     @property
     def inputs(self) -> slice:
-        """What comes from peers: the reference, its derivative, and their torque."""
-        return slice(self.states, self.states + 3 * self.coordinates)
+        """What comes from peers: the reference, its derivative, and their torque; then that of each."""
+        return slice(self.states, self.states + 3 * self.coordinates * (1 + self.peers))
 
     def _input(self, place: int) -> slice:
         first = self.states + place * self.coordinates
@@ -94,11 +97,18 @@ class ArgumentLayout(NamedTuple):
     @property
     def arguments(self) -> int:
         """Length of the whole argument."""
-        return self.states + 3 * self.coordinates + self.joints
+        return self.states + 3 * self.coordinates * (1 + self.peers) + self.joints
+
+    def of_peer(self, place: int) -> slice:
+        """What came from one peer: its x, the velocity, and its exogenous torque."""
+        first = self.states + 3 * self.coordinates * (1 + place)
+        return slice(first, first + 3 * self.coordinates)
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns the layout of the arguments of a site's rates."""
+    """Returns the layout of the arguments of a site's rates; memory of a law of one's own is its estimate."""
+    if isinstance(site.own, NumericLaw):
+        return ArgumentLayout(site.layout.joints, len(site.own.memory), 0, len(site.links))
     return ArgumentLayout(site.layout.joints, site.layout.parameters, site.layout.shared)
 
 
@@ -157,9 +167,12 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     at = lay_out_arguments(site)
     arm, qd = place_arm(site, x[at.q]), x[at.qd]
     following = follow_peers(site, arm, x)
-    tau, estimate = _evaluate_law(site, arm, following, x)
     external = x[at.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
+    if isinstance(site.own, NumericLaw):
+        tau, estimate = site.own.evaluate(np.concatenate([x[: at.inputs.stop], external + held]))
+    else:
+        tau, estimate = _evaluate_law(site, arm, following, x)
     qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, tau + external + held)
     reflected = following.from_joints(external + held)
     return SiteRates(qdd, estimate, tau, external, held, following.x, following.xd, reflected)
@@ -172,7 +185,9 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """True if the site's state includes an estimate."""
+    """True if the site's state includes an estimate, or the memory of a law of one's own."""
+    if isinstance(site.own, NumericLaw):
+        return len(site.own.memory) > 0
     return site.gains.law is Law.ADAPTIVE
 
 
@@ -258,7 +273,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
         depth_m = float((np.array(actor.a) - position) @ np.array(actor.b))
         if abs(depth_m) < SWITCHING_TOLERANCE:
             yield f"{site.name} rests exactly on the surface of its wall {n + 1}: it counts as not touching"
-    if has_estimate(site):
+    if site.gains.law is Law.ADAPTIVE:
         rate = evaluate_site_rates(site, x).estimate
         unbounded = site.gains._replace(low=-np.inf, high=np.inf)
         free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate

@@ -8,7 +8,8 @@ stages in their order; a sample of tick m is in use d = max(1, ceil(T / h)) tick
 `second_order`: theta_k = theta_{k-1} + h/2 (f_{k-1} + f_k) with f the rate of the estimate, and the torque
 on the arm is 1.5 tau_k - 0.5 tau_{k-1}. With eta_k = theta_{k-1} + h/2 f_{k-1} that is
 theta_k = eta_k + h/2 f_k and eta_{k+1} = eta_k + h f_k. `digital`: theta_k = eta_k,
-eta_{k+1} = eta_k + h f_k, and the torque on the arm is tau_k.
+eta_{k+1} = eta_k + h f_k, and the torque on the arm is tau_k. The memory of a law of one's own is eta: with
+h f = m_k - m_{k-1} it is what the law makes of it.
 """
 
 import itertools
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from ..core.site_setup import Scheme, SiteSetup
+from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array
 from .characteristic_roots import (
     Complex,
@@ -57,7 +58,7 @@ class SiteTickMap(NamedTuple):
 
     Attributes:
         P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque before.
-        Q: shape (n, 3 m).
+        Q: shape (n, inputs).
         sent: its output to peers, shape (3 m, n), see `SiteJacobian.sent`.
         names: of its states.
     """
@@ -74,9 +75,14 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> 
     second = site.scheme is Scheme.SECOND_ORDER
     arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
     n = at.states + (at.joints if second else 0)
-    own, peers = np.eye(at.arguments, n), np.eye(at.arguments, 3 * at.coordinates, -at.inputs.start)
+    own, peers = (
+        np.eye(at.arguments, n),
+        np.eye(at.arguments, at.inputs.stop - at.inputs.start, -at.inputs.start),
+    )
     own[at.states :] = 0.0
-    inverse_inertia = rates.qdd[:, at.external_torque]
+    by_law = np.eye(at.joints) + rates.tau[:, at.external_torque]  # one of one's own may use what it feels
+    inverse_inertia = np.linalg.solve(by_law.T, rates.qdd[:, at.external_torque].T).T
+    trapezoid = second and site.gains.law is Law.ADAPTIVE
     zero = np.zeros((at.joints, at.joints))
     free = rates.qdd[:, arm] - inverse_inertia @ (rates.tau + rates.held)[:, arm]
     Phi, Gamma = discretise_zero_order_hold(
@@ -86,7 +92,7 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> 
     def control(by: Array) -> Array:
         """Returns the change of X by the controller, whose arguments are `by` times a vector."""
         f = rates.estimate @ by
-        tau = rates.tau @ by + (0.5 * h_s * rates.tau[:, memory] @ f if second else 0.0)
+        tau = rates.tau @ by + (0.5 * h_s * rates.tau[:, memory] @ f if trapezoid else 0.0)
         u = (1.5 if second else 1.0) * tau + rates.held @ by
         return np.vstack([Gamma @ u, h_s * f, *([tau] if second else [])])
 

@@ -1,0 +1,79 @@
+"""Laws of one's own that say once more what built-in ones do, and a few that go beyond them."""
+
+import trilat_net
+from trilat_net.core.user_law import LawContext, LawInput
+
+
+class PD:
+    """`p_d`, by the reference."""
+
+    remembers: tuple[str, ...] = ()
+    tune = {"K": (5.0, 50.0, "N m/rad"), "d": (1.0, 20.0, "N m s/rad")}  # noqa: RUF012
+
+    def __init__(self, _facts: LawContext, K: float = 10.0, d: float = 3.0, gravity: float = 1.0) -> None:
+        self.K, self.d, self.gravity = K, d, gravity
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            pull = self.K * (now.q_des[i] - now.q[i])
+            now.tau[i] = self.gravity * now.gravity[i] + pull - self.d * now.qd[i]
+
+
+@trilat_net.compiled
+class CompiledPD(PD):
+    """The same, compiled."""
+
+
+class PeerPD(PD):
+    """`p_d`, by what each peer sent."""
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            now.tau[i] = now.gravity[i] - self.d * now.qd[i]
+            for peer in now.peers:
+                now.tau[i] += peer.alpha * self.K * (peer.q[i] - now.q[i])
+
+
+class Backward(PD):
+    """P+d with the velocity of the angle that it saw a tick ago."""
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            speed = (now.q[i] - now.q_before[i]) / now.h_s
+            now.tau[i] = now.gravity[i] + self.K * (now.q_des[i] - now.q[i]) - self.d * speed
+
+
+class Remembering(Backward):
+    """The same, and it remembers that angle itself."""
+
+    remembers = ("last",)
+
+    def __init__(self, facts: LawContext, K: float = 10.0, d: float = 3.0) -> None:
+        super().__init__(facts, K, d)
+        self.last = [0.0] * facts.joints
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            last = self.last[i] if now.k else now.q[i]
+            self.last[i] = now.q[i]
+            speed = (now.q[i] - last) / now.h_s
+            now.tau[i] = now.gravity[i] + self.K * (now.q_des[i] - now.q[i]) - self.d * speed
+
+
+class Forces:
+    """`four_channel`: positions, forces of the peers by the sum or each by itself, and its own."""
+
+    remembers = ()
+
+    def __init__(
+        self, _facts: LawContext, K: float = 100.0, B: float = 20.0, own: float = 0.5, alone: bool = False
+    ) -> None:
+        self.K, self.B, self.own, self.alone = K, B, own, alone
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            felt = now.felt[i]
+            if self.alone:
+                felt = -sum(peer.alpha * peer.tau_x[i] for peer in now.peers)
+            now.tau[i] = now.gravity[i] + self.K * (now.q_des[i] - now.q[i]) + felt - self.own * now.tau_x[i]
+            now.tau[i] += self.B * (now.qd_des[i] - now.qd[i])

@@ -1,0 +1,99 @@
+"""Laws of one's own, linearised by differences: their roots are those of built-in laws that they repeat."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.laws import Adaptive
+from tests.own_laws import PD, Backward, CompiledPD, Forces, PeerPD, Remembering
+from tests.plugged_laws import Line
+from tests.unit_arm import CLAMP
+from trilat_net.core.vectors import Array
+from trilat_net.errors import ScenarioError
+from trilat_net.theory.characteristic_roots import Spectrum
+from trilat_net.theory.equilibrium import find_equilibrium, follow_equilibrium
+from trilat_net.theory.linear_analysis import LinearAnalysis
+from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.theory.tick_map import compute_decisive_spectrum
+
+POSE = (0.3, 0.2)
+
+
+def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
+    return tn.linear(name, {"control": {"law": law, **more.pop("gains", {})}, **more}, pose=POSE, ports=False)
+
+
+def roots(found: Spectrum) -> Array:
+    return np.array([one.s for one in found.roots])
+
+
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+@pytest.mark.parametrize("law", [PD, PeerPD])
+def test_p_d_of_ones_own_has_the_roots_of_p_d(law: type, scheme: str) -> None:
+    ours, theirs = linear("p_d", scheme=scheme), linear(law, scheme=scheme)
+    assert ours.sampled is not None
+    assert theirs.sampled is not None
+    assert np.allclose(roots(theirs.sampled), roots(ours.sampled), rtol=0.0, atol=1e-8)
+    assert np.allclose(roots(theirs.continuous), roots(ours.continuous), rtol=0.0, atol=1e-8)
+    assert theirs.margin.intervals[0].high_s == pytest.approx(ours.margin.intervals[0].high_s, rel=1e-8)
+    assert f"tests.own_laws:{law.__name__} of m1, m2, s is differentiated numerically" in theirs.notes[0]
+
+
+def test_forces_are_those_of_the_four_channel_law() -> None:
+    """Of the peers, in sum and each by itself, and of its own arm: with an operator at a master."""
+    hand = [{**CLAMP, "to_rad": list(POSE), "stiffness_nm_rad": 40.0, "damping_nm_s_rad": 5.0}]
+    held: dict[str, Any] = {"sites.m1.hands": hand, "link.delay_ms": 30.0}
+    ours = linear("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
+    for alone in (False, True):
+        theirs = linear(Forces, gains={"alone": alone}, **held)
+        assert np.allclose(roots(theirs.continuous), roots(ours.continuous), rtol=1e-7, atol=1e-7)
+
+
+def test_the_tick_before_is_memory_like_any_other() -> None:
+    kept, remembered = linear(Backward), linear(Remembering)
+    assert kept.sampled is not None
+    assert remembered.sampled is not None
+    assert np.allclose(roots(kept.sampled), roots(remembered.sampled), rtol=0.0, atol=1e-6)
+    late, exact = roots(kept.sampled)[0], roots(linear("p_d").decisive)[0]
+    assert 1e-4 < abs(late - exact) < 1e-2, "half a tick of delay in the damping"
+
+
+@pytest.mark.parametrize("scheme", ["second_order", "digital"])
+def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
+    """The adaptive law that users write keeps Y'r and the estimates, by the trapezoid rule."""
+    more = {"scheme": scheme, "link.delay_ms": 0.0}
+    ours, theirs = (tn.load_scenario("free", {**more, "control.law": law}) for law in ("adaptive", Adaptive))
+    rest = find_equilibrium(ours, POSE)
+    memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
+    same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
+    found = roots(compute_decisive_spectrum(derive_operating_conditions(theirs), same, 6, 8))
+    known = roots(compute_decisive_spectrum(derive_operating_conditions(ours), rest, 6, 8))
+    same_bits = scheme == "second_order"
+    assert np.allclose(found[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2)
+
+
+def test_what_is_not_linearised_is_refused() -> None:
+    with pytest.raises(ScenarioError, match="sends vectors of its own"):
+        linear(Line)
+
+
+def test_a_certificate_runs_no_code_from_outside() -> None:
+    log = tn.simulate("two_sites", {"control.law": PD}, duration_s=0.1)
+    found = tn.certify(log).roots
+    assert found is not None
+    assert "imported law" in found.text
+
+
+@pytest.mark.long
+def test_a_run_decays_as_its_roots_say() -> None:
+    """From the poses of its sites to rest, and its edge lies where that of p_d does."""
+    own = tn.linear(
+        "p_d_margin", {"control.law": CompiledPD, "control.d": 1.5}, over=["control.d=0.3:3"], ports=True
+    )
+    built_in = tn.linear("p_d_margin", {"control.d": 1.5}, over=["control.d=0.3:3"], ports=True)
+    assert own.scans[0].edges[0].value == pytest.approx(built_in.scans[0].edges[0].value, rel=1e-5)
+    assert np.allclose(own.rest.q, built_in.rest.q, atol=1e-5)
+    assert own.ports is not None
+    assert own.ports.verdict == "stable"

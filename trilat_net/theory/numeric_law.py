@@ -1,0 +1,154 @@
+"""A law of one's own as a function of numbers, and its derivatives by central differences.
+
+    (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque ON the arm)
+
+Invariant: it is asked as its site asks it, through the rows from which it gets its input, without the clamp.
+Its memory m is its own, and the torque and the angles of the tick before if it uses these. In continuous time
+m' = (m_k - m_{k-1}) / h, which the sampled loop puts back to the memory that it was.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..core import chain_stages, two_link_stages
+from ..core.compiled_law import plug_law
+from ..core.site_arrays import build_site_arrays
+from ..core.site_setup import SiteSetup
+from ..core.ticks import tick_ns
+from ..core.user_law import LawContext, UserLaw, read_memory
+from ..core.vectors import Array
+from ..errors import ScenarioError
+from .textbook_arm import Numbers
+
+_TICK = 1_000_000
+"""The tick at which a law is asked: late, so that nothing begins."""
+_STEP = 1e-5
+"""Half the difference of an argument, relative to its size, at least 1: errors are about 1e-10."""
+_STILL = 1e-14
+"""A step by which memory is at rest."""
+
+
+class NumericLaw:
+    """An imported law of a site, made; called, it returns it, as a factory does.
+
+    Args:
+        setup: of its site.
+        code: what the scenario calls it.
+        shares: the dominance factors of the peers in force.
+
+    Attributes:
+        names: of the numbers of its memory, as "error[1]".
+        memory: the same at the beginning.
+
+    Raises:
+        ScenarioError: it sends vectors of its own, or follows with an end effector.
+    """
+
+    def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
+        path = f"sites.{setup.name}.control.law"
+        if setup.layout.sent:
+            raise ScenarioError(f"{code} sends vectors of its own, which are not linearised", path=path)
+        if setup.layout.task:
+            raise ScenarioError(f"{code} is linearised between joint angles alone", path=path)
+        assert setup.own is not None
+        self._law, self._layout = setup.own(setup.law_context()), setup.layout
+        self._arrays, self._rate_hz = build_site_arrays(setup), setup.rate_hz
+        self._arrays.site["tau_limit"], self._arrays.links["alpha"] = np.inf, shares
+        self._asked = plug_law(self._law, setup, self._arrays, np.zeros(0))
+        own = np.array(read_memory(self._law))
+        self._own, self._keeps_past = len(own), False
+        self.memory, self.names = own, _name_memory(self._law, self._own)
+        arguments = self._lay_out(setup)
+        past = np.r_[np.zeros(self._layout.joints), setup.q0]
+        self._keeps_past = not np.array_equal(self._ask(arguments, past), self._ask(arguments, past + 1e-3))
+        if self._keeps_past:
+            self.memory = np.r_[own, past]
+            for name in ("tau_before", "q_before"):
+                self.names += tuple(f"{name}[{joint + 1}]" for joint in range(self._layout.joints))
+
+    def __call__(self, _context: LawContext) -> UserLaw:
+        """Returns the law."""
+        return self._law
+
+    def complete(self, memory: Array | None) -> Array:
+        """Returns all of the memory: that at the beginning, with as much of it as is given."""
+        whole: Array = self.memory.copy()
+        if memory is not None:
+            known = len(whole) if len(memory) >= len(whole) else self._own
+            whole[:known] = memory[:known]
+        return whole
+
+    def settle(self, x: Array, ticks: int) -> Array:
+        """Returns its memory after so many ticks of the same arguments, or once it stays as it is."""
+        memory = slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
+        x = x.copy()
+        for _ in range(ticks):
+            step = self._evaluate(x)[1] / self._rate_hz
+            x[memory] += step
+            if not np.abs(step).max(initial=0.0) > _STILL:
+                break
+        return x[memory]
+
+    def _lay_out(self, setup: SiteSetup) -> Array:
+        """Returns the arguments at the start."""
+        n, start = self._layout.joints, np.array(setup.q0)
+        rest = np.zeros(n)
+        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
+        return np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
+
+    def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
+        """Returns the torque and the rate of the memory; of complex columns with their derivatives."""
+        if not np.iscomplexobj(x):
+            return self._evaluate(x)
+        at: Array = x.real[:, 0]
+        torque, rate = self._evaluate(at)
+        columns = []
+        for n, value in enumerate(at):
+            half = _STEP * max(1.0, abs(float(value)))
+            up, down = at.copy(), at.copy()
+            up[n], down[n] = value + half, value - half
+            ends = [np.concatenate(self._evaluate(one)) for one in (up, down)]
+            columns.append((ends[0] - ends[1]) / (up[n] - down[n]))
+        whole = np.concatenate([torque, rate])[:, np.newaxis] + 1j * (np.stack(columns, axis=1) @ x.imag)
+        return whole[: len(torque)], whole[len(torque) :]
+
+    def _evaluate(self, x: Array) -> tuple[Array, Array]:
+        n, memory = (
+            self._layout.joints,
+            slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory)),
+        )
+        past = x[memory][self._own :] if self._keeps_past else np.r_[np.zeros(n), x[:n]]
+        after = self._ask(x, past)
+        torque, kept = after[:n], after[n:]
+        now = np.r_[kept, torque, x[:n]] if self._keeps_past else kept
+        return torque, (now - x[memory]) * self._rate_hz
+
+    def _ask(self, x: Array, past: Array) -> Array:
+        """Returns the torque and the law's own memory after a tick; `past`: torque and angles before it."""
+        a, n = self._arrays, self._layout.joints
+        s: Any = a.site[0]
+        start = 2 * n + len(self.memory)
+        s.q[:], s.qd[:] = x[:n], x[n : 2 * n]
+        s.q_des[:], s.qd_des[:], s.felt[:] = np.split(x[start : start + 3 * n], 3)
+        s.tau_before[:], s.q_before[:] = np.split(past, 2)
+        s.on_arm[:] = x[len(x) - n :]
+        a.links["used"] = _TICK - 1
+        for j, link in enumerate(a.links):
+            first = start + 3 * n * (1 + j)
+            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(x[first : first + 3 * n], 3)
+        if a.chain is None:
+            two_link_stages.update_errors(s)  # with the regressor, which gravity is taken from
+        else:
+            chain_stages.place_chain(s, a.chain)
+        self._asked.recall(x[2 * n : 2 * n + self._own].tolist())
+        memory = self._asked.compute(_TICK, tick_ns(_TICK, self._rate_hz))
+        return np.concatenate([s.tau, memory])
+
+
+def _name_memory(law: Any, count: int) -> tuple[str, ...]:
+    """Returns the names of what a law remembers."""
+    if callable(getattr(law, "memory", None)):
+        return tuple(f"memory[{n + 1}]" for n in range(count))
+    return tuple(f"{name}[{n + 1}]" for name in law.remembers for n in range(np.size(getattr(law, name))))
