@@ -6,8 +6,9 @@ when none arrive any more. One that the arm cannot have made since the last is d
 of which nothing is heard is not held.
 """
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import LifeReason, Mode, PlantState
@@ -30,7 +31,8 @@ SILENCE_LIMIT_NS = 200_000_000
 SWITCH_SILENCE_NS = 100_000_000
 """A dead-man switch of which nothing is heard for longer is not held."""
 STARTS_KEPT = 64
-"""Of so many earlier holders no message has an effect any more."""
+"""So many programs at a switch are told apart by their messages; of more one is forgotten, rather one that
+does not hold it."""
 START_POSE_TOLERANCE_RAD = 0.01
 """A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000
@@ -158,33 +160,67 @@ class ExternalArm:
         return all(abs(a - b) <= most for a, b, most in zip(q, self.newest.q, way, strict=True))
 
 
-class DeadManSwitch:
-    """The dead-man switch of one arm: held by one program at a time, until it lets go or is silent.
+@dataclass
+class _Holder:
+    """A start of a program at the switch.
 
-    Its age is taken on the own clock from where a message came in, so that a site that slept is not held.
+    Attributes:
+        n: of its newest message.
+        pressed_ns: when it last said that it is held; None: it is not.
+        counts: False while it is held since before another one let go.
+    """
+
+    n: int = -1
+    pressed_ns: int | None = None
+    counts: bool = True
+
+
+class DeadManSwitch:
+    """The dead-man switch of one arm: whoever holds it and lets go, or is silent, stops the arm.
+
+    Who held it besides has then to let go and press anew. Its age is taken on the own clock from where a
+    message came in, so that a site that slept is not held.
     """
 
     def __init__(self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]) -> None:
         self._site, self._ring, self._clock, self._dropped = site, ring, clock, dropped
-        self._boot = self._n = -1
-        self._held_ns: int | None = None
-        self._earlier: deque[int] = deque(maxlen=STARTS_KEPT)
+        self._programs: dict[int, _Holder] = {}
+        self._was_let_go = False
+
+    def _holders(self) -> list[_Holder]:
+        return [one for one in self._programs.values() if one.counts and one.pressed_ns is not None]
+
+    def _is_silent(self, one: _Holder) -> bool:
+        return one.pressed_ns is None or self._clock.monotonic_ns() - one.pressed_ns > SWITCH_SILENCE_NS
 
     @property
     def held(self) -> bool:
-        """True if somebody held it a moment ago."""
-        return self._held_ns is not None and self._clock.monotonic_ns() - self._held_ns <= SWITCH_SILENCE_NS
+        """True if all that hold it said so a moment ago, and there is one."""
+        holders = self._holders()
+        return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
         """Takes in the messages that have arrived."""
         while (message := self._ring.poll()) is not None:
             self._take(*message)
+        self._let_go([one for one in self._holders() if self._is_silent(one)])
 
     def take_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
         """Returns what the switch asks of its site, which is in some mode for a reason; "": nothing."""
-        if self.held:
-            return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
-        return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
+        was_let_go, self._was_let_go = self._was_let_go, False
+        if was_let_go or not self.held:
+            return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
+        return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
+
+    def _let_go(self, released: Sequence[_Holder]) -> None:
+        """Takes note of holders that let go or are silent: the others count no more until they press anew."""
+        if not released:
+            return
+        for one in released:
+            one.pressed_ns = None
+        for other in self._holders():
+            other.counts = False
+        self._was_let_go = True
 
     def _take(self, payload: bytes, came_ns: int) -> None:
         try:
@@ -192,14 +228,20 @@ class DeadManSwitch:
         except WireError as error:
             self._dropped[error.reason] += 1
             return
-        another = message.boot != self._boot
-        if message.site != self._site or message.boot in self._earlier or (another and self.held):
+        if message.site != self._site:
             self._dropped["stranger"] += 1
             return
-        if another:
-            self._earlier.append(self._boot)
-            self._boot, self._n = message.boot, -1
-        if message.n <= self._n:
+        if message.boot not in self._programs and len(self._programs) >= STARTS_KEPT:
+            idle = (boot for boot, one in self._programs.items() if one.pressed_ns is None)
+            del self._programs[next(idle, next(iter(self._programs)))]
+        one = self._programs.setdefault(message.boot, _Holder())
+        if message.n <= one.n:
             self._dropped["old switch message"] += 1
             return
-        self._n, self._held_ns = message.n, came_ns if message.held else None
+        one.n = message.n
+        if message.held:
+            one.pressed_ns = came_ns
+            return
+        if one.counts and one.pressed_ns is not None:
+            self._let_go([one])
+        one.pressed_ns, one.counts = None, True

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import os
 import re
 import runpy
 import sys
@@ -17,6 +18,7 @@ import trilat_net
 from tests.log_editing import recorded
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
+from trilat_net.net.arm_port import EnablePort
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
@@ -125,6 +127,43 @@ def test_a_stick_moves_the_target_and_a_button_lets_go(monkeypatch: pytest.Monke
     run_with_hand("gamepad_hand.py", arm, monkeypatch)
     assert arm.target == pytest.approx((1.3, 0.5), abs=0.012)
     assert arm.released > 0
+
+
+class PressedSwitch:
+    """Stands in for the switch of an arm, whose session ends after some rounds."""
+
+    def __init__(self, rounds: int) -> None:
+        self.said: list[bool] = []
+        self.rounds = rounds
+
+    @property
+    def over(self) -> bool:
+        return len(self.said) >= self.rounds
+
+    def send(self, *, held: bool) -> None:
+        self.said.append(held)
+
+
+def test_a_switch_is_held_while_keys_come_and_let_go_after_a_gap() -> None:
+    """Rounds of 20 ms: a key in the 5th, another in the 30th; each counts for 0.6 s."""
+    hold = runpy.run_path(str(LOOK.with_name("dead_man_switch.py")))["hold"]
+    switch = PressedSwitch(100)
+    keys = (b"x" if n in (5, 30) else b"" for n in itertools.count())
+    hold(switch, lambda: next(keys), lambda: len(switch.said) * 0.02, 0.599)
+    assert switch.said == [5 <= n < 60 for n in range(101)]
+
+
+def test_a_switch_is_let_go_at_once_when_the_program_before_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = os.pipe()
+    os.write(ends[1], b"pressed\n")
+    os.close(ends[1])
+    switch = PressedSwitch(1000)
+    monkeypatch.setattr(EnablePort, "connected", lambda *_: nullcontext(switch))
+    monkeypatch.setattr(sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"])
+    with os.fdopen(ends[0]) as there:
+        monkeypatch.setattr(sys, "stdin", there)
+        runpy.run_path(str(LOOK.with_name("dead_man_switch.py")), run_name="__main__")
+    assert switch.said == [True, False]
 
 
 @pytest.mark.long

@@ -84,11 +84,10 @@ ROWS = (
     Row(
         "F6",
         "a link is cut in one direction",
-        "who hears nothing holds; both say so",
+        "who hears nothing holds within 21 ticks; both say so",
         ("cut one way",),
         (_LEAVING + "a_site_says_that_a_peer_that_it_hears_does_not_hear_it",),
-        (),
-        "with real cables both directions are cut (F5)",
+        ("a_way_that_is_cut_in_one_direction_is_held_at_both_ends",),
     ),
     Row(
         "F7",

@@ -72,6 +72,20 @@ class Machines:
         for here, there in ((one, other), (other, one)):
             self.ip(here, "route", "del", "blackhole", self.address[there])
 
+    def deafen(self, name: str, other: str, *, ends: bool = False) -> None:
+        """Cuts the way from another machine to this one, and not the way back; or `ends` that.
+
+        Raises:
+            NoNamespaces: there is no `iptables`, or it may not.
+        """
+        rule = ("iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
+        try:
+            done = subprocess.run([*self.on(name), *rule], capture_output=True, text=True, timeout=30)
+        except FileNotFoundError as error:
+            raise NoNamespaces(str(error)) from None
+        if done.returncode:
+            raise NoNamespaces(f"{' '.join(rule)}: {done.stderr.strip()}")
+
     def remove(self) -> None:
         """Removes all; cables go with their machines."""
         for space in self._spaces.values():

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from tests.faults.invariants import SILENT_TICKS, count_silence, stretches
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_log
+from trilat_net.net.clock import SystemClock
 
 from .processes import PAPER, Session, Stage
 
@@ -20,8 +22,28 @@ GLIDE = (
 JOINS, FOLLOWS = "joins the running session", " s, run, "
 
 
+def pause(time_s: float) -> None:
+    """Lets a session go on for a time."""
+    clock = SystemClock()
+    clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+
+
+def ticks_to_hold(log: Log) -> dict[str, list[int]]:
+    """Of every hold of each site, how many ticks after its last sample in use it began."""
+    found: dict[str, list[int]] = {site: [] for site in log.sites}
+    for site, holds in found.items():
+        for stretch in stretches(log[site].states):
+            before = ""
+            for state, silent in count_silence(stretch):
+                assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (site, state.tick)
+                if state.mode == "hold" != before:
+                    holds.append(silent)
+                before = state.mode
+    return found
+
+
 def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
-    """The paper's session, of which one site after the other is killed and started again."""
+    """The paper's session: one site after the other is killed and started again, then one stopped for 1 s."""
     session = Session(stage, "paper", PAPER, "--duration", "600", *GLIDE)
     session.all()
     session.begun()
@@ -35,6 +57,10 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
         session.processes[victim] = started
         started.prints(JOINS)
         started.prints(FOLLOWS)
+    session.processes["s"].signal(signal.SIGSTOP)
+    pause(1.0)
+    session.processes["s"].signal(signal.SIGCONT)
+    pause(4.0)
     for name in PAPER:
         session.processes[name].signal(signal.SIGINT)
     assert [session.processes[name].code() for name in PAPER] == [130] * 3
@@ -61,6 +87,10 @@ def test_a_killed_site_started_again_follows_within_two_seconds(victims: Sequenc
     took_s = engaged_after_s(log)
     assert len(took_s) == len(victims)
     assert max(took_s) <= 2.0, took_s
+    holds = ticks_to_hold(log)
+    assert len(holds["m2"]) >= len(victims) + 1  # and once for who was stopped
+    assert min(map(len, holds.values())) >= 2
+    assert max(max(found) for found in holds.values()) <= SILENT_TICKS + 1
     for site in log.sites:
         assert log.missing(site) == 0
         if site not in victims:

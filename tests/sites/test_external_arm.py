@@ -16,6 +16,7 @@ from sites.external_arm import (
     HELD_SILENCE_NS,
     MEASUREMENTS_KEPT,
     SILENCE_LIMIT_NS,
+    STARTS_KEPT,
     SWITCH_SILENCE_NS,
     DeadManSwitch,
     ExternalArm,
@@ -270,24 +271,32 @@ def test_a_switch_is_for_an_arm_outside_alone() -> None:
         load_scenario("two_sites", {"sites.s.arm.dead_man": True})
 
 
-def test_a_switch_is_held_by_one_program_until_it_lets_go_or_is_silent() -> None:
-    clock, dropped = ManualClock(), Counter[str]()
-    ring = StampingRing(clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
-    switch = DeadManSwitch("s", ring, clock, dropped)
+class Switch:
+    """A switch, and programs that say whether they hold it."""
 
-    def hear(boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0) -> bool:
-        clock.sleep_until(clock.monotonic_ns() + after_ns)
-        ring.take(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
-        switch.poll()
-        return switch.held
+    def __init__(self) -> None:
+        self.clock, self.dropped = ManualClock(), Counter[str]()
+        self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+        self.switch = DeadManSwitch("s", self.ring, self.clock, self.dropped)
 
+    def hear(self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0) -> bool:
+        """Hears of one program; returns whether it is held then."""
+        self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
+        self.ring.take(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
+        self.switch.poll()
+        return self.switch.held
+
+
+def test_a_switch_is_held_until_who_holds_it_lets_go_or_is_silent() -> None:
+    one = Switch()
+    switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
     assert switch.take_order(Mode.RUN, LifeReason.START) == "released"
     assert switch.take_order(Mode.FAULT, LifeReason.START) == ""
     assert not hear(1, 0, site="m")
     assert hear(1, 5)
     assert switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
     assert switch.take_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
-    assert hear(2, 0, held=False)  # another one has no effect
+    assert hear(2, 0, held=False)  # of one that does not hold it
     clock.sleep_until(clock.monotonic_ns() + SWITCH_SILENCE_NS)
     assert switch.held
     assert not hear(1, 5, after_ns=1)  # said before
@@ -295,10 +304,51 @@ def test_a_switch_is_held_by_one_program_until_it_lets_go_or_is_silent() -> None
     assert hear(1, 6)
     assert not hear(1, 7, held=False)
     assert hear(2, 1)
-    assert not hear(1, 8, after_ns=SWITCH_SILENCE_NS + 1)  # of an earlier holder nothing counts any more
     ring.take(b"garbage")
     switch.poll()
-    assert dropped == {"stranger": 3, "old switch message": 1, "malformed": 1}
+    assert one.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
+
+
+@pytest.mark.parametrize("first", [1, 2])
+def test_of_two_that_hold_a_switch_whoever_lets_go_stops_the_arm(first: int) -> None:
+    """The other one has to let go and press anew: a hand-over goes by way of a stop."""
+    one, other = Switch(), 3 - first
+    assert one.hear(1, 0)
+    assert one.hear(2, 0)
+    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == ""
+    assert not one.hear(first, 1, held=False)
+    assert not one.hear(other, 1)  # it still holds
+    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not one.hear(other, 2)
+    assert not one.hear(other, 3, held=False)
+    assert one.hear(other, 4)
+    assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+
+
+def test_of_two_that_hold_a_switch_the_silence_of_one_stops_the_arm() -> None:
+    """As its program crashed; nor does one go on that lets go and presses within a tick."""
+    one = Switch()
+    assert one.hear(1, 0)
+    for n in range(4):
+        assert one.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
+    assert not one.hear(2, 4, after_ns=1)
+    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert not one.hear(2, 5)
+    assert not one.hear(2, 6, held=False)
+    assert one.hear(2, 7)
+    assert not one.hear(2, 8, held=False)
+    assert one.hear(2, 9)
+    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+
+
+def test_many_that_do_not_hold_a_switch_make_nobody_forgotten_who_does() -> None:
+    one = Switch()
+    assert one.hear(0, 0)
+    for boot in range(1, 2 * STARTS_KEPT):
+        assert one.hear(boot, 0, held=False)
+    assert not one.hear(0, 0, after_ns=SWITCH_SILENCE_NS + 1)  # said before
+    assert one.dropped == {"old switch message": 1}
 
 
 @pytest.mark.long
