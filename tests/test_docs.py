@@ -3,8 +3,6 @@
 import ast
 import math
 import re
-import shlex
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import get_args
@@ -14,7 +12,6 @@ import pytest
 from recorder import backfill, record_process, session_recording
 from recorder.play import pace
 from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
-from tests.cli.running import parses
 from trilat_net.analysis import arm_rows, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
@@ -212,30 +209,6 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
     for name, rest in names:
         known = name in files or any(one.startswith(name) if rest else one == name for one in functions)
         assert known, name
-
-
-def commands(page: Path) -> Iterator[list[str]]:
-    """Yields the commands of a page that are written out, without what stands for something else."""
-    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    lines = re.findall(r"^(?: {4})?(?:\$ )?(trilat [^\n]*)$", text, re.MULTILINE)
-    for line in lines:
-        words = shlex.split(line.partition("   ")[0].replace("…", "..."), comments=True)
-        if not any(re.search(r"\.\.\.|\b[A-Z]{3,}\b|^\[|[|<>&]", word) for word in words):
-            yield words
-
-
-WRITTEN = [(page.name, words) for page in PAGES for words in commands(page)]
-
-
-@pytest.mark.parametrize(
-    "words", [words for _, words in WRITTEN], ids=[f"{p}: {shlex.join(w)}" for p, w in WRITTEN]
-)
-def test_a_command_on_a_page_parses_as_it_is_written(words: list[str]) -> None:
-    parses(words)
-
-
-def test_most_pages_have_commands() -> None:
-    assert len(WRITTEN) > 60
 
 
 def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> None:

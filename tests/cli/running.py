@@ -5,6 +5,7 @@ import io
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -44,11 +45,17 @@ class Done:
             assert fact in self.err, self
 
 
+@cache
+def whole_command() -> Any:
+    """`trilat` with all of its commands; to make it takes a while."""
+    return get_command(app)
+
+
 def parses(words: list[str]) -> None:
     """A command line, `trilat` included, has a command, and no option or argument that this does not take."""
     program, *rest = words
     assert program == "trilat"
-    command: Any = get_command(app)
+    command: Any = whole_command()
     while hasattr(command, "commands"):
         command = command.commands[rest.pop(0)]
     with command.make_context(command.name, rest) as context:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.json_outline import is_documented
 from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
@@ -133,7 +134,8 @@ def test_the_facts_are_json_and_name_the_command() -> None:
     assert told["command"] == build_margin_command(asked(), WITHIN)
     assert told["command"].endswith("--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005")
     (place,) = told["places"]
-    assert place["link.delay_ms"] == 100.0
+    assert place.pop("link.delay_ms") == 100.0
+    assert is_documented("sweep --margin", told)
     assert place["edges"] == [{"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}]
 
 

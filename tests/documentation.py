@@ -1,0 +1,108 @@
+"""The blocks of the documentation: which there are, and what a test does with each.
+
+Invariant: a block of a language, or of commands, is run by `tests/test_documentation.py`, or it stands in
+ELSEWHERE with the test that runs it, or in NOT_RUN with the reason; the others are formulas and listings.
+"""
+
+import re
+import shlex
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))]
+_BLOCK = re.compile(
+    r"^```(?P<language>\w*)\n(?P<fenced>.*?)^```$|(?P<indented>(?:^ {4}[^\n]*\n(?:\n(?= {4}))?)+)",
+    re.DOTALL | re.MULTILINE,
+)
+_PROGRAM = re.compile(r"(?:\$ )?(?:[A-Z]+=\S+ )?(trilat|make|docker|dask|export|uvx|pip) ")
+_CODE = re.compile(r"(?:from|import) \w+")
+
+
+class Block(NamedTuple):
+    """A block of a page: "python", "toml", "sh" for commands, or "" for what is only shown."""
+
+    page: str
+    language: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """Its page and its first line."""
+        return f"{self.page}: {self.text.splitlines()[0].strip()}"
+
+
+@cache
+def find_blocks(page: str) -> tuple[Block, ...]:
+    """Returns the blocks of a page, in order."""
+    blocks = []
+    for found in _BLOCK.finditer((ROOT / page).read_text(encoding="utf-8")):
+        text = found["fenced"] if found["fenced"] is not None else _unindent(found["indented"])
+        stated = found["language"] or ""
+        guessed = "sh" if _PROGRAM.match(text) else "python" if _CODE.match(text) else ""
+        blocks.append(Block(page, guessed if stated == "" else stated.replace("text", ""), text))
+    return tuple(blocks)
+
+
+def _unindent(text: str) -> str:
+    return re.sub(r"^ {4}", "", text, flags=re.MULTILINE).rstrip() + "\n"
+
+
+def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
+    """Yields the words of every command of a block, and the lines of output that the block shows of it.
+
+    What stands in [--brackets] may be given, and is.
+    """
+    lines = re.sub(r"\[(--[^\]]*)\]", r"\1", text.replace("\\\n", " ")).splitlines()
+    shows = any(line.startswith("$ ") for line in lines)
+    made: list[tuple[list[str], list[str]]] = []
+    for line in lines:
+        if shows and not line.startswith("$ "):
+            if line.strip() != "...":
+                made[-1][1].append(" ".join(line.split("   #")[0].split()))
+            continue
+        parts = re.split(r"  {2,}(?=[a-z])", line.removeprefix("$ "))[0].split(" && ")
+        made.extend((words, []) for part in parts if (words := shlex.split(part, comments=True)))
+    yield from made
+
+
+ELSEWHERE = {
+    "README.md: $ make demo": "tests/live/test_demo.py",
+    "docs/bench.md: trilat bench --small": "tests/cli/test_benches.py",
+    "docs/external-arm.md: from trilat_net.net.arm_port import ArmPort": "tests/sites/test_external_arm.py",
+    "docs/external-arm.md: from trilat_net.net.arm_port import Enable": "tests/sites/test_external_arm.py",
+    "docs/lab.md: trilat": "tests/test_lab.py",
+    "docs/live-hands.md: import trilat_net": "tests/live/test_hands.py",
+    "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
+    "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",
+    "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "tests/studies/sweep/test_confirmation.py",
+    "docs/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
+    "docs/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
+    "docs/network.md: trilat ping --answer": "tests/sites/test_network_benchmark.py",
+    "docs/network.md: trilat ping --session": "tests/live/test_clocks.py",
+    "docs/network.md: trilat site m2 --scenario glide.toml": "tests/live/test_returning.py",
+    "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
+    "docs/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
+    "docs/sweep.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
+}
+"""Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
+
+NOT_RUN = {
+    "docs/maps/contact.md: trilat sweep contact": "1 640 runs: minutes; it draws the page itself",
+    "docs/maps/jitter.md: trilat sweep jitter": "2 200 runs: minutes; it draws the page itself",
+    "docs/maps/p_d.md: trilat sweep p_d_margin --duration 20 --over": "1 640 runs: minutes; it draws it",
+    "docs/maps/p_d.md: trilat sweep p_d_margin --duration 20 --longest": "of 320 s; see test_page_numbers.py",
+    "docs/maps/p_d.md: trilat sweep p_d_margin --duration 40": "of 640 s; see test_page_numbers.py",
+    "docs/maps/round-trips.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws the page itself",
+    "docs/maps/tick-rate.md: trilat sweep free": "870 runs: minutes; it draws the page itself",
+    "docs/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
+}
+"""Beginnings of blocks of which only the words are checked, with the reason."""
+
+
+def find_exception(block: Block) -> str:
+    """Returns the test or the reason of a block that is not run here; "" if it is."""
+    tables = {**ELSEWHERE, **NOT_RUN}
+    return next((why for name, why in tables.items() if block.name.startswith(name)), "")

@@ -1,0 +1,278 @@
+"""The blocks of the documentation: each runs and gives what stands beside it, or there is a reason."""
+
+import re
+import shutil
+import tomllib
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from importlib import resources
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+
+import trilat_net as tn
+from tests.cli.running import parses, started, trilat
+from tests.documentation import (
+    ELSEWHERE,
+    NOT_RUN,
+    PAGES,
+    ROOT,
+    Block,
+    find_blocks,
+    find_exception,
+    read_commands,
+)
+from tests.golden.surface import all_options
+from tests.scenario.test_measured_traces import irtt
+
+BLOCKS = [block for page in PAGES for block in find_blocks(page)]
+SCENARIOS = resources.files("trilat_net") / "scenarios"
+OPTIONS = all_options()
+
+
+def test_every_exception_is_one_and_its_test_is_there() -> None:
+    for name, why in {**ELSEWHERE, **NOT_RUN}.items():
+        assert sum(block.name.startswith(name) for block in BLOCKS) >= 1, name
+        assert (ROOT / why).is_file() or why in NOT_RUN.values(), why
+    assert not ELSEWHERE.keys() & NOT_RUN.keys()
+
+
+def test_every_block_is_run_or_there_is_a_reason() -> None:
+    runs = {"sh": SESSION_PAGES | COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
+    known = [block for block in BLOCKS if block.language]
+    assert len(known) > 60
+    assert not [b.name for b in known if b.page not in runs[b.language] and not find_exception(b)]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_command_parses_as_it_is_written(page: str) -> None:
+    for block in find_blocks(page):
+        for words, _ in read_commands(block.text) if block.language == "sh" else ():
+            if words[0] == "trilat":
+                parses(words)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_command_in_a_sentence_is_one_and_has_these_options(page: str) -> None:
+    for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
+        words = re.findall(r"[^\s\[\]|,()]+", text)
+        (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
+        below = [one for known, one in OPTIONS.items() if known.startswith(name)]
+        known = {option for one in below for option in one} | {"--help", "--version", "--install-completion"}
+        given = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert not given - known, text
+
+
+# --- settings ---------------------------------------------------------------------------------------------
+
+SCENARIO_OF = {
+    "docs/arms.md": "six_joints",
+    "docs/external-arm.md": "two_sites",
+    "docs/links.md": "paper",
+    "docs/live-hands.md": "play",
+    "docs/metrics.md": "free",
+    "docs/own-controller.md": "paper",
+    "docs/sweep.md": "free",
+}
+"""By page the scenario into which its settings are put."""
+
+
+def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
+    both = dict(base)
+    for key, value in more.items():
+        nested = isinstance(value, dict) and isinstance(both.get(key), dict)
+        both[key] = merge(both[key], value) if nested else value
+    return both
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "toml"], ids=lambda block: block.name)
+def test_settings_make_a_scenario(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = block.text
+    if block.page == "docs/metrics.md":  # each line is one way to push
+        for line in text.splitlines():
+            hands = tomllib.loads(line)
+            assert tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
+        return
+    if text.startswith("name"):
+        (tmp_path / "mine.toml").write_text(write_own_arm(tmp_path, text))
+        assert tn.load_scenario(tmp_path / "mine.toml").names == ("m", "s")
+        return
+    if block.page == "docs/own-controller.md":
+        (tmp_path / "mylaws.py").write_text(find_blocks(block.page)[0].text)
+    base = tomllib.loads((SCENARIOS / f"{SCENARIO_OF[block.page]}.toml").read_text(encoding="utf-8"))
+    stated = tomllib.loads(text)
+    (tmp_path / "arm6.urdf").write_text((SCENARIOS / "arm6.urdf").read_text(encoding="utf-8"))
+    (tmp_path / "whole.toml").write_text(tomli_w.dumps(merge(base, stated)))
+    scenario = tn.load_scenario(tmp_path / "whole.toml")
+    for key in ("arm", "on_stale"):
+        if key in stated:
+            assert all(getattr(site, key) is not None for site in scenario.sites.values())
+
+
+def write_own_arm(folder: Path, text: str) -> str:
+    """Puts an arm of the package in place of a robot's file that is not shipped; returns the scenario."""
+    shutil.copy(str(SCENARIOS / "arm6.urdf"), folder / "ur5_robot.urdf")
+    return text.replace('"tool0"', '"flange"')
+
+
+# --- commands ---------------------------------------------------------------------------------------------
+
+SESSION_PAGES = {"README.md"}
+COMMAND_PAGES = {
+    "docs/arms.md",
+    "docs/errata.md",
+    "docs/fair-comparison.md",
+    "docs/lab.md",
+    "docs/linear.md",
+    "docs/links.md",
+    "docs/rerun.md",
+    "docs/sweep.md",
+}
+SHORTER = {"compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]}
+"""What is added to a command that else would take minutes."""
+OF_RUNS = {"docs/rerun.md": "paper"}
+"""Pages whose blocks are about run.mcap, and its scenario."""
+
+
+def prepare(page: str, folder: Path) -> None:
+    """Makes the files that a page takes for granted."""
+    if page in OF_RUNS:
+        trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
+    if page == "docs/links.md":
+        irtt(folder, zipped=True)
+    if page == "docs/arms.md":
+        (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))
+        (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", sorted(COMMAND_PAGES - {"docs/lab.md"}))
+def test_the_commands_of_a_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
+    prepare(page, tmp_path)
+    for block in find_blocks(page):
+        if block.language != "sh" or find_exception(block):
+            continue
+        for words, shown in read_commands(block.text):
+            done = trilat(*words[1:], *SHORTER.get(words[1], []), cwd=tmp_path)
+            assert done.code in (0, 1), (words, done)
+            printed = " ".join((done.out + done.err).split())
+            for line in shown:
+                assert line in printed, (words, line, done)
+
+
+@pytest.mark.long
+@pytest.mark.live
+def test_the_sessions_of_the_readme_run(tmp_path: Path) -> None:
+    """Four terminals as the page has them, for 2 s, and then its Python on the log that they left."""
+    (block,) = (b for b in find_blocks("README.md") if b.text.startswith("trilat record"))
+    short = ("--set", "duration_s=2")
+    processes = [
+        started(*words[1:], *(short if words[1] == "site" else ()), cwd=tmp_path)
+        for words, _ in read_commands(block.text)
+    ]
+    for process in processes:
+        said = process.communicate(timeout=120)
+        assert process.returncode == 0, said
+    printed = run_python("README.md", tmp_path)
+    assert "6000/6000 records" in printed
+    assert printed.startswith("1.999 ")
+
+
+# --- Python -----------------------------------------------------------------------------------------------
+
+PYTHON_PAGES = {
+    "README.md",
+    "docs/certificate.md",
+    "docs/linear.md",
+    "docs/own-controller.md",
+    "docs/ports.md",
+    "docs/python.md",
+    "docs/rerun.md",
+    "docs/sweep.md",
+}
+AT_HAND = {
+    "docs/certificate.md": "import numpy as np\nfrom trilat_net.core.law_energy import *\n",
+    "docs/rerun.md": "import trilat_net\n",
+}
+"""What a page takes for granted in its code."""
+
+
+def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
+    """Runs the code of a page in a folder, in one namespace; returns what it prints."""
+    space: dict[str, Any] = {"__name__": "page"} if names is None else names
+    printed = StringIO()
+    with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for code in (AT_HAND.get(page, ""), *(b.text for b in find_blocks(page) if b.language == "python")):
+            exec(compile(code, page, "exec"), space)
+    return printed.getvalue()
+
+
+def check_linear(printed: str, names: dict[str, Any]) -> None:
+    page = (ROOT / "docs/linear.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| roots \| (.+) \|$", page, re.MULTILINE)
+    table = [cell for row in rows for cell in row.split(" | ")]
+    assert [line.split()[3] for line in printed.splitlines()] == table
+    assert names["find_linear_edge"]
+
+
+def check_ports(_: str, names: dict[str, Any]) -> None:
+    page = (ROOT / "docs/ports.md").read_text(encoding="utf-8")
+    call = re.search(r"`print\(\*(describe_ports\(.+\)), sep=.*`", page)
+    (shown,) = (block.text for block in find_blocks("docs/ports.md") if block.text.startswith("Ports of"))
+    assert "\n".join(eval(call[1], names)).startswith(shown.rstrip())
+
+
+def check_energies(_: str, names: dict[str, Any]) -> None:
+    """A line that carries 2 N m for a second gave, and took, 2 J."""
+    u = {"u": np.full((1000, 1), 2.0)}
+    peers = [SimpleNamespace(sent=u, received=u)]
+    found = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
+    assert found.gave[0][-1] == pytest.approx(2.0)
+    assert found.took[0][-1] == pytest.approx(2.0)
+
+
+def check_rerun(_: str, names: dict[str, Any]) -> None:
+    error = names["again"].sites["s"].error_rms_rad
+    page = (ROOT / "docs/rerun.md").read_text(encoding="utf-8")
+    assert f"(before={error.before:.4f}, after={error.after:.4f})" in page
+
+
+CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
+    "docs/linear.md": check_linear,
+    "docs/ports.md": check_ports,
+    "docs/certificate.md": check_energies,
+    "docs/rerun.md": check_rerun,
+}
+"""By page what it says of the results of its code."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", sorted(PYTHON_PAGES - {"README.md", "docs/sweep.md"}))
+def test_the_code_of_a_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
+    prepare(page, tmp_path)
+    names: dict[str, Any] = {"__name__": "page"}
+    printed = run_python(page, tmp_path, names)
+    CHECKS.get(page, lambda *_: None)(printed, names)
+
+
+@pytest.mark.long
+def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
+    over = ["--over", "link.delay_ms=0,100", "--over", "control.d=0.2,3", "--duration", "2", "--jobs", "1"]
+    trilat("sweep", "p_d_margin", *over, cwd=tmp_path).succeeds()
+    names: dict[str, Any] = {"__name__": "page"}
+    run_python("docs/sweep.md", tmp_path, names)
+    assert len(names["results"].rows) == len(names["plan"].cells)
+
+
+@pytest.mark.long
+def test_what_the_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
+    trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
+    (shown,) = (b.text for b in find_blocks("docs/certificate.md") if b.text.startswith("ok   stable"))
+    assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())

@@ -1,0 +1,165 @@
+"""The release: one version, workflows whose steps are commands that exist, a wheel that installs and runs."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.cli.running import parses
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+PINNED = re.compile(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
+VERSION = PROJECT["project"]["version"]
+RELEASE: dict[Any, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    used = re.findall(r"uses: (.+)$", text, re.MULTILINE)
+    assert used
+    assert not [one for one in used if not PINNED.fullmatch(one)]
+    stated = yaml.safe_load(text)
+    assert stated["permissions"] == {"contents": "read"}
+    for job in stated["jobs"].values():
+        assert job["timeout-minutes"] <= 30
+        assert all(("uses" in step) != ("run" in step) for step in job["steps"])
+        for step in job["steps"]:
+            if step.get("uses", "").startswith("actions/checkout@"):
+                assert step["with"] == {"persist-credentials": False}
+    assert "secrets." not in text
+
+
+def test_what_the_workflows_run_is_there() -> None:
+    for path in WORKFLOWS:
+        for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values():
+            for line in (step["run"] for step in job["steps"] if "run" in step):
+                words = line.split()
+                if words[0].startswith(".ci/"):
+                    assert os.access(ROOT / words[0], os.X_OK), line
+                elif words[0] in PROJECT["project"]["scripts"] and words[1:] != ["--version"]:
+                    parses(["trilat", *words[1:]])
+                else:
+                    assert words[0] in ("python", "check-wheel-contents", "twine", "trilat-net"), line
+
+
+def test_it_is_built_once_installed_everywhere_and_then_published_without_a_secret() -> None:
+    jobs = RELEASE["jobs"]
+    assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
+    assert [jobs[name].get("needs") for name in ("build", "install", "publish")] == [None, "build", "install"]
+    assert jobs["publish"]["environment"]["name"] == "pypi"
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+    assert [name for name in jobs if "permissions" in jobs[name]] == ["publish"]
+    assert not any("checkout" in step.get("uses", "") for step in jobs["publish"]["steps"])
+    stated = [one.rpartition(" ")[2] for one in PROJECT["project"]["classifiers"] if ":: 3." in one]
+    assert jobs["install"]["strategy"]["matrix"]["python"] == stated
+    assert PROJECT["project"]["requires-python"] == f">={stated[0]}"
+
+
+def check_release(tag: str, folder: Path) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, ROOT / ".ci" / "check-release", tag, folder], capture_output=True, text=True
+    )
+
+
+def test_a_tag_that_is_not_the_version_is_refused(tmp_path: Path) -> None:
+    for name in ("pyproject.toml", "CITATION.cff"):
+        shutil.copy(ROOT / name, tmp_path)
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    (tmp_path / "CHANGELOG.md").write_text(changes.replace("## Unreleased", f"## {VERSION} (2026-12-01)", 1))
+    assert check_release(f"v{VERSION}", tmp_path).returncode == 0
+    assert len(check_release("v99.0.0", tmp_path).stderr.splitlines()) == 3
+    (tmp_path / "CHANGELOG.md").write_text(changes)
+    refused = check_release(f"v{VERSION}", tmp_path)
+    assert (refused.returncode, "CHANGELOG.md" in refused.stderr) == (1, "Unreleased" in changes)
+
+
+def test_both_names_of_the_program_are_one() -> None:
+    """`uvx trilat-net` runs the script that bears the name of the package."""
+    scripts = PROJECT["project"]["scripts"]
+    assert scripts["trilat-net"] == scripts["trilat"]
+    (made,) = {one.value for one in entry_points(group="console_scripts") if one.name == "trilat"}
+    assert made == scripts["trilat"]
+
+
+def run(*words: object, cwd: Path, **more: str) -> str:
+    """Runs a program outside of the checkout; returns what it printed."""
+    bare = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL"))}
+    done = subprocess.run(
+        [str(word) for word in words], cwd=cwd, env={**bare, **more}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.mark.long
+def test_the_wheel_of_the_sdist_is_whole_and_its_first_command_runs(tmp_path: Path) -> None:
+    """Without a network: what the program needs is of this environment, the program the wheel's alone."""
+    source = tmp_path / "source"
+    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True).stdout
+    for name in filter(None, tracked.decode().split("\0")):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
+    build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
+    run(sys.executable, "-c", build, "build_sdist", tmp_path, cwd=source)
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (unpacked,) = (tmp_path / "unpacked").iterdir()
+    run(sys.executable, "-c", build, "build_wheel", tmp_path, cwd=unpacked)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    packages = ("trilat_net", "sites", "recorder", "live")
+    code = {str(one.relative_to(ROOT)) for name in packages for one in (ROOT / name).rglob("*.py")}
+    assert code <= names
+    assert {name.split("/")[0] for name in names if "." not in name.split("/")[0]} == set(packages)
+    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "clean", cwd=tmp_path)
+    clean = tmp_path / "clean" / "bin"
+    install = ["-m", "pip", "--python", clean / "python", "install", "--no-deps", "--no-index", wheel]
+    run(sys.executable, *install, cwd=tmp_path)
+    (packages_of,) = (tmp_path / "clean" / "lib").glob("python3*/site-packages")
+    own = next(Path(path) for path in sys.path if path.endswith("site-packages"))
+    for entry in own.iterdir():  # all that is installed here but the program
+        if "trilat" not in entry.name and entry.suffix != ".pth":
+            (packages_of / entry.name).exists() or (packages_of / entry.name).symlink_to(entry)
+    where = run(clean / "python", "-c", "import trilat_net; print(trilat_net.__file__)", cwd=tmp_path)
+    assert where.startswith(str(packages_of))
+    for name in PROJECT["project"]["scripts"]:
+        assert run(clean / name, "--version", cwd=tmp_path) == f"trilat-net {VERSION}\n"
+    run(clean / "trilat-net", "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)
+    assert "2000/2000 records identical" in run(clean / "trilat", "verify", "first.mcap", cwd=tmp_path)
+
+
+@pytest.mark.long
+def test_the_packagers_find_nothing(tmp_path: Path) -> None:
+    tools = {name: shutil.which(name) for name in ("check-wheel-contents", "twine", "pyproject-build")}
+    if missing := [name for name, path in tools.items() if path is None]:
+        pytest.skip(f"there is no {', '.join(missing)} here; the release workflow has them")
+    source = tmp_path / "source"
+    run("git", "clone", "-q", "--local", ROOT, source, cwd=tmp_path)
+    run(tools["pyproject-build"], "--no-isolation", "-o", tmp_path / "dist", source, cwd=tmp_path)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    run(tools["check-wheel-contents"], wheel, cwd=source)
+    run(tools["twine"], "check", "--strict", *(tmp_path / "dist").iterdir(), cwd=tmp_path)
+
+
+def test_to_import_the_package_imports_none_of_what_takes_time() -> None:
+    """The bar is 30 ms: what it imports beyond an interpreter's start are a few modules of the library."""
+    code = "import sys; before = set(sys.modules); import trilat_net; print(*(set(sys.modules) - before))"
+    made = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True)
+    extra = {name.partition(".")[0] for name in made.stdout.split()} - {"trilat_net"}
+    assert extra <= sys.stdlib_module_names
+    assert len(made.stdout.split()) < 60
