@@ -20,7 +20,9 @@ GOLDEN_LOG = Path(__file__).parents[1] / "golden" / "live-paper.mcap"
 NO_RESULT = {
     *(f"trilat {name}" for name in ("site", "record", "watch", "router", "log view")),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
-    *(f"trilat {name}" for name in ("scenario show", "scenario new", "keys new", "keys pair")),  # files
+    *(
+        f"trilat {name}" for name in ("scenario show", "scenario new", "new law", "keys new", "keys pair")
+    ),  # files
 }
 """Commands that print what they do, and find nothing."""
 
