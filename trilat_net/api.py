@@ -263,12 +263,12 @@ def linear(
 
 
 def sweep(
-    scenario: str | Path,
+    scenario: AnyScenario,
     over: Sequence[str] = (),
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     seeds: int | Sequence[int] = 1,
-    laws: Sequence[str] = (),
+    laws: Sequence[str | type] = (),
     duration_s: float | None = None,
     longest_s: float | None = None,
     out: str | Path | None = None,
@@ -282,11 +282,11 @@ def sweep(
     2
 
     Args:
-        scenario: the name of a shipped scenario, or a path.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         over: the axes, as in `["link.delay_ms=0:1600:50"]`.
         set: what is to be changed everywhere, as in `{"control.Kd": 5}`.
         seeds: how many, or which.
-        laws: names of laws to sweep besides.
+        laws: names of laws, or classes, to sweep besides.
         duration_s: how long a cell runs at first, s.
         longest_s: how long at most, s; by default eight times that.
         out: folder of the results; a sweep in it is continued. By default the next free runs/sweep-NAME-N.
@@ -308,14 +308,14 @@ def sweep(
 
 
 def margin(
-    scenario: str | Path,
+    scenario: AnyScenario,
     along: str,
     over: Sequence[str] = (),
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     tolerance: float = 0.005,
     seeds: int | Sequence[int] = 1,
-    laws: Sequence[str] = (),
+    laws: Sequence[str | type] = (),
     duration_s: float | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -327,13 +327,13 @@ def margin(
     [False]
 
     Args:
-        scenario: the name of a shipped scenario, or a path.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         along: the key and its range, as in "control.d=0.2:3".
         over: axes at every point of which it is searched, as in `["link.delay_ms=100,200"]`.
         set: what is to be changed everywhere.
         tolerance: how wide an edge may be, relative to its value.
         seeds: how many, or which.
-        laws: names of laws to search besides.
+        laws: names of laws, or classes, to search besides.
         duration_s: how long a run is at first, s.
         jobs: how many processes; None for one per core.
         on: what runs them instead: a Dask scheduler's address or an executor.
@@ -357,8 +357,8 @@ def margin(
 
 
 def tune(
-    scenario: str | Path,
-    laws: Sequence[str] = (),
+    scenario: AnyScenario,
+    laws: Sequence[str | type] = (),
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     budget: int = 64,
@@ -377,8 +377,8 @@ def tune(
     ['p_d']
 
     Args:
-        scenario: the name of a shipped scenario, or a path.
-        laws: which laws; none means all that take any number of sites.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        laws: which laws, by names or as classes; none means all that take any number of sites.
         set: overrides, as in `{"link.delay_ms": 100}`.
         budget: candidates per law.
         seed: the seed of the search.

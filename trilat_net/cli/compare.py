@@ -72,7 +72,7 @@ def compare_command(
             metavar="LAW,LAW...",
             help="Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
             "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
-            "authority, impedance, smith.",
+            "authority, impedance, smith, and your own, as in mylaws:Law.",
         ),
     ] = None,
     budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,

@@ -103,7 +103,7 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = _import_class(self.code, f"{path}.law")
+            kind = import_law_class(self.code, f"{path}.law")
             _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
@@ -237,7 +237,7 @@ def _find_spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def _import_class(code: str, path: str) -> Any:
+def import_law_class(code: str, path: str) -> Any:
     """Returns the class of a law from its file as it is now; refuses a file that does not define it."""
     module, _, name = code.partition(":")
     file = _find_file(code, path)

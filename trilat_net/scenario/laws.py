@@ -4,7 +4,7 @@ Invariant: each law states its source and the condition of its stability, and sa
 only sufficient. Symbols are the paper's; gains are diagonal, one number per joint or parameter.
 """
 
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from msgspec.structs import asdict
@@ -257,5 +257,12 @@ EnergyLaws = WaveVariables | PassivityControl | EnergyTanks
 ControlLaw = (
     Adaptive | AdaptiveBox | AdaptiveRobust | KnownGravityLaw | PluggedLaws | EnergyLaws | ImportedLaw
 )
+
+
+def identify_law(law: Any) -> str:
+    """Returns what a scenario calls a law; an imported one as in "package.module:Law"."""
+    return law.code if isinstance(law, ImportedLaw) else str(law.__struct_config__.tag)
+
+
 LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tomli_w
 
@@ -19,6 +19,7 @@ from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
 from ..errors import ScenarioError
 from ..files import open_regular
 from .fields import suggest_nearest
+from .imported_law import name_law_classes
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
@@ -92,18 +93,57 @@ def load_scenario(
         overrides = {**overrides, **more}
     else:
         overrides = [*overrides, *(f"{key}={value!r}" for key, value in more.items())]
-    if isinstance(source, Mapping):
-        return parse_scenario(tomli_w.dumps(source), "scenario", overrides)
-    if isinstance(source, str) and "\n" in source:
-        return parse_scenario(source, "scenario", overrides)
     if isinstance(source, Scenario):
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))
             return parse_scenario(source.text, source.name, expanded) if overrides else source
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
+    found = read_experiment(source)
+    in_file = not isinstance(source, Mapping) and "\n" not in str(source)
+    return parse_scenario(found.text, found.called if in_file else "scenario", overrides, found.folder)
+
+
+class ExperimentText(NamedTuple):
+    """An experiment as its author wrote it.
+
+    Attributes:
+        called: what a command calls it: a shipped name or a path; of one that is in no file the path at which
+            a command would look for it.
+        text: its TOML text.
+        folder: of the files that it names; None: it is resolved, and names none.
+    """
+
+    called: str
+    text: str
+    folder: Path | None
+
+    def load(self, overrides: Sequence[str] = ()) -> Scenario:
+        """Returns it with overrides.
+
+        Raises:
+            ScenarioError: it is not valid with them.
+        """
+        if self.folder is None:
+            return load_scenario(parse_scenario(self.text, self.called, folder=None), overrides)
+        return parse_scenario(self.text, self.called, overrides, self.folder)
+
+
+def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:
+    """Returns the text of a shipped name, a path, a TOML text, tables, or a scenario.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    if isinstance(source, Scenario):
+        return ExperimentText(f"./{source.name}.toml", source.text, None)
+    if isinstance(source, Mapping):
+        named = str(source.get("name", "scenario"))
+        return ExperimentText(f"./{named}.toml", tomli_w.dumps(name_law_classes(source)), Path())
+    if isinstance(source, str) and "\n" in source:
+        return ExperimentText("./scenario.toml", source, Path())
     text, folder = read_source(source)
-    return parse_scenario(text, str(source), overrides, folder)
+    return ExperimentText(str(source), text, folder)
 
 
 def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:

@@ -139,7 +139,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
     ("laws", "words"),
     [
         (["p_dd"], ("--law", "no law 'p_dd'", "did you mean 'p_d'?")),
-        (["mine.laws:Law"], ("laws from outside are not swept",)),
+        (["mine.laws:Law"], ("no module mine.laws",)),
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
 )

@@ -124,8 +124,8 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
         ("", ["no law ''", "tuned are adaptive, adaptive_box, adaptive_robust, p_d, pd_d, saturated_pd"]),
-        ("my.file:Law", ["a law of your own has no search ranges"]),
-        ("own", ["a law of your own"]),
+        ("tests.laws:Adaptive", ["tests.laws:Adaptive has no search ranges", "tune = {"]),
+        ("own", ["no law 'own'"]),
     ],
 )
 def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:

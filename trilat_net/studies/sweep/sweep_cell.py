@@ -14,7 +14,9 @@ from typing import NamedTuple
 import msgspec
 
 from ...errors import ScenarioError
-from ...scenario import Scenario, parse_scenario
+from ...scenario import Scenario
+from ...scenario.laws import identify_law
+from ...scenario.scenario_reader import ExperimentText
 from ..commands import format_command, set_options
 from . import cell_result
 from .cell_result import CellResult
@@ -50,18 +52,18 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class SweepSource(NamedTuple):
-    """The experiment that is swept, as its author wrote it.
+    """The experiment that is swept, as its author wrote it, see `ExperimentText`.
 
     Attributes:
         source: what a command calls it: a shipped name or a path.
         text: its TOML text.
-        folder: where the files lie that it names.
+        folder: where the files lie that it names; None: it is resolved.
         overrides: what is changed of it everywhere, as texts KEY=VALUE.
     """
 
     source: str
     text: str
-    folder: str
+    folder: str | None
     overrides: tuple[str, ...]
 
     def scenario(self, *more: str) -> Scenario:
@@ -70,7 +72,8 @@ class SweepSource(NamedTuple):
         Raises:
             ScenarioError: it is not valid with them.
         """
-        return parse_scenario(self.text, self.source, [*self.overrides, *more], Path(self.folder))
+        folder = None if self.folder is None else Path(self.folder)
+        return ExperimentText(self.source, self.text, folder).load([*self.overrides, *more])
 
 
 class SweepCell(NamedTuple):
@@ -150,7 +153,7 @@ def _base_text(written: SweepSource) -> str:
 
 def join_law_names(scenario: Scenario) -> str:
     """Returns the laws of a scenario's sites, each once."""
-    return ", ".join(dict.fromkeys(str(s.control.__struct_config__.tag) for s in scenario.sites.values()))
+    return ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
 
 
 def build_sim_command(

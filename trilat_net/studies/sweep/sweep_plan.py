@@ -8,7 +8,7 @@ in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
 import math
 import tomllib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import product
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, apply_overrides
 from ...scenario.fields import is_number, suggest_nearest
-from ...scenario.laws import LAWS
-from ...scenario.scenario_reader import read_source
+from ...scenario.imported_law import name_law_classes
+from ...scenario.laws import LAWS, identify_law
+from ...scenario.scenario_reader import read_experiment
 from . import cell_result
 from .sweep_cell import CellTask, SweepCell, SweepSource
 
@@ -241,36 +242,37 @@ class SweepPlan(NamedTuple):
 
 
 def plan_sweep(
-    source: str | Path,
+    source: str | Path | Mapping[str, Any] | Scenario,
     overrides: Sequence[str] = (),
     *,
     over: Sequence[str] = (),
     seeds: int | Sequence[int] = 1,
-    laws: Sequence[str] = (),
+    laws: Sequence[str | type] = (),
     longest_s: float | None = None,
 ) -> SweepPlan:
     """Returns a sweep, checked and ready to run.
 
     Args:
-        source: the name of a shipped scenario, or a path.
+        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         overrides: what is to be changed of it everywhere, as texts KEY=VALUE.
         over: the axes, as "link.delay_ms=0:1600:50" or "link.order=newest,in_order".
         seeds: how many, from the scenario's own on; or which.
-        laws: names of laws, swept besides the axes. One that all sites have stays with the gains of the
-            scenario; another one replaces the law of every site, with its default gains. Overrides of gains
-            count for either.
+        laws: names of laws, or classes, swept besides the axes. One that all sites have stays with the gains
+            of the scenario; another one replaces the law of every site, with its default gains. Overrides of
+            gains count for either.
         longest_s: how long an undecided cell may be extended, s; by default eight times its duration.
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
         UsageError: another argument cannot be right.
     """
-    text, folder = read_source(source)
-    written = SweepSource(str(source), text, str(folder), tuple(overrides))
+    read = read_experiment(source)
+    folder = None if read.folder is None else str(read.folder)
+    written = SweepSource(read.called, read.text, folder, tuple(overrides))
     base = written.scenario()
     axes = tuple(map(parse_axis, over))
-    _refuse_twice(axes, laws)
-    chosen = tuple(dict.fromkeys(laws))
+    chosen: tuple[str, ...] = tuple(dict.fromkeys(map(name_law_classes, laws)))
+    _refuse_twice(axes, chosen)
     forced = tuple(_law_overrides(written, base, law) for law in chosen)
     plan = SweepPlan(
         written, base, axes, chosen, forced, _seeds(seeds, base.seed), _longest_s(longest_s, base)
@@ -329,12 +331,10 @@ def _longest_s(asked: float | None, base: Scenario) -> float:
 def _law_overrides(written: SweepSource, base: Scenario, law: str) -> tuple[str, ...]:
     """Returns what puts a law into force at every site."""
     ours = [name for name in LAWS if name != "own"]
-    if law not in ours:
-        outside = ":" in law or law == "own"
-        why = "laws from outside are not swept" if outside else f"there is no law {law!r}"
-        hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}"
-        raise UsageError(f"--law: {why}{hint}")
-    if all(spec.control.__struct_config__.tag == law for spec in base.sites.values()):
+    if law not in ours and ":" not in law:
+        hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
+        raise UsageError(f"--law: there is no law {law!r}{hint}")
+    if all(identify_law(spec.control) == law for spec in base.sites.values()):
         return ()
     tables = tomllib.loads(written.text)
     apply_overrides(tables, written.overrides)

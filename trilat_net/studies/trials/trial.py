@@ -16,7 +16,7 @@ from ...log.log_reader import open_log
 from ...net.clock import SystemClock
 from ...scenario import Scenario, load_scenario
 from ...scenario.fields import is_distribution
-from ...scenario.scenario_reader import reseed_scenario
+from ...scenario.scenario_reader import read_experiment, reseed_scenario
 from ..commands import format_command, format_toml_value, set_options
 from .expectations import ExpectationResult, evaluate_expectations
 from .measure_run import RunMetrics, measure_log, measure_virtual_run
@@ -100,7 +100,7 @@ class Trial(NamedTuple):
 
 
 def trials(
-    source: str | Path | Scenario,
+    source: str | Path | Mapping[str, Any] | Scenario,
     seeds: Iterable[int] = (),
     set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
     *,
@@ -115,7 +115,7 @@ def trials(
     others would be the same run.
 
     Args:
-        source: the name of a shipped scenario, a path, or a scenario.
+        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         seeds: which seeds; none means the scenario's own.
         set: overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
         live: whether they are to run over a network.
@@ -124,7 +124,7 @@ def trials(
         ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
     """
     scenario = load_scenario(source, set)
-    called = f"./{scenario.name}.toml" if isinstance(source, Scenario) else str(source)
+    called = read_experiment(source).called
     _check_expectations_reachable(scenario, called)
     if not live:
         virtual.check_virtual(scenario)

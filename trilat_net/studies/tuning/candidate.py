@@ -4,10 +4,10 @@ Invariant: a candidate's scenario is loaded through the same settings that its c
 score is a function of the scenario alone: None for the errors of a run that does not reach its end.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,8 +18,9 @@ from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
-from ...scenario import Scenario, load_scenario, parse_scenario
+from ...scenario import Scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
+from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
 from ..record_batches import RecordBatch, join_batches, run_compiled_in_batches
@@ -175,22 +176,27 @@ def measure_candidate_task(task: CandidateTask) -> CandidateScore:
 class TuningScenario(NamedTuple):
     """The experiment in which laws are compared; a command calls it by source and overrides KEY=VALUE."""
 
-    source: str
+    written: ExperimentText
     overrides: tuple[str, ...]
     scenario: Scenario
+
+    @property
+    def source(self) -> str:
+        """What a command calls it."""
+        return self.written.called
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
         """Returns the same with the control of every site replaced, in as few settings as say it."""
         single = [f"sites.{name}.control={format_toml_value(table)}" for name, table in controls.items()]
-        wanted = load_scenario(self.source, [*self.overrides, *single])
+        wanted = self.written.load([*self.overrides, *single])
         first = next(iter(controls.values()))
         if all(table == first for table in controls.values()):
             texts = (*self.overrides, f"control={format_toml_value(first)}")
             with suppress(ScenarioError):  # a site has gains of its own, which are none of this law
-                scenario = load_scenario(self.source, texts)
+                scenario = self.written.load(texts)
                 if scenario.sites == wanted.sites:
-                    return TuningScenario(self.source, texts, scenario)
-        return TuningScenario(self.source, (*self.overrides, *single), wanted)
+                    return TuningScenario(self.written, texts, scenario)
+        return TuningScenario(self.written, (*self.overrides, *single), wanted)
 
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
@@ -216,10 +222,13 @@ def build_candidate_task(seeds: Sequence[TuningScenario]) -> CandidateTask:
     return CandidateTask(tuple(one.texts for one in seeds), name)
 
 
-def load_tuning_scenario(source: str | Path, overrides: Sequence[str] = ()) -> TuningScenario:
-    """Returns the experiment that a name or path and overrides mean.
+def load_tuning_scenario(
+    source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
+) -> TuningScenario:
+    """Returns the experiment that a name, a path, a text, tables or a scenario mean with overrides.
 
     Raises:
         ScenarioError: there is none.
     """
-    return TuningScenario(str(source), tuple(overrides), load_scenario(source, overrides))
+    written = read_experiment(source)
+    return TuningScenario(written, tuple(overrides), written.load(overrides))

@@ -8,6 +8,7 @@ heaviest joint's, and the others have their share of it, see `weigh_joints`. All
 parameters, the true ones times one share, and no inertia: a law that estimates it starts at zero.
 """
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ import numpy as np
 from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
-from ...scenario.fields import MAX_QUANTITY, field_names, suggest_nearest
+from ...scenario.fields import MAX_QUANTITY, field_names, is_number, suggest_nearest
+from ...scenario.imported_law import import_law_class
 from ...scenario.laws import LAWS
 
 MIN_BOX = 0.1
@@ -303,8 +305,8 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
     names = list(dict.fromkeys(laws)) or list(DEFAULT_LAWS)
     tuned = f"; tuned are {', '.join(SEARCH_SPACES)}"
     for name in names:
-        if ":" in name or name == "own":
-            raise UsageError(f"--law {name}: a law of your own has no search ranges{tuned}")
+        if ":" in name:
+            continue
         if name not in SEARCH_SPACES:
             hint = suggest_nearest(name, list(SEARCH_SPACES))
             raise UsageError(f"--law: there is no law {name!r} to tune{hint}{tuned}")
@@ -319,4 +321,33 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
             f"{roles.count('master')} of them masters: leave p_f out, or take contact",
             source=scenario.name,
         )
-    return [SEARCH_SPACES[name] for name in names]
+    return [SEARCH_SPACES.get(name) or build_own_search_space(name) for name in names]
+
+
+def build_own_search_space(code: str) -> SearchSpace:
+    """Returns where a law of one's own is searched: its class says it, as `tune = {"K": (10.0, 300.0)}`.
+
+    A third entry is the unit. A class with an argument `gravity` is told the share that all laws are told.
+
+    Raises:
+        ScenarioError: there is no such class.
+        UsageError: it has no ranges, or one of them is none.
+    """
+    kind = import_law_class(code, "--law")
+    ranges = getattr(kind, "tune", None)
+    if not isinstance(ranges, Mapping) or not ranges:
+        raise UsageError(f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}')
+    knobs = []
+    for name, entry in ranges.items():
+        low, high, unit = (*entry, "", "", "")[:3] if isinstance(entry, tuple | list) else ("", "", "")
+        if not (is_number(low) and is_number(high) and 0.0 < low < high and isinstance(unit, str)):
+            problem = "is as in (10.0, 300.0), from above 0 to more, or with a unit behind"
+            raise UsageError(f"--law {code}: tune[{name!r}] {problem}, not {entry!r}")
+        knobs.append(GainRange(str(name), unit, float(low), float(high)))
+    told = "gravity" in inspect.signature(kind).parameters
+
+    def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
+        known = {"gravity": knowledge.gravity} if told else {}
+        return {name: {"law": code, **gains, **known} for name in scenario.names}
+
+    return SearchSpace(code, tuple(knobs), "gravity" if told else "what it asks of now", controls)

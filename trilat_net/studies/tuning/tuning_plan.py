@@ -4,7 +4,7 @@ Invariant: the result is a function of the plan alone; neither the number of pro
 The gains that the paper prints are measured, never searched, and stand on no front.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +17,8 @@ from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ...results import Result
+from ...scenario import Scenario
+from ...scenario.imported_law import name_law_classes
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .candidate import (
     CandidateScore,
@@ -211,10 +213,10 @@ class TuningResult(Result):
 
 
 def plan_tuning(
-    source: str | Path,
+    source: str | Path | Mapping[str, Any] | Scenario,
     overrides: Sequence[str] = (),
     *,
-    laws: Sequence[str] = (),
+    laws: Sequence[str | type] = (),
     budget: int = DEFAULT_BUDGET,
     seed: int = 1,
     objective: str = "error",
@@ -224,9 +226,9 @@ def plan_tuning(
     """Returns a comparison, checked and ready to run.
 
     Args:
-        source: the name of a shipped scenario, or a path.
+        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         overrides: what is to be changed of it, as texts KEY=VALUE.
-        laws: which laws; none means all that take any number of sites.
+        laws: which laws, by names or as classes; none means all that take any number of sites.
         budget: candidates per law.
         seed: of the search; the seed of the scenario is the scenario's own.
         seeds: of how many seeds of the scenario, from its own on, each candidate is the mean.
@@ -248,13 +250,13 @@ def plan_tuning(
     knowledge = build_model_information(gravity_percent)
     found = load_tuning_scenario(source, overrides)
     scenario = found.scenario
-    spaces = select_search_spaces(laws, scenario)
+    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
             f"a candidate would take {ticks} ticks, at most {MAX_TICKS} are given: shorten it with --duration"
         )
-        raise ScenarioError(problem, path="duration_s", source=str(source))
+        raise ScenarioError(problem, path="duration_s", source=found.source)
     check_comparable(scenario)
     more = range(scenario.seed + 1, scenario.seed + seeds) if scenario.random else ()
     others = tuple(load_tuning_scenario(source, (*overrides, f"seed={one}")) for one in more)

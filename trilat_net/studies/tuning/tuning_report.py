@@ -295,7 +295,8 @@ def draw_front(tuned: TuningResult) -> Figure:
 
 def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
-    place = list(SEARCH_SPACES).index(found.space.law)
+    names = list(dict.fromkeys([*SEARCH_SPACES, found.space.law]))
+    place = names.index(found.space.law)
     colour, mark = SITE_COLOURS[place % len(SITE_COLOURS)], _MARKS[place % len(_MARKS)]
     points = found.points
     settled = [point for point in points if point is not None]
