@@ -218,7 +218,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
         shown = [texts[0], texts[1], "...", texts[-1]] if count > 4 else [texts[n] for n in range(count)]
         lines.append(f"  over {one.asked}: {', '.join(shown)}")
     first_s, longest_s = plan.base.duration_s, plan.longest_s
-    extended = f", one that is not plain by then up to {longest_s:g} s" if longest_s > first_s else ""
+    extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
     return [*lines, f"  {first_s:g} s each{extended}"]
 
 
@@ -232,8 +232,8 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     if extended:
         longest_s = max(row["ran_s"] for row in extended)
         first_s = results.plan.base.duration_s
-        went_on = f"and went on, the longest to {longest_s:g} s"
-        yield f"{len(extended)} were not plain after {first_s:g} s {went_on}"
+        continued = f"and continued, the longest to {longest_s:g} s"
+        yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
     yield from _describe_totals(rows)
     if len(results.plan.seeds) > 1:
         yield from _of_seeds(results)
@@ -254,7 +254,7 @@ def _describe_totals(rows: Sequence[ResultRow]) -> Iterator[str]:
 def _of_seeds(results: SweepResults) -> Iterator[str]:
     fixed = sum(not row["random"] for row in results.rows)
     if fixed:
-        yield f"in {_cells(fixed)} nothing is random: one seed was run there, which stands for all"
+        yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
     doubtful = [place for place in collect_grid_points(results) if place.doubtful]
     if doubtful:
         yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
