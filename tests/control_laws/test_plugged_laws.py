@@ -2,14 +2,17 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
+from tests.core.test_safeguards import RATE_NM_S, largest_step, ordered
 from tests.log_editing import opened, recorded
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario
+from trilat_net.scenario.laws import LAWS as ALL_LAWS
 
 LAWS: dict[str, tuple[str, dict[str, Any]]] = {
     "six_channel": ("paper", {"control.acceleration": 0.5, "control.force_own": 0.1}),
@@ -66,3 +69,39 @@ def test_its_log_is_executed_again(law: str) -> None:
     assert verdict.identical == verdict.records
     twins = compare_with_virtual(log)
     assert twins.fed.identical == twins.plain.identical == verdict.records
+
+
+DIGITAL = ("wave", "tdpa", "tanks")
+FOR_TWO = ("p_f", *DIGITAL)
+RULE = {"action": "glide", "align_limit_rad": 4.0, "align_speed_rad_s": 2.0}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", [law for law in ALL_LAWS if law != "own"])
+def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> None:
+    """Arms begin 3 rad apart, links are cut, a site is stopped, the first one in fault; from tick 0 on."""
+    name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
+    first, *others = load_scenario(name).names
+    keys = {
+        "duration_s": 9.0,
+        "control.law": law,
+        "link.delay_ms": 20.0,
+        "link.outages_s": [[4.0, 4.5]],
+        "limits.tau_rate_limit_nm_s": RATE_NM_S,
+        f"sites.{first}.q0_rad": [3.2, 1.2],
+        **{f"sites.{other}.q0_rad": [0.2, 1.5] for other in others},
+        **{f"on_stale.{key}": value for key, value in RULE.items()},
+        **({"scheme": "digital"} if law in DIGITAL else {}),
+        **({"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}),  # elbows bent, and none hangs
+    }
+    orders = {
+        "s": {2800: "stop", 3200: "enable", 3230: "stop", 3300: "enable", 7000: "stop", 7040: "enable"},
+        first: {5500: "arm_lost", 5530: "stop", 6000: "reset", 6050: "arm_lost", 6400: "reset"},
+    }
+    log = ordered(load_scenario(name, {**settings, **keys}), orders)
+    modes = {str(mode) for site in log.sites for mode in log[site].mode}
+    assert {"waiting", "return", "run", "hold", "stopped", "fault"} <= modes
+    for site in log.sites:
+        assert largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9), site
+        assert np.isfinite(log[site].tau).all()
+    assert verify(log).differing == 0
