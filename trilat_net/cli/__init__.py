@@ -176,7 +176,7 @@ _CHANGES.callback()(set_command.set_command)
 app.add_typer(_group(_SINGLE))
 app.add_typer(
     _group(
-        _LOG, "log ", no_args_is_help=True, help="Inspects, checks, signs, recovers, exports, shows a log."
+        _LOG, "log ", no_args_is_help=True, help="Inspects, checks, signs, recovers, exports or views a log."
     ),
     name="log",
 )
@@ -189,11 +189,17 @@ app.add_typer(
     _group(_NEW, "new ", no_args_is_help=True, help="A control law of your own, with its test."), name="new"
 )
 app.add_typer(
-    _group(_TRACE, "trace ", no_args_is_help=True, help="Delays that other programs measured."), name="trace"
+    _group(_TRACE, "trace ", no_args_is_help=True, help="Imports delays that other programs measured."),
+    name="trace",
 )
 app.add_typer(_CHANGES, name="set")
 app.add_typer(
-    _group(_KEYS, "keys ", no_args_is_help=True, help="The keys by which members know one another."),
+    _group(
+        _KEYS,
+        "keys ",
+        no_args_is_help=True,
+        help="Keys that authenticate members of a session, and sign logs.",
+    ),
     name="keys",
 )
 

@@ -21,7 +21,7 @@ def demo_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario live: each site and a recorder as a process over Zenoh, then verifies and reports."""
+    """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
     from sites.demo_session import demo_session_name, run_demo
     from sites.monitor import SessionDisplay
 

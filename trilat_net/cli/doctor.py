@@ -1,4 +1,4 @@
-"""`trilat doctor`: what stands in the way of a session on this machine."""
+"""`trilat doctor`: checks if a session can run on this machine."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,16 +18,20 @@ def doctor_command(
     keys: options.KeysOption = None,
     insecure: options.InsecureOption = False,
     session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Ask its members for their clocks, too.")
+        str | None,
+        typer.Option(
+            "--session", metavar="ID", help="Also ask the members of this session for their clocks."
+        ),
     ] = None,
     folder: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results would go.")
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder where results would go.")
     ] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Examines keys, links, clocks, real-time rights, disk and processors: a line for each finding.
+    """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per finding.
 
-    Give it the options that a site, recorder or router here would get. Exit code 1 if something fails.
+    Give it the options that a site, recorder or router on this machine would get. Exit code 1 if a check
+    fails.
     """
     from sites.doctor import examine_machine
 

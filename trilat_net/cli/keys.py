@@ -1,4 +1,4 @@
-"""`trilat keys`: the keys by which members of a session know one another."""
+"""`trilat keys`: keys that authenticate the members of a session, and keys that sign logs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,39 +14,39 @@ def keys_new_command(
     members: Annotated[
         list[str],
         typer.Argument(
-            help="Sites, and recorder, operator, router as far as there are.", metavar="MEMBER..."
+            help="The sites; and recorder, operator, router if there are any.", metavar="MEMBER..."
         ),
     ],
     hosts: Annotated[
         list[str] | None,
         typer.Option(
-            "--host", metavar="NAME", help="Name or address at which some member listens; repeatable."
+            "--host", metavar="NAME", help="Host name or address at which a member listens; repeatable."
         ),
     ] = None,
-    days: Annotated[
-        int, typer.Option("--days", min=1, max=3650, help="How long the certificates hold.")
-    ] = 30,
+    days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
 ) -> None:
-    """Makes keys: a private authority, and for each member a folder that it alone needs.
+    """Makes keys: a private certificate authority, and for each member a folder for its machine alone.
 
-    Bring each folder to its machine by a way that you trust, and give it as --keys. Members without keys, or
-    with those of another authority, cannot connect; each can speak under its own name alone. Keep the folder
-    `authority` where no member runs, or delete it: new keys are made for all at once.
+    Bring each folder to its machine by a channel that you trust, and give it as --keys. Members without keys,
+    or with keys of another authority, cannot connect; a member can send only under its own name. Keep the
+    folder `authority` where no member runs, or delete it: new keys are always made for all members at once.
     """
     from ..net.member_keys import create_keys
 
     made = create_keys(folder, members, hosts or (), days)
     for one in made:
         terminal.print_line(f"{one}: for {one.name}")
-    terminal.print_line(f"they hold for {days} days; as in: trilat site {made[0].name} --keys {made[0]} ...")
+    terminal.print_line(
+        f"they are valid for {days} days; use them as in: trilat site {made[0].name} --keys {made[0]} ..."
+    )
 
 
 def keys_pair_command(
     name: Annotated[Path, typer.Argument(help="Makes NAME.key and NAME.pub.", metavar="NAME")],
 ) -> None:
-    """Makes a pair of Ed25519 keys, with which logs are signed and checked.
+    """Makes a pair of Ed25519 keys, to sign logs and to check signatures.
 
-    Keep NAME.key to yourself; give NAME.pub to whoever is to check your logs, by a way that they trust.
+    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to those who check your logs.
     """
     from ..log.log_signature import create_signing_keys
 
@@ -59,7 +59,7 @@ def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows whose keys these are, until when they hold, and the settings of Zenoh that they make."""
+    """Shows whose keys these are, until when they are valid, and the Zenoh settings that follow from them."""
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)

@@ -22,14 +22,17 @@ def live_command(
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
     host: Annotated[
-        str, typer.Option("--host", help="Address to serve the page at; others than loopback demand a token.")
+        str,
+        typer.Option(
+            "--host", help="Address of the page; beyond loopback it needs --insecure and has a token."
+        ),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow --host of a network, though nothing is encrypted.")
+        bool, typer.Option("--insecure", help="Allow --host beyond loopback, without encryption.")
     ] = False,
     browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open a browser where there is one.")
+        bool, typer.Option("--browser/--no-browser", help="Open a browser if there is one.")
     ] = True,
     duration: options.DurationOption = None,
     folder: Annotated[
@@ -41,9 +44,10 @@ def live_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario live with a page to watch and take part, until its button or Ctrl-C; then reports.
+    """Runs a scenario live, with a page on which to watch it and take hold of the arms.
 
-    With --session it shows a session that runs already, and leaves it running.
+    The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
+    page shows a session that already runs, and leaves it running.
     """
     from live.live_session import PageOptions, watch_with_page
 
@@ -54,7 +58,9 @@ def live_command(
     if session is not None:
         alone = {"--duration", "--out", "--seed", "--set", "--force", "--json", "scenario"}
         if extra := alone & set(options.given_options(context)):
-            raise UsageError(f"--session shows a session that runs: leave out {', '.join(sorted(extra))}")
+            raise UsageError(
+                f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
+            )
         connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
         name = options.check_session_name(session)
         code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)

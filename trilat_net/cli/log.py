@@ -26,13 +26,14 @@ def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
         Path | None,
-        typer.Option("--key", metavar="PUB", help="Check FILE.sig by this public key, too."),
+        typer.Option("--key", metavar="PUB", help="Also check FILE.sig, by this public key."),
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks that a log is well-formed, complete and consistent; executes nothing.
 
-    Exit code 0: sound; 1: not; 2: no such file. Files of other programs: structure only.
+    Exit code 0: sound; 1: not sound; 2: no such file. Of files of other programs only the structure is
+    checked.
     """
     from ..log.session_check import check_log
 
@@ -55,16 +56,14 @@ def log_check_command(
 
 def log_sign_command(
     file: options.LogArgument,
-    key: Annotated[
-        Path, typer.Option("--key", metavar="KEY", help="Private key, as trilat keys pair makes one.")
-    ],
+    key: Annotated[Path, typer.Option("--key", metavar="KEY", help="Private key, made by trilat keys pair.")],
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Signs a finished log with Ed25519: writes FILE.sig, and leaves FILE as it is.
 
-    What is signed is its digest chain: all messages and all that describes them. Whoever has the public key
-    checks it with: trilat log check FILE --key PUB
+    The signature covers the digest chain: all messages and everything that describes them. The owner of the
+    public key checks it with: trilat log check FILE --key PUB
     """
     from ..log.log_signature import sign_log
 
@@ -91,7 +90,7 @@ def log_recover_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Makes a whole file of a torn or damaged one, which stays as it is.
+    """Recovers a torn or damaged log into a new, whole file; the original is not changed.
 
     Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is listed; 1: nothing
     could be recovered.
@@ -157,14 +156,14 @@ def log_view_command(
     ] = False,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="OUT.rrd", help="Write a recording for Rerun instead of opening it."),
+        typer.Option("--save", metavar="OUT.rrd", help="Write a file for Rerun instead of opening it."),
     ] = None,
     force: options.ForceOption = False,
 ) -> None:
-    """Opens a log in Rerun: every curve with its name, a column per site.
+    """Opens a log in Rerun: a column per site, a name for every curve.
 
-    If a log lacks standard channels (--views off), was not finished or has parts, they are made first, in a
-    temporary file.
+    If a log lacks the standard channels (--views off), was not finished or has parts, they are first made in
+    a temporary file.
     """
     from ..files import refuse_existing
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun

@@ -7,8 +7,8 @@ from . import options
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
 
-    Sites, links and walls are columns. A dash stands for a missing number; if there could be one, the reason
-    is given below. docs/metrics.md has every formula.
+    Sites, links and walls are columns. A dash is a missing number; if the run could have one, the reason is
+    given below the table. docs/metrics.md has every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 

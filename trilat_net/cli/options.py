@@ -78,8 +78,8 @@ RouterOption = Annotated[
     typer.Option(
         "--router",
         metavar="EP",
-        help="Endpoint of a router to go through instead, as in tcp/192.0.2.1:7447; repeatable: the first "
-        "one that answers is used.",
+        help="Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: the first one that "
+        "answers is used.",
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -88,11 +88,11 @@ ZenohConfigOption = Annotated[
 ]
 KeysOption = Annotated[
     Path | None,
-    typer.Option("--keys", metavar="DIR", help="Folder of this member's keys, see trilat keys new."),
+    typer.Option("--keys", metavar="DIR", help="Folder of this member's keys (trilat keys new)."),
 ]
 InsecureOption = Annotated[
     bool,
-    typer.Option("--insecure", help="Allow --listen at a network where everybody is trusted, unencrypted."),
+    typer.Option("--insecure", help="Allow --listen on a network whose users you trust, unencrypted."),
 ]
 
 
@@ -153,7 +153,7 @@ ViewsOption = Annotated[
     typer.Option(
         "--views",
         metavar="off|full|HZ",
-        help="Rate of additional standard channels for other viewers, Hz; extremes are kept.",
+        help="Rate of the standard channels for ROS 2 and viewers, Hz; extremes are kept.",
     ),
 ]
 

@@ -32,7 +32,7 @@ def ping_command(
         typer.Option(
             "--benchmark",
             metavar="SCENARIO",
-            help="Measure the network instead, by size, rate and transport, against this scenario.",
+            help="Measure the network instead, by size, rate and transport, for this scenario.",
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
@@ -42,7 +42,7 @@ def ping_command(
         typer.Option(
             "--seconds",
             metavar="S",
-            help="How long all cases take together, s; default 24. With --answer: until then.",
+            help="Duration of all cases together, s; default 24. With --answer: time until it ends.",
             callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
         ),
     ] = None,
@@ -52,7 +52,9 @@ def ping_command(
     force: options.ForceOption = False,
     answer: Annotated[
         list[str] | None,
-        typer.Option("--answer", metavar="EP", help="Be the far end of benchmarks, here; repeatable."),
+        typer.Option(
+            "--answer", metavar="EP", help="Answer benchmarks from elsewhere, at this endpoint; repeatable."
+        ),
     ] = None,
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
@@ -61,12 +63,13 @@ def ping_command(
 ) -> None:
     """Shows round trip, clock offset and jitter between here and every member of a session.
 
-    The session may be waiting for members or running; then the links that its sites measure are shown too.
+    The session may still wait for members. If it runs, the links that its sites measure are shown too.
     Without endpoints it asks the first site, at its loopback port, for the others.
 
-    With --benchmark it asks no session: is this network good enough for a scenario, with the delay margin of
-    trilat linear? The far end is trilat ping --answer EP at another machine, given as --connect EP; without
-    one it runs here, over TCP, TLS and QUIC. That takes half a minute; exit code 1 if it is not good enough.
+    With --benchmark it needs no session: it measures if the network is good enough for a scenario, by the
+    delay margin of trilat linear. The far end is trilat ping --answer EP on another machine, given as
+    --connect EP; without one it runs here, over TCP, TLS and QUIC. This takes half a minute; exit code 1 if
+    the network is not good enough.
     """
     if benchmark is not None or answer:
         _refuse_others(context, "--answer" if benchmark is None else "--benchmark")

@@ -34,7 +34,7 @@ def record_command(
         typer.Option(
             "--join-timeout",
             metavar="S",
-            help="Longest wait for its start, s; default: no limit.",
+            help="Longest wait for the session to begin, s; default: no limit.",
             callback=options.check_seconds,
         ),
     ] = None,
@@ -42,37 +42,43 @@ def record_command(
     clock_drift: options.ClockDriftOption = 0.0,
     concluded: Annotated[
         bool,
-        typer.Option("--conclude", help="Verify the log afterwards and write its report into its folder."),
+        typer.Option("--conclude", help="Afterwards verify the log, and write a report into its folder."),
     ] = False,
     include: Annotated[
         list[str] | None,
         typer.Option(
-            "--include", metavar="KEYS", help="Record these channels alone, as '**/m1/**'; repeatable."
+            "--include", metavar="KEYS", help="Record only these channels, as in '**/m1/**'; repeatable."
         ),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        typer.Option("--exclude", metavar="KEYS", help="Leave these channels out, as '**/link'; repeatable."),
+        typer.Option(
+            "--exclude", metavar="KEYS", help="Leave these channels out, as in '**/link'; repeatable."
+        ),
     ] = None,
     split_size: Annotated[
-        float | None, typer.Option("--split-size", metavar="MIB", help="Parts of at most this size, MiB.")
+        float | None,
+        typer.Option(
+            "--split-size", metavar="MIB", help="Split the log into parts of at most this size, MiB."
+        ),
     ] = None,
     split_duration: Annotated[
-        float | None, typer.Option("--split-duration", metavar="S", help="Parts of this duration, s.")
+        float | None,
+        typer.Option("--split-duration", metavar="S", help="Split the log into parts of this duration, s."),
     ] = None,
     carry_on: Annotated[
         bool, typer.Option("--continue", help="If the log exists, write its next part.")
     ] = False,
     durable: Annotated[
-        bool, typer.Option("--durable", help="Sync to the disk every 100 ms instead of every second.")
+        bool, typer.Option("--durable", help="Sync to the disk at every flush instead of every second.")
     ] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
 ) -> None:
-    """Records one session, from its epoch to its end or to Ctrl-C.
+    """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
 
     Without endpoints it asks the first site, at its loopback port, for the others. Parts are named
-    FILE-001.mcap and so on. The name of a file ends in .active until it is finished.
+    FILE-001.mcap and so on. The name of a file ends in .active until the file is finished.
     """
     from recorder.record_process import record_session
 

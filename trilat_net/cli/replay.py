@@ -31,7 +31,7 @@ def replay_command(
     rate: Annotated[
         str,
         typer.Option(
-            "--rate", metavar="X", help="Speed relative to the recording; max: as fast as possible."
+            "--rate", metavar="X", help="Speed relative to the recording, or max: as fast as possible."
         ),
     ] = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Start over at the end, until Ctrl-C.")] = False,
@@ -50,7 +50,7 @@ def replay_command(
         typer.Option(
             "--include",
             metavar="KEYEXPR",
-            help="Play these channels alone, as in '**/m1/*'; repeatable. Default: all of the sites.",
+            help="Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
         ),
     ] = None,
     exclude: Annotated[
@@ -61,17 +61,21 @@ def replay_command(
     ] = None,
     prefix: Annotated[
         str,
-        typer.Option("--prefix", metavar="WORD", help="The session is WORD-NAME; '': NAME, as recorded."),
+        typer.Option(
+            "--prefix", metavar="WORD", help="Name the session WORD-NAME; with '' NAME, as recorded."
+        ),
     ] = "replay",
     session: Annotated[
         str | None, typer.Option("--session", metavar="ID", help="Name of the session, without a prefix.")
     ] = None,
     time: Annotated[
         str,
-        typer.Option("--time", metavar="publish|log", help="Time by the stamps of sending or of arrival."),
+        typer.Option(
+            "--time", metavar="publish|log", help="Play messages at their times of sending, or of arrival."
+        ),
     ] = "publish",
     low_cpu: Annotated[
-        bool, typer.Option("--low-cpu", help="Sleep until every deadline: about 0.1 ms less exact.")
+        bool, typer.Option("--low-cpu", help="Sleep until every deadline, which is about 0.1 ms less exact.")
     ] = False,
     needs_recorder: options.NeedsRecorderOption = False,
     preload: Annotated[
@@ -79,7 +83,7 @@ def replay_command(
         typer.Option(
             "--preload",
             metavar="MIB",
-            help="Largest log held in memory; a process reads larger ones meanwhile.",
+            help="Largest log held in memory; another process reads a larger one during the replay.",
         ),
     ] = 256,
     listen: options.ListenOption = None,
@@ -91,9 +95,9 @@ def replay_command(
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a session of its own.
 
-    Recorders, viewers and `trilat ping` find it as they find a running session: it answers for the sites of
-    the log, and its messages are theirs, byte for byte. Without endpoints it listens where the session's
-    first site would.
+    To recorders, viewers and `trilat ping` it looks like a running session: it answers for the sites of the
+    log, and its messages are theirs, byte for byte. Without endpoints it listens where the session's first
+    site would.
     """
     from recorder.play.pace import parse_rate
     from recorder.play.play_process import PlayOptions, play_log

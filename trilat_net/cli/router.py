@@ -1,4 +1,4 @@
-"""`trilat router`: lets sites meet that cannot reach each other directly."""
+"""`trilat router`: connects sites that cannot reach each other directly."""
 
 from typing import Annotated
 
@@ -33,10 +33,10 @@ def router_command(
         ),
     ] = None,
 ) -> None:
-    """Connects sites that cannot reach each other directly, as behind NAT.
+    """Connects sites that cannot reach each other directly, for example behind NAT.
 
-    Sites and recorder name it with --router; the order of starts is free. It runs until Ctrl-C; a session
-    continues when it is restarted. Routers that --connect to each other act as one.
+    Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
+    continues when the router is restarted. Routers that --connect to each other act as one.
     """
     from ..net.clock import SystemClock
     from ..net.connection import open_bus, resolve_router_connection, run_router, secure_connection

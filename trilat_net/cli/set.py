@@ -57,7 +57,7 @@ def set_command(
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
 ) -> None:
-    """Changes a link, or a site's shares in its peers, while a session runs.
+    """Changes a link, or a row of the dominance matrix, while a session runs.
 
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
@@ -94,11 +94,13 @@ def set_link_command(
 
 def set_dominance_command(
     context: typer.Context,
-    site: Annotated[str, typer.Argument(help="Site whose shares change.")],
-    shares: Annotated[list[str], typer.Argument(metavar="PEER=SHARE...", help="They sum to 1.")],
+    site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
+    shares: Annotated[
+        list[str], typer.Argument(metavar="PEER=SHARE...", help="New shares of its peers, which sum to 1.")
+    ],
     ramp: Annotated[str, typer.Option("--ramp", help="Duration of the change, as in 2s.")] = "1s",
 ) -> None:
-    """Changes one row of the dominance matrix linearly over a time; it sums to 1 throughout."""
+    """Changes one row of the dominance matrix along a linear ramp; it sums to 1 throughout."""
     table = {peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()}
     _send_change(context, site, {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3})
 

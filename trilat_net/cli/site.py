@@ -51,7 +51,7 @@ def site_command(
         typer.Option(
             "--stay",
             metavar="S",
-            help="Wait at the end until the recorder has left, s at most.",
+            help="At the end, wait until the recorder has left, at most this long, s.",
             callback=options.check_seconds,
         ),
     ] = 0.0,
@@ -60,7 +60,7 @@ def site_command(
         typer.Option(
             "--without",
             metavar="SITE",
-            help="Option of the first site: begin without this one, which may join later; repeatable.",
+            help="Option of the first site: begin without SITE, which may join later; repeatable.",
         ),
     ] = None,
     leave_timeout: Annotated[
@@ -68,7 +68,7 @@ def site_command(
         typer.Option(
             "--leave-timeout",
             metavar="S",
-            help="Under glide: how long to go on without a site that has left, s; default: to the end.",
+            help="Under glide: time to go on without a site that has left, s; default: to the end.",
             callback=options.check_seconds,
         ),
     ] = None,
@@ -80,8 +80,8 @@ def site_command(
 ) -> None:
     """Runs one site as one process: for separate terminals or machines.
 
-    Without endpoints, sites of a session find each other on this machine: each listens at a loopback port
-    derived from session and site, and connects to the sites before it in the scenario.
+    Without endpoints, the sites of a session find each other on this machine: each listens at a loopback port
+    derived from session and site, and connects to the sites that precede it in the scenario.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site
@@ -126,7 +126,9 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
     for late in without:
         find_site(scenario, late)
         if name != scenario.names[0] or late == name:
-            raise UsageError(f"--without is an option of {scenario.names[0]}, who begins, for other sites")
+            raise UsageError(
+                f"--without is an option of {scenario.names[0]}, the first site, and names other sites"
+            )
         if not scenario.sites_may_return:
             raise UsageError('--without asks for on_stale.action = "glide" at every site')
     return tuple(without)

@@ -56,17 +56,18 @@ def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
     end: Annotated[
-        bool, typer.Option("--end", help="End the session in order, with every recorder's records.")
+        bool,
+        typer.Option("--end", help="End the whole session instead; recorders get every record."),
     ] = False,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
 ) -> None:
-    """Stops arms at once, while the session goes on: their torque goes over to damping and gravity in 100 ms.
+    """Stops arms at once while the session goes on: their torque blends into damping and gravity in 100 ms.
 
-    They stay so until `trilat enable`. With --end all sites end their run at one time instead. Without
-    endpoints it asks the first site, at its loopback port, for the others.
+    They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
+    Without endpoints it asks the first site, at its loopback port, for the others.
     """
     connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     if not end:
@@ -91,7 +92,7 @@ def enable_command(
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
 ) -> None:
-    """Lets arms that were stopped follow again: they wait for their peers and align with them."""
+    """Lets stopped arms follow again: they wait for their peers and align with them."""
     connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     _order(session, connection, sites, "enable")
 
@@ -104,6 +105,6 @@ def reset_command(
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
 ) -> None:
-    """Ends the fault of sites, unless its reason is still there: they wait for their peers and align."""
+    """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
     connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     _order(session, connection, sites, "reset")

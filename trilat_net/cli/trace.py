@@ -1,4 +1,4 @@
-"""`trilat trace`: delays that other programs measured, for links."""
+"""`trilat trace`: imports delays that other programs measured, for links."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ from . import options
 def trace_import_command(
     form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
     file: Annotated[
-        Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a head.", metavar="FILE")
+        Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a header.", metavar="FILE")
     ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="CSV", help="Default: FILE as -trace.csv, here.")
@@ -23,8 +23,8 @@ def trace_import_command(
         typer.Option(
             "--way",
             metavar="half|send|receive|whole",
-            help="Half a round trip, one way of irtt there or back, or delays as they are. "
-            "Default: half of what is a round trip.",
+            help="Half a round trip, one way of irtt (send or receive), or delays as they are. "
+            "Default: half of a round trip, a one-way delay as it is.",
         ),
     ] = "",
     column: Annotated[
@@ -36,7 +36,7 @@ def trace_import_command(
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Makes a trace for links from what another program measured, and says what the network is like."""
+    """Makes a trace for links from what another program measured, and prints statistics of the network."""
     from ..scenario.measured_traces import import_trace
 
     place = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
@@ -47,4 +47,4 @@ def trace_import_command(
         terminal.print_json({**found.to_dict(), "file": str(place)})
         return
     terminal.print_line(found.summary())
-    terminal.print_line(f"{place}: as in --set link.model=trace --set link.file={place}")
+    terminal.print_line(f"{place}: use it with --set link.model=trace --set link.file={place}")

@@ -16,10 +16,10 @@ def watch_command(
     keys: options.KeysOption = None,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
-    """Shows a running session in a terminal, a line for each site, until it ends or Ctrl-C.
+    """Shows a running session in a terminal, with a line per site, until the session ends or Ctrl-C.
 
-    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the arm; above them
-    stands V. Without endpoints it asks the first site, at its loopback port, for the others.
+    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the arm. The line
+    above has V. Without endpoints it asks the first site, at its loopback port, for the others.
     """
     from live.terminal_watch import watch_session
 
