@@ -23,7 +23,7 @@ from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..files import find_page
-from .fields import Frozen
+from .fields import Frozen, suggest_nearest
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
 from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
@@ -245,10 +245,10 @@ def import_law_class(code: str, path: str) -> Any:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError, RecursionError) as error:
         raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
-    if not any(isinstance(node, ast.ClassDef) and node.name == name for node in tree.body):
-        raise ScenarioError(
-            f"{file} defines no class {name}; see {find_page('own-controller.md')}", path=path
-        )
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    if name not in classes:
+        hint = suggest_nearest(name, classes) or f"; see {find_page('own-controller.md')}"
+        raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
     now = hash_law_source(code, path)
     with _searching_here():
         try:
