@@ -187,13 +187,12 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
         if own_laws and isinstance(law, ImportedLaw):
             gains = law.gains(theta)
         if gains is None:
-            code = f"{law.code} is an imported law" if isinstance(law, ImportedLaw) else "is a law"
             why = law.explain_no_linear_form() if isinstance(law, PluggedLaw) else ""
+            if isinstance(law, ImportedLaw):
+                why = f"{law.code} is known by its code alone, which trilat linear runs, and this does not"
+            others = f"adaptive, adaptive_box, p_d, pd_d, p_f and others have one, see {find_page('laws.md')}"
             raise ScenarioError(
-                f"has no linear loop: {why}"
-                if why
-                else f"{code}, whose equations are unknown here; adaptive, adaptive_box, p_d, pd_d and p_f "
-                f"can be linearised, and some others, see {find_page('laws.md')}",
+                f"has no linear loop: {why or others}",
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
