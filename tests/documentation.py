@@ -74,7 +74,6 @@ ELSEWHERE = {
     "docs/external-arm.md: from trilat_net.net.arm_port import ArmPort": "tests/sites/test_external_arm.py",
     "docs/external-arm.md: from trilat_net.net.arm_port import Enable": "tests/sites/test_external_arm.py",
     "docs/lab.md: trilat": "tests/test_lab.py",
-    "docs/live-hands.md: import trilat_net": "tests/live/test_hands.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",
     "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "tests/studies/sweep/test_confirmation.py",

@@ -28,6 +28,7 @@ from tests.documentation import (
     read_commands,
 )
 from tests.golden.surface import all_options
+from tests.live.processes import BEGUN, Process
 from tests.scenario.test_measured_traces import irtt
 
 BLOCKS = [block for page in PAGES for block in find_blocks(page)]
@@ -184,18 +185,36 @@ def test_the_sessions_of_the_readme_run(tmp_path: Path) -> None:
     assert printed.startswith("1.999 ")
 
 
+@pytest.mark.long
+@pytest.mark.live
+def test_the_code_of_a_hand_takes_hold_of_an_arm_and_lets_go(tmp_path: Path) -> None:
+    words = ("--scenario", "play", "--set", "duration_s=600")
+    sites = [Process(name, ["site", name, *words], tmp_path) for name in tn.load_scenario("play").names]
+    try:
+        sites[0].prints(BEGUN)
+        names: dict[str, Any] = {"__name__": "page"}
+        run_python("docs/live-hands.md", tmp_path, names)
+        assert len(names["hand"].pose) == 2
+    finally:
+        for site in sites:
+            site.end()
+
+
 # --- Python -----------------------------------------------------------------------------------------------
 
 PYTHON_PAGES = {
     "README.md",
     "docs/certificate.md",
     "docs/linear.md",
+    "docs/live-hands.md",
     "docs/own-controller.md",
     "docs/ports.md",
     "docs/python.md",
     "docs/rerun.md",
     "docs/sweep.md",
 }
+OF_THEIR_OWN = {"README.md", "docs/live-hands.md", "docs/sweep.md"}
+"""Pages whose code needs a session or a sweep, which a test of their own makes."""
 AT_HAND = {
     "docs/certificate.md": "import numpy as np\nfrom trilat_net.core.law_energy import *\n",
     "docs/rerun.md": "import trilat_net\n",
@@ -254,7 +273,7 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("page", sorted(PYTHON_PAGES - {"README.md", "docs/sweep.md"}))
+@pytest.mark.parametrize("page", sorted(PYTHON_PAGES - OF_THEIR_OWN))
 def test_the_code_of_a_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
@@ -268,7 +287,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
     trilat("sweep", "p_d_margin", *over, cwd=tmp_path).succeeds()
     names: dict[str, Any] = {"__name__": "page"}
     run_python("docs/sweep.md", tmp_path, names)
-    assert len(names["results"].rows) == len(names["plan"].cells)
+    assert len(names["results"].rows) == names["plan"].cells == 135
 
 
 @pytest.mark.long
