@@ -614,7 +614,7 @@ def test_the_page_names_every_field_of_a_message() -> None:
     table = page[page.index("| key |") : page.index("The torque stands")]
     assert set(re.findall(r"`(\w+)`", table)) == set(ArmMeasurement.__struct_fields__)
     assert f"| {VERSION}, the version of the messages |" in table
-    switch = page[page.index("| of `enable` |") : page.index("At most one")]
+    switch = page[page.index("| of `enable` |") : page.index("Several programs")]
     assert set(re.findall(r"^\| `(\w+)`", switch, re.MULTILINE)) == {"held"}
     assert set(ArmEnable.__struct_fields__) - set(ArmMeasurement.__struct_fields__) == {"held"}
     for seconds in (HELD_SILENCE_NS, SILENCE_LIMIT_NS, FRESH_NS, SWITCH_SILENCE_NS):
