@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 import trilat_net
+from tests.core.test_safeguards import ordered
 from tests.core.test_task_space import POSE, build
 from tests.task_arms import posed_arms
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
@@ -201,3 +202,17 @@ def test_energies_close_over_a_hold_in_task_space_and_the_storage_falls_from_twe
     assert np.diff(S).max() <= 1e-9 * S[0]
     assert S[-1] < S[0]
     assert verify(log).differing == 0
+
+
+@pytest.mark.long
+def test_arms_that_agree_on_a_pose_are_stopped_in_fault_cut_off_and_back_without_a_step() -> None:
+    text = posed_arms(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
+    scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
+    orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}
+    log = ordered(scenario, orders)
+    assert {"stopped", "fault", "hold"} <= {str(mode) for site in log.sites for mode in log[site].mode}
+    for site in log.sites:
+        tau = log[site].tau
+        assert np.abs(np.diff(tau, axis=0, prepend=np.zeros_like(tau[:1]))).max() <= 0.5 * (1.0 + 1e-9)
+        assert set(log[site].mode[-200:]) == {"run"}
+    assert verify(log).identical == 18_000
