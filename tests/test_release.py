@@ -104,22 +104,32 @@ def run(*words: object, cwd: Path, **more: str) -> str:
     return done.stdout + done.stderr
 
 
-@pytest.mark.long
-def test_the_wheel_of_the_sdist_is_whole_and_its_first_command_runs(tmp_path: Path) -> None:
-    """Without a network: what the program needs is of this environment, the program the wheel's alone."""
-    source = tmp_path / "source"
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The sdist of what git tracks, and the wheel that is made of that sdist."""
+    folder = tmp_path_factory.mktemp("built")
+    source = folder / "source"
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True).stdout
     for name in filter(None, tracked.decode().split("\0")):
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
-    run(sys.executable, "-c", build, "build_sdist", tmp_path, cwd=source)
-    (sdist,) = tmp_path.glob("*.tar.gz")
+    run(sys.executable, "-c", build, "build_sdist", folder, cwd=source)
+    (sdist,) = folder.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
-        archive.extractall(tmp_path / "unpacked", filter="data")
-    (unpacked,) = (tmp_path / "unpacked").iterdir()
-    run(sys.executable, "-c", build, "build_wheel", tmp_path, cwd=unpacked)
-    (wheel,) = tmp_path.glob("*.whl")
+        archive.extractall(folder / "unpacked", filter="data")
+    (unpacked,) = (folder / "unpacked").iterdir()
+    run(sys.executable, "-c", build, "build_wheel", folder, cwd=unpacked)
+    (wheel,) = folder.glob("*.whl")
+    return [sdist, wheel]
+
+
+@pytest.mark.long
+def test_the_wheel_of_the_sdist_is_whole_and_its_first_command_runs(
+    built: list[Path], tmp_path: Path
+) -> None:
+    """Without a network: what the program needs is of this environment, the program the wheel's alone."""
+    wheel = built[1]
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     packages = ("trilat_net", "sites", "recorder", "live")
@@ -144,16 +154,12 @@ def test_the_wheel_of_the_sdist_is_whole_and_its_first_command_runs(tmp_path: Pa
 
 
 @pytest.mark.long
-def test_the_packagers_find_nothing(tmp_path: Path) -> None:
-    tools = {name: shutil.which(name) for name in ("check-wheel-contents", "twine", "pyproject-build")}
+def test_the_packagers_find_nothing(built: list[Path]) -> None:
+    tools = {name: shutil.which(name) for name in ("check-wheel-contents", "twine")}
     if missing := [name for name, path in tools.items() if path is None]:
         pytest.skip(f"there is no {', '.join(missing)} here; the release workflow has them")
-    source = tmp_path / "source"
-    run("git", "clone", "-q", "--local", ROOT, source, cwd=tmp_path)
-    run(tools["pyproject-build"], "--no-isolation", "-o", tmp_path / "dist", source, cwd=tmp_path)
-    (wheel,) = (tmp_path / "dist").glob("*.whl")
-    run(tools["check-wheel-contents"], wheel, cwd=source)
-    run(tools["twine"], "check", "--strict", *(tmp_path / "dist").iterdir(), cwd=tmp_path)
+    run(tools["check-wheel-contents"], built[1], cwd=ROOT)
+    run(tools["twine"], "check", "--strict", *built, cwd=ROOT)
 
 
 def test_to_import_the_package_imports_none_of_what_takes_time() -> None:

@@ -129,8 +129,9 @@ def check_result(found: Result, transports: list[str]) -> None:
     assert [one["transport"] for one in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
     assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
-    own = [one for one in facts["rows"] if one["bytes"] == facts["needs"]["sample_bytes"]]
-    assert all(one["one_way_us"]["p50"] > 0 for one in own)
+    for one in facts["rows"]:  # a machine that stands still for half a second loses all of a row
+        assert (one["one_way_us"] is None) == (one["lost"] == one["sent"])
+        assert one["one_way_us"] is None or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
     assert is_documented("ping --benchmark", facts)
     assert len(found.to_frame()) == len(facts["rows"])
 
