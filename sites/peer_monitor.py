@@ -87,7 +87,12 @@ class PeerMonitor:
             self.away[member] = t_ns, f"{member} is gone since t = {t_ns * 1e-9:.1f} s"
 
     def _read(self, inbox: Inbox, publisher: EventPublisher, t_ns: int) -> Iterator[Event]:
-        """Takes a peer's events; yields those of starts that come."""
+        """Takes a peer's events; yields those of starts that come.
+
+        Of what it admitted in the place of this site the last counts: before came starts that died joining.
+        """
+        own = publisher.info.boot
+        in_place = own
         for event in read_events(inbox):
             if event.kind == "coming" and self._admits:
                 yield event
@@ -101,10 +106,10 @@ class PeerMonitor:
                     self.away[event.member] = t_ns, event.text
                     publisher.publish("left", event.text, about=event.member, t_ns=t_ns, ticks=event.ticks)
             elif event.kind == "admit" and event.about == self._site:
-                own = publisher.info.boot
-                if event.boots.get(self._site) != own and self.boots.get(self._site) == own:
-                    self.ended_by = f"another start of {self._site} has taken its place"
-                    self.ended_member = self._site
+                in_place = event.boots.get(self._site, own)
+        if in_place != own and self.boots.get(self._site) == own:
+            self.ended_by = f"another start of {self._site} has taken its place"
+            self.ended_member = self._site
 
     def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
         """Admits another start of a site, or says why not."""

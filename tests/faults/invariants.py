@@ -125,26 +125,45 @@ def check_storage(session: FaultSession) -> Iterator[str]:
 def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]]]:
     """How much the storage rises in a tick of every hold: from 20 ticks on, and before beyond that work, J.
 
-    Both are relative to the largest storage in it, where that is more than 1 J.
+    Both are relative to the largest storage in it, where that is more than 1 J. Ticks in which the limit of
+    its rate keeps the torque from being that of the law say nothing of the law.
     """
     for name, states in session.published.states.items():
         setup = session.scenario.setup(name)
-        for (_, mode), held in groupby(states, key=lambda state: (state.boot, state.mode)):
-            rows = list(held)
+        limited = find_limited_ticks(session.scenario, name, states)
+        for (_, mode), held in groupby(enumerate(states), key=lambda at: (at[1].boot, at[1].mode)):
+            first, rows = 0, []
+            for place, state in held:
+                first = first if rows else place
+                rows.append(state)
             if mode != "hold" or len(rows) < 2:
                 continue
             S = compute_storage(session.scenario, name, rows)
             qd, qd_des = (np.array([getattr(state, key) for state in rows]) for key in ("qd", "qd_des"))
             power = (qd * np.asarray(setup.gains.Kd) * qd_des).sum(axis=1)
+            free = ~limited[first : first + len(rows) - 1]
             rises = np.diff(S) / max(1.0, S.max())
             work = 0.5 * (power[1:] + power[:-1]) / setup.rate_hz / max(1.0, S.max())
             yield (
                 name,
                 (
-                    rises[SILENT_TICKS:].max(initial=-np.inf),
-                    (rises - work)[:SILENT_TICKS].max(initial=-np.inf),
+                    rises[SILENT_TICKS:][free[SILENT_TICKS:]].max(initial=-np.inf),
+                    (rises - work)[:SILENT_TICKS][free[:SILENT_TICKS]].max(initial=-np.inf),
                 ),
             )
+
+
+def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -> np.ndarray:
+    """True for every record whose torque, or that before, stepped by as much as its rate allows.
+
+    Over the period after a record the arm feels both of them (Eq. (8), extrapolated to mid-period).
+    """
+    setup = scenario.setup(name)
+    most = np.asarray(setup.limits.tau_rate) / setup.rate_hz * (1.0 - RESIDUAL)
+    tau = np.array([state.tau for state in states])
+    limited = np.any(np.abs(np.diff(tau, axis=0, prepend=tau[:1])) >= most, axis=1)
+    found: np.ndarray = limited | np.r_[False, limited[:-1]]
+    return found
 
 
 def compute_storage(scenario: Scenario, name: str, states: Sequence[State]) -> np.ndarray:

@@ -262,12 +262,16 @@ def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_pa
     assert link.loss == 0.0
 
 
-def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("dies_ms", "again_ms"), [(4300, 5000), (4050, 4060)])
+def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(
+    dies_ms: int, again_ms: int, tmp_path: Path
+) -> None:
+    """Also if the other site admits it only when the next one is there already."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
     session.site("m", at_ns=4 * S)
-    session.clocks["m"].dies_ns = 4 * S + 300_000_000  # it is admitted, and has said `coming` alone
-    session.site("m", at_ns=5 * S)
+    session.clocks["m"].dies_ns = dies_ms * 1_000_000  # it has said `coming` alone
+    session.site("m", at_ns=again_ms * 1_000_000)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
     admitted = [event for event in log.events if event.kind == "admit"]
