@@ -264,20 +264,16 @@ def _changes(spare: Sequence[float]) -> list[int]:
 def _straighten(values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]) -> Array:
     """Returns what is zero at the edges of a column and goes straight between its values, shape (y,).
 
-    Far from an edge it is a step of the grid. An edge that is not given is where `spare` itself, if it went
-    straight, would be zero.
+    Elsewhere it is `spare`, by which a line that rises steeply finds its way between two columns. An edge
+    that is not given is where `spare` itself, if it went straight, would be zero.
     """
-    step = abs(values[-1] - values[0]) / (len(values) - 1)
-    straight: Array = np.where(np.isfinite(spare), np.where(np.array(spare) > 0.0, step, -step), np.nan)
-    done = -1
+    straight: Array = np.where(np.isfinite(spare), spare, np.nan)
+    straight[straight == 0.0] = -_ROUNDING
     for n in _changes(spare):
         low, high = values[n : n + 2]
         share = (edges[n] - low) / (high - low) if n in edges else spare[n] / (spare[n] - spare[n + 1])
         share = min(max(share, _ROUNDING), 1.0 - _ROUNDING)
-        if n > done:  # else it is given by the edge below it
-            straight[n] = np.copysign(share * (high - low), straight[n])
         straight[n + 1] = straight[n] * (1.0 - 1.0 / share)
-        done = n + 1
     return straight
 
 
