@@ -74,6 +74,7 @@ def _row(what: str) -> Scenario:
     return next(row.make() for row in ROWS if row.what == what)
 
 
+@pytest.mark.long
 def test_the_truth_of_rows_that_die_out_later() -> None:
     """Parametric resonance detunes itself after minutes, and so does the limit cycle; both grew before."""
     first, last = _speed(_row("the delay swings at 1.7 Hz"), 60.0, 120.0)
@@ -85,6 +86,7 @@ def test_the_truth_of_rows_that_die_out_later() -> None:
 GROW = [row for row in ROWS if row.mark in ("F1", "F5", "F2") or "hammers" in row.what]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("row", GROW, ids=_named)
 def test_the_truth_of_rows_that_grow(row: Row) -> None:
     assert find_truth(Drawn("row", row.make())).unstable

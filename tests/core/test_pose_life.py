@@ -57,6 +57,7 @@ def steps(turns: Array) -> Array:
     return np.asarray((found[1:] * found[:-1].inv()).as_rotvec())
 
 
+@pytest.mark.long
 def test_the_way_to_peers_at_rest_is_the_shortest_turn_at_the_speed_that_is_allowed() -> None:
     run = drive((0.0, 0.0, 0.0), [(50, 5000)], 4000)
     aligning = np.flatnonzero(run["mode"] == Mode.RETURN)

@@ -46,6 +46,7 @@ def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path)
     assert made.returncode == case["exit"], made.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", _params(BEFORE["exit"]))
 def test_every_exit_code_stays(case: dict, tmp_path: Path) -> None:
     asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]

@@ -42,6 +42,7 @@ class Law(Adaptive):
 """
 
 
+@pytest.mark.long
 def test_a_law_that_is_too_slow_ends_the_session_in_order(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

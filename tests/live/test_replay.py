@@ -68,6 +68,7 @@ def virtual_log(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(stage: Stage) -> None:
     """Round after round, so that nobody is too late; until Ctrl-C."""
     path = virtual_log(stage.folder)

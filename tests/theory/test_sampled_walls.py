@@ -42,13 +42,14 @@ def test_the_map_in_contact_has_its_edge() -> None:
     assert not found.stable_above
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("B", "b"),
     [
         (0.0, 5.0),
-        pytest.param(2.0, 10.0, marks=pytest.mark.long),
-        pytest.param(5.0, 10.0, marks=pytest.mark.long),
-        pytest.param(0.0, 20.0, marks=pytest.mark.long),
+        (2.0, 10.0),
+        (5.0, 10.0),
+        (0.0, 20.0),
     ],
 )
 def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:

@@ -22,9 +22,8 @@ def run(law: str) -> Log:
     return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
-@pytest.mark.parametrize(
-    "law", [pytest.param(law, marks=pytest.mark.long if law != "tanks" else ()) for law in LAWS]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("law", LAWS)
 def test_the_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
     log = run(law)
     found = observe_energies(log)
