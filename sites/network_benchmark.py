@@ -105,7 +105,7 @@ class NearEnd:
                 yield sample.number, arrived_ns - sample.sent_ns
 
     def meet(self) -> bool:
-        """Returns whether the far end answers in time."""
+        """Returns True if the far end answers in time."""
         clock = self._clock
         until_ns = clock.monotonic_ns() + CONNECT_NS
         while clock.monotonic_ns() < until_ns:
@@ -222,7 +222,7 @@ class ScenarioNeeds(NamedTuple):
 
 def find_needs(scenario: Scenario) -> ScenarioNeeds:
     """Returns what a scenario asks of a network; takes as long as `trilat linear`."""
-    links = [scenario.links[name] for name in scenario.links]
+    links = list(scenario.links.values())
     shared = max(arm.counts.shared for arm in scenario.arms.values())
     vectors = {name: [0.5] * shared for name in ("q", "qd", "tau_x")}
     sample = PeerSample(
@@ -252,7 +252,7 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
 
 
 def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns whether a network is good enough, by its row at the scenario's own size and rate.
+    """Judges if a network is good enough, by its row at the scenario's own size and rate.
 
     A sample is in use from its receiver's first tick after it came and was due (L2): the network counts with
     its p99, a play-out and the scenario's own delay hide what is shorter.
@@ -291,7 +291,7 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """Whether it is good enough over every transport."""
+        """True if it is good enough over every transport."""
         return all(one["good"] for one in self.judged)
 
     def to_dict(self) -> dict[str, Any]:

@@ -131,17 +131,15 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
     for name, states in session.published.states.items():
         setup = session.scenario.setup(name)
         limited = find_limited_ticks(session.scenario, name, states)
-        for (_, mode), held in groupby(enumerate(states), key=lambda at: (at[1].boot, at[1].mode)):
-            first, rows = 0, []
-            for place, state in held:
-                first = first if rows else place
-                rows.append(state)
+        marked = zip(states, limited, strict=True)
+        for (_, mode), held in groupby(marked, key=lambda at: (at[0].boot, at[0].mode)):
+            rows, bound = map(list, zip(*held, strict=True))
             if mode != "hold" or len(rows) < 2:
                 continue
             S = compute_storage(session.scenario, name, rows)
             qd, qd_des = (np.array([getattr(state, key) for state in rows]) for key in ("qd", "qd_des"))
             power = (qd * np.asarray(setup.gains.Kd) * qd_des).sum(axis=1)
-            free = ~limited[first : first + len(rows) - 1]
+            free = ~np.array(bound[:-1])
             rises = np.diff(S) / max(1.0, S.max())
             work = 0.5 * (power[1:] + power[:-1]) / setup.rate_hz / max(1.0, S.max())
             yield (

@@ -153,17 +153,23 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
     assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
 
 
+def following(stage: Stage, apart: Machines, duration_s: int) -> Apart:
+    """A session under `glide`, in which every site follows its peers."""
+    session = Apart(stage, apart, "--duration", str(duration_s), *GLIDE)
+    session.all()
+    session.begun()
+    for name in SITES:
+        session.processes[name].prints(FOLLOWS)
+    return session
+
+
 @pytest.mark.long
 def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_when_killed(
     stage: Stage, apart: Machines
 ) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
     bridged(apart, ALL)
-    session = Apart(stage, apart, "--duration", "40", *GLIDE)
-    session.all()
-    session.begun()
-    for name in SITES:
-        session.processes[name].prints(FOLLOWS)
+    session = following(stage, apart, 40)
     apart.part("m1", "m2")
     pause(6.0)
     apart.mend("m1", "m2")
@@ -198,11 +204,7 @@ def test_a_way_that_is_cut_in_one_direction_is_held_at_both_ends(stage: Stage, a
     its retransmission timer runs out; then m1 hears nothing either, and holds too.
     """
     bridged(apart, ALL)
-    session = Apart(stage, apart, "--duration", "36", *GLIDE)
-    session.all()
-    session.begun()
-    for name in SITES:
-        session.processes[name].prints(FOLLOWS)
+    session = following(stage, apart, 36)
     for cut_s in (2.5, 8.0):
         try:
             apart.deafen("m2", "m1")

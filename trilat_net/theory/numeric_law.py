@@ -68,6 +68,11 @@ class NumericLaw:
             for name in ("tau_before", "q_before"):
                 self.names += tuple(f"{name}[{joint + 1}]" for joint in range(self._layout.joints))
 
+    @property
+    def _memory_at(self) -> slice:
+        """Where its memory stands in the arguments: after the angles and speeds."""
+        return slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
+
     def __call__(self, _context: LawContext) -> UserLaw:
         """Returns the law."""
         return self._law
@@ -82,8 +87,7 @@ class NumericLaw:
 
     def settle(self, x: Array, ticks: int) -> Array:
         """Returns its memory after so many ticks of the same arguments, or once it stays as it is."""
-        memory = slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
-        x = x.copy()
+        memory, x = self._memory_at, x.copy()
         for _ in range(ticks):
             step = self._evaluate(x)[1] / self._rate_hz
             x[memory] += step
@@ -115,10 +119,7 @@ class NumericLaw:
         return whole[: len(torque)], whole[len(torque) :]
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:
-        n, memory = (
-            self._layout.joints,
-            slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory)),
-        )
+        n, memory = self._layout.joints, self._memory_at
         past = x[memory][self._own :] if self._keeps_past else np.r_[np.zeros(n), x[:n]]
         after = self._ask(x, past)
         torque, kept = after[:n], after[n:]
@@ -129,7 +130,7 @@ class NumericLaw:
         """Returns the torque and the law's own memory after a tick; `past`: torque and angles before it."""
         a, n = self._arrays, self._layout.joints
         s: Any = a.site[0]
-        start = 2 * n + len(self.memory)
+        start = self._memory_at.stop
         s.q[:], s.qd[:] = x[:n], x[n : 2 * n]
         s.q_des[:], s.qd_des[:], s.felt[:] = np.split(x[start : start + 3 * n], 3)
         s.tau_before[:], s.q_before[:] = np.split(past, 2)
