@@ -22,19 +22,16 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
 from ..scenario import Scenario
 from ..scenario.scenario_types import Limits
-from .following import read_rest
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _TASK_COLUMNS = ("x", "xd", "wrench")
 _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
-STOPPED_MODES = ("fault", "stopped")
-"""Modes in which the torque is not that of the law."""
-RESTING_MODES = ("waiting", "hold")
-"""Modes in which a site in task space holds its joint pose."""
+RESTING_MODES = ("waiting", "hold", "fault", "stopped")
+"""Modes in which, under the rule `glide`, the torque is not that of the law alone."""
 RESUMING_S = 2.0 * BLEND_S
-"""For so long after these it may not be that of the law alone."""
+"""For so long after these it may not be that either."""
 
 
 class AlignedRecords(NamedTuple):
@@ -57,8 +54,7 @@ class AlignedRecords(NamedTuple):
         wrench: what tau_x amounts to there, likewise.
         axes: see `SiteLog`.
         hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
-        stopped: True in one of the `STOPPED_MODES`, and for `RESUMING_S` afterwards; empty: never.
-        rest: in task space under the rule `glide` the joint pose that is held, see `following.read_rest`.
+        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards; empty: never.
     """
 
     site: str
@@ -79,8 +75,7 @@ class AlignedRecords(NamedTuple):
     wrench: Array = _NONE
     axes: tuple[float, ...] = ()
     hand: Array = _NONE
-    stopped: Bools = _NO_ROWS
-    rest: Array = _NONE
+    rests: Bools = _NO_ROWS
 
     @property
     def shared(self) -> Array:
@@ -172,12 +167,12 @@ def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
     return np.asarray((np.abs(qd_des) < limit).all(axis=-1))
 
 
-def _find_stopped(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Returns the records in one of the `STOPPED_MODES`, or within `RESUMING_S` after one."""
-    stopped = np.isin(modes, STOPPED_MODES)
-    if not stopped.any():
-        return stopped
-    last = np.maximum.accumulate(np.where(stopped, tick, np.iinfo(np.int64).min // 2))
+def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
+    """Returns the records in one of the `RESTING_MODES`, or within `RESUMING_S` after one."""
+    rests = np.isin(modes, RESTING_MODES)
+    if not rests.any():
+        return rests
+    last = np.maximum.accumulate(np.where(rests, tick, np.iinfo(np.int64).min // 2))
     found: Bools = tick - last <= RESUMING_S * rate_hz
     return found
 
@@ -194,13 +189,10 @@ def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | N
     before = np.searchsorted(tick, grid, side="right") - 1
     known: Bools = tick[before] == grid
     follows: Bools = (part.mode[rows] == "run")[before]
-    stopped = _find_stopped(part.mode[rows], tick, part.rate_hz)[before]
+    glides = scenario.sites[part.name].on_stale.action == "glide"
+    rests = _find_rests(part.mode[rows], tick, part.rate_hz)[before] if glides else _NO_ROWS
     follows &= find_unlimited(scenario.sites[part.name].limits, part.qd_des[rows])[before]
     columns = {name: getattr(part, name)[rows] for name in names}
-    if part.layout.task and scenario.sites[part.name].on_stale.action == "glide":
-        place = part.layout.rest_columns(len(part.peers))
-        mem = np.array([part.mem[row][place] for row in rows])
-        columns["rest"] = read_rest(mem, np.isin(part.mode[rows], RESTING_MODES))
     for name, values in columns.items():
         columns[name] = (
             values[: len(grid)]
@@ -216,7 +208,7 @@ def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | N
         follows,
         used=used,
         axes=part.axes,
-        stopped=stopped if stopped.any() else _NO_ROWS,
+        rests=rests if rests.any() else _NO_ROWS,
         **columns,
     )
 

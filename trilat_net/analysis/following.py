@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.task_space import REST_RATE_1_S, REST_S
 from ..core.vectors import Array
 from ..log.record_columns import Ints
 from .arm_rows import ArmRows, PlanarArmRows
@@ -60,8 +59,7 @@ class TaskFollowing:
     Attributes:
         Lambda: 0 along an axis that it does not follow, shape (m,).
         J, Jd: Jacobian of the followed axes and its derivative, shape (K, m, n).
-        psi, psi_rate: velocity towards the posture, and towards a joint pose that is held, and its
-            derivative, shape (K, n).
+        psi, psi_rate: velocity towards the posture, and its derivative, shape (K, n).
         inverse: of J J' with its damping, shape (K, m, m).
         damping, damping_rate: shape (K,), m^2 and m^2/s.
         least: the lower bound of the least singular value that damping goes by, shape (K,), m.
@@ -123,19 +121,8 @@ class TaskFollowing:
 Following = JointFollowing | TaskFollowing
 
 
-def read_rest(mem: Array, rests: Bools) -> Array:
-    """Returns the weight of the joint pose that is held, its derivative and the pose, shape (K, 2 + n).
-
-    `mem` has the share and the pose, see `Layout.rest_columns`; `rests` says where the share grows.
-    """
-    share = mem[:, :1]
-    growing = np.where(rests[:, np.newaxis], 1.0, -1.0) / REST_S
-    weight, rate = share**2 * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share) * growing
-    return np.hstack([weight, rate, mem[:, 1:]])
-
-
-def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array, rest: Array | None = None) -> Following:
-    """Returns how a site follows along rows of its joints, shape (K, n); `rest` is of `read_rest`."""
+def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
+    """Returns how a site follows along rows of its joints, shape (K, n)."""
     task = arm.task
     if isinstance(arm, PlanarArmRows) or task is None:
         return JointFollowing(Lambda)
@@ -154,10 +141,6 @@ def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array, rest: Array | 
         inverse = np.linalg.inv(A + damping[:, np.newaxis, np.newaxis] * np.eye(len(axes)))
     to_posture = task.posture_rate * (np.array(task.posture) - q)
     psi, psi_rate = to_posture, -task.posture_rate * qd
-    if rest is not None and rest.size:
-        weight, rate, to_rest = rest[:, :1], rest[:, 1:2], REST_RATE_1_S * (rest[:, 2:] - q)
-        psi = (1.0 - weight) * to_posture + weight * to_rest
-        psi_rate = rate * (to_rest - to_posture) + (1.0 - weight) * psi_rate - weight * REST_RATE_1_S * qd
     return TaskFollowing(
         Lambda,
         J,

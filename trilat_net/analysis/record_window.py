@@ -12,15 +12,7 @@ import numpy as np
 
 from ..net.messages import TASK_VECTORS, State
 from ..scenario import Scenario
-from .aligned import (
-    RECORD_COLUMNS,
-    RESTING_MODES,
-    RESUMING_S,
-    STOPPED_MODES,
-    AlignedRecords,
-    find_unlimited,
-)
-from .following import read_rest
+from .aligned import RECORD_COLUMNS, RESTING_MODES, RESUMING_S, AlignedRecords, find_unlimited
 
 KEPT_S = 12.0
 """Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
@@ -41,20 +33,16 @@ class RecordWindow:
         layout = scenario.layout(site)
         names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()), *(("hand",) if layout.hand else ()))
         lengths = layout.lengths()
-        self._rest = slice(0)
-        if layout.task and scenario.sites[site].on_stale.action == "glide":
-            names, self._rest = (*names, "rest"), layout.rest_columns(len(self.peers))
-            lengths["rest"] = layout.joints + 2
         ends = list(accumulate(lengths[name] for name in names))
         self._columns = {name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)}
         self._kept = max(8, round(kept_s * self.rate_hz))
         self._floats = np.zeros((2 * self._kept, ends[-1]))
         self._used = np.full((2 * self._kept, len(self.peers)), -1, dtype=np.int64)
         self._known = np.zeros(2 * self._kept, dtype=np.bool_)
-        self._follows, self._stopped = np.zeros((2, 2 * self._kept), dtype=np.bool_)
+        self._follows, self._rests = np.zeros((2, 2 * self._kept), dtype=np.bool_)
         self._limits = scenario.sites[site].limits
         self.first, self.newest = 0, -1
-        self._stopped_at = -(2**40)
+        self._glides, self._rested_at = scenario.sites[site].on_stale.action == "glide", -(2**40)
 
     def take(self, record: State) -> bool:
         """Adds a record; false if it is older than the window, or says that the site diverged."""
@@ -66,16 +54,12 @@ class RecordWindow:
             self._move(record.tick - self._kept + 1)
         row = record.tick - self.first
         for name, columns in self._columns.items():
-            if name != "rest":
-                self._floats[row, columns] = getattr(record, name)
-        if "rest" in self._columns:
-            mem, rests = np.array([record.mem[self._rest]]), np.array([record.mode in RESTING_MODES])
-            self._floats[row, self._columns["rest"]] = read_rest(mem, rests)[0]
+            self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
-        if record.mode in STOPPED_MODES:
-            self._stopped_at = max(self._stopped_at, record.tick)
-        since = record.tick - self._stopped_at
-        self._known[row], self._stopped[row] = True, 0 <= since <= RESUMING_S * self.rate_hz
+        if self._glides and record.mode in RESTING_MODES:
+            self._rested_at = max(self._rested_at, record.tick)
+        since = record.tick - self._rested_at
+        self._known[row], self._rests[row] = True, 0 <= since <= RESUMING_S * self.rate_hz
         free = self._limits.qd_des_limit_rad_s is None or find_unlimited(
             self._limits, np.array(record.qd_des)
         )
@@ -86,7 +70,7 @@ class RecordWindow:
     def _move(self, first: int) -> None:
         """Forgets the records before a tick."""
         left = max(0, self.newest + 1 - first)
-        for column in (self._floats, self._used, self._known, self._follows, self._stopped):
+        for column in (self._floats, self._used, self._known, self._follows, self._rests):
             column[:left] = column[first - self.first :][:left].copy()
         self._known[left:] = False
         self.first = first
@@ -99,20 +83,20 @@ class RecordWindow:
         """Returns the records of ticks in the window, both ends included; a missing one is interpolated."""
         part = slice(first - self.first, last + 1 - self.first)
         known, floats, used = self._known[part].copy(), self._floats[part], self._used[part]
-        follows, stopped = self._follows[part].copy(), self._stopped[part].copy()
+        follows, rests = self._follows[part].copy(), self._rests[part].copy()
         if not known.all() and known.any():
             floats, there = floats.copy(), np.flatnonzero(known)
             for column in floats.T:
                 column[:] = np.interp(np.arange(len(known)), there, column[there])
             before = there[np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)]
-            used, follows, stopped = used[before], follows[before], stopped[before]
+            used, follows, rests = used[before], follows[before], rests[before]
         columns: dict[str, Any] = {name: floats[:, where] for name, where in self._columns.items()}
         return AlignedRecords(
             *(self.site, self.rate_hz, first, known, follows),
             **columns,
             used={peer: used[:, n] for n, peer in enumerate(self.peers)},
             axes=self._axes,
-            stopped=stopped,
+            rests=rests,
         )
 
 

@@ -21,7 +21,6 @@ from .jit import leaf
 from .site_setup import Law
 from .task_space import (
     add_task_torque,
-    rest_velocity,
     update_pose,
     update_task_errors,
     update_wrench,
@@ -95,8 +94,6 @@ def update_torque(s: Row, chain: RowArray) -> None:
                 torque -= robust_torque(s.rho[i], s.width[i], s.r[i])
         else:
             torque -= s.d[i] * s.qd[i]
-            if s.rest_share > 0.0:
-                torque += s.d[i] * rest_velocity(s, i)
         s.tau[i] = limit_torque(torque, s.tau_limit[i])
 
 

@@ -12,7 +12,8 @@ from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
-from .safeguards import fall_back, is_torque_finite, limit_reference, limit_torque_rate, return_to_law
+from .resting import add_rest_torque, advance_rest, limit_torque_rate, rests, rests_by_law
+from .safeguards import is_torque_finite, limit_reference, return_to_law
 from .session_life import is_law_returning, latch, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
@@ -20,8 +21,7 @@ from .task_space import POSE, update_orientation_reference
 from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
-_DIVERGED, _FAULT, _STOPPED = int(Mode.DIVERGED), int(Mode.FAULT), int(Mode.STOPPED)
-_HOLD, _WAITING, _ALIGN = int(Mode.HOLD), int(Mode.WAITING), int(Mode.RETURN)
+_DIVERGED, _FAULT = int(Mode.DIVERGED), int(Mode.FAULT)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
@@ -58,8 +58,7 @@ def _advance_estimate(s: Row, chain: RowArray | None, gain_s: float, Yr: Vector)
 @leaf
 def _adapts(s: Row) -> bool:
     """True in a mode in which estimates follow their law."""
-    stopped: bool = s.mode == _DIVERGED or s.mode == _FAULT or s.mode == _STOPPED
-    return not stopped
+    return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
 
 @leaf
@@ -97,21 +96,21 @@ def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of a site without its law, and none that changes faster than it may.
-
-    In FAULT and STOPPED no law acts; one that is plugged in does not while the site waits or holds, unless it
-    says that it holds by its reference, which in task space is not all of the arm.
-    """
+    """Ends stage 6: the torque of an arm at rest or on its way back, and none that changes too fast."""
+    resting = False
     if s.on_stale == _GLIDE:
-        if s.mode != _FAULT and s.mode != _DIVERGED and not is_torque_finite(s):
-            latch(tick_ns(k - 1, s.rate_hz), s, _FAULT, _NOT_FINITE)
-        pauses = s.law == _OWN and (s.holds == 0 or s.task != 0)
-        if s.mode == _FAULT or s.mode == _STOPPED or (pauses and (s.mode == _HOLD or s.mode == _WAITING)):
-            _put_known_gravity(s, chain, s.u)
-            fall_back(t_ns, s)
-        elif (pauses and s.mode == _ALIGN) or is_law_returning(t_ns, s):
+        if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
+            latch(t_ns, s, _FAULT, _NOT_FINITE)
+        resting = rests(s)
+        if resting:
+            if not rests_by_law(s):
+                _put_known_gravity(s, chain, s.tau)
+            add_rest_torque(k, t_ns, s)
+        elif is_law_returning(t_ns, s):
             return_to_law(t_ns, s)
     limit_torque_rate(s)
+    if resting:
+        advance_rest(t_ns, s)
 
 
 @leaf
@@ -245,10 +244,11 @@ def reference_stages(
     update_reference(t_ns, s, links, ramps)  # 3 reference
     _place_arm(s, chain, links, True)
     if s.on_stale == _GLIDE:
-        update_session_life(t_ns, tick_ns(k - 1, s.rate_hz), s, links)
+        update_session_life(t_ns, s, links)
     else:
         update_stale_mode(t_ns, s, links)
-    limit_reference(k, s)
+    if not rests(s):
+        limit_reference(k, s)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
     _update_external_torque(t_ns * 1e-9, s, chain, actors, table)

@@ -1,20 +1,19 @@
-"""Last of all: how fast a reference and a torque may change, and the torque of a site that is stopped.
+"""How fast a reference may change, and a torque that goes back to that of the law.
 
-Invariant: whatever a law asks for, the reference moves no faster than its limit, and the torque differs from
-that of the tick before by no more than its rate allows. Without limits, and in other modes, nothing changes.
+Invariant: whatever a law asks for, the reference moves no faster than its limit. Without limits, and in other
+modes, nothing changes.
 """
 
 from math import inf, isfinite
 
 from .chain import put_three, scale, three
-from .control import limit_torque
 from .jit import leaf
 from .rotation import add_turn, rotation_matrix, turn_between
-from .task_space import has_orientation, rest_velocity, straight_coordinates
+from .task_space import has_orientation, straight_coordinates
 from .vectors import Row
 
 BLEND_S = 0.1
-"""Time in which a torque goes over to damping and gravity, and back to that of the law."""
+"""Time in which a torque goes over from that of an arm at rest to that of the law."""
 
 
 @leaf
@@ -66,34 +65,8 @@ def is_torque_finite(site: Row) -> bool:
 
 
 @leaf
-def fall_back(t_ns: int, site: Row) -> None:
-    """Writes the torque of a site without its law: from the last one to `u`, which is gravity, less B qd.
-
-    In task space it goes back to the joint pose that it holds. A torque that is no number is none.
-    """
-    share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
-    for i in range(site.joints):
-        speed = site.qd[i]
-        if site.rest_share > 0.0:
-            speed -= rest_velocity(site, i)
-        goal = limit_torque(site.u[i] - site.damping[i] * speed, site.tau_limit[i])
-        if not isfinite(goal):
-            goal = 0.0
-        site.tau[i] = site.tau_held[i] + share * (goal - site.tau_held[i])
-
-
-@leaf
 def return_to_law(t_ns: int, site: Row) -> None:
     """Writes the torque of a site that has its law again: from the last one to that of the law."""
     share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
     for i in range(site.joints):
         site.tau[i] = site.tau_held[i] + share * (site.tau[i] - site.tau_held[i])
-
-
-@leaf
-def limit_torque_rate(site: Row) -> None:
-    """Holds the torque within reach of that of the tick before; before the first tick there is none."""
-    for i in range(site.joints):
-        if site.tau_rate[i] < inf:
-            most, before = site.tau_rate[i] / site.rate_hz, site.tau_before[i]
-            site.tau[i] = min(max(site.tau[i], before - most), before + most)

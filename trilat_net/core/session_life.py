@@ -4,22 +4,22 @@
     any -> FAULT (a limit, a number that is not finite, its arm lost)  -- RESET  -> WAITING
     any -> STOPPED (an order, or nobody holds its dead-man switch) -- ENABLE, HELD -> WAITING
 
-Invariant: the reference and its derivative never jump, and the second is the derivative of the first. Held,
-the rate of the reference falls to zero over the time after which a peer counts as silent, and the reference
-is its integral; while the site aligns, the way from the peers' reference falls to zero with its rate, no
-faster than `align_speed` beyond what it had. Of an orientation the way is the rotation vector of the turn
-from the peers' to the own one, and a rate is an angular velocity. A peer that holds or aligns itself is
+Invariant: in WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays there, in one way
+(`resting`): the reference leaves the peers, begins at the own pose with the own velocity, and falls to rest.
+From there to the peers and while it follows them neither it nor its derivative jumps, and the second is the
+derivative of the first: while the site aligns, the way from the peers' reference falls to zero with its rate,
+no faster than `align_speed` beyond what it had. Of an orientation the way is the rotation vector of the turn
+from the peers' to the own one, and a rate is an angular velocity. A peer that rests or aligns itself is
 followed like any other.
-FAULT and STOPPED are latched: the torque goes over from the last one to damping and gravity (`safeguards`),
-and afterwards in the same way back to that of the law; meanwhile the reference is the own pose, and estimates
-stay as they are. No message of a peer leads there or back. A switch that is held again ends what its release
-began, but no stop by order.
+FAULT and STOPPED are latched. No message of a peer leads there or back. A switch that is held again ends what
+its release began, but no stop by order.
 """
 
 from math import isfinite
 
-from .chain import Three, add, put_three, subtract, three
+from .chain import add, put_three, scale, subtract, three
 from .jit import leaf
+from .resting import begin_rest, put_rest_reference, rests
 from .rotation import (
     add_turn,
     length,
@@ -29,14 +29,14 @@ from .rotation import (
     turn_rate,
     turning_velocity,
 )
-from .task_space import has_orientation, keep_rest, straight_coordinates
+from .task_space import has_orientation, straight_coordinates
 from .ticks import LifeOrder, LifeReason, Mode, tick_ns
-from .vectors import Row, RowArray, put
+from .vectors import Array, Row, RowArray, put
 
 MIN_ALIGN_NS = 250_000_000
 """The least time of an alignment."""
 RETURN_NS = 100_000_000
-"""Time in which a torque goes back from damping and gravity to that of the law, `safeguards.BLEND_S`."""
+"""Time in which a torque goes over from that of an arm at rest to that of the law."""
 HELD_OVERRUN_TICKS = 20
 """A site at an arm outside that missed more ticks than these holds."""
 FAULT_OVERRUN_TICKS = 200
@@ -45,7 +45,7 @@ FAULT_OVERRUN_TICKS = 200
 _RUN, _DIVERGED, _HOLD = int(Mode.RUN), int(Mode.DIVERGED), int(Mode.HOLD)
 _ALIGN, _WAITING = int(Mode.RETURN), int(Mode.WAITING)
 _FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
-_START = int(LifeReason.START)
+_START, _DROPPED, _RESTORED = int(LifeReason.START), int(LifeReason.DROPPED), int(LifeReason.RESTORED)
 _PEERS_HERE, _ALIGNED = int(LifeReason.PEERS_HERE), int(LifeReason.ALIGNED)
 _PEER_SILENT, _PEERS_BACK = int(LifeReason.PEER_SILENT), int(LifeReason.PEERS_BACK)
 _ALIGN_LIMIT, _OVERRUN = int(LifeReason.ALIGN_LIMIT), int(LifeReason.OVERRUN)
@@ -53,7 +53,6 @@ _LIMIT_Q, _LIMIT_QD = int(LifeReason.LIMIT_Q), int(LifeReason.LIMIT_QD)
 _NOT_FINITE, _STOP = int(LifeReason.NOT_FINITE), int(LifeReason.STOP)
 _ENABLE, _RESET = int(LifeReason.ENABLE), int(LifeReason.RESET)
 _ARM_SILENT, _ARM_BACK = int(LifeReason.ARM_SILENT), int(LifeReason.ARM_BACK)
-_RESUMED = int(LifeReason.RESUMED)
 _RELEASED, _HELD = int(LifeReason.RELEASED), int(LifeReason.HELD)
 _TO_STOP, _TO_ENABLE, _TO_RESET = int(LifeOrder.STOP), int(LifeOrder.ENABLE), int(LifeOrder.RESET)
 _HEAR_SILENCE, _LOSE_ARM = int(LifeOrder.ARM_SILENT), int(LifeOrder.ARM_LOST)
@@ -71,45 +70,6 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 
 
 @leaf
-def _enter(t_ns: int, mode: int, reason: int, site: Row) -> None:
-    site.mode, site.reason, site.return_from_ns = mode, reason, t_ns
-
-
-@leaf
-def _find_fall(t_ns: int, site: Row, i: int) -> tuple[float, float]:
-    """Returns how far the reference has gone since it is held, and its rate, which falls to zero."""
-    fall_s = site.stale_ns * 1e-9
-    since_s = min((t_ns - site.return_from_ns) * 1e-9, fall_s)
-    rate = site.qd_held[i] * (1.0 - since_s / fall_s)
-    return 0.5 * (site.qd_held[i] + rate) * since_s, rate
-
-
-@leaf
-def _find_held(t_ns: int, site: Row, i: int) -> tuple[float, float]:
-    """Returns where the held reference is and its rate."""
-    way, rate = _find_fall(t_ns, site, i)
-    return site.q_held[i] + way, rate
-
-
-@leaf
-def _find_held_orientation(t_ns: int, site: Row) -> tuple[Three, Three]:
-    """Returns the orientation of the held reference and its angular velocity."""
-    x, wx = _find_fall(t_ns, site, 3)
-    y, wy = _find_fall(t_ns, site, 4)
-    z, wz = _find_fall(t_ns, site, 5)
-    return add_turn((x, y, z), three(site.q_held[3:])), (wx, wy, wz)
-
-
-@leaf
-def _find_turn(t_ns: int, site: Row) -> tuple[Three, Three]:
-    """Returns the turn from the peers' orientation to the held one, and the derivative of its vector."""
-    held, velocity = _find_held_orientation(t_ns, site)
-    turn = turn_between(rotation_matrix(held), rotation_matrix(three(site.q_des[3:])))
-    carried = rotate_by(turn, three(site.qd_des[3:]))
-    return turn, turn_rate(turn, subtract(velocity, carried))
-
-
-@leaf
 def _align_s(site: Row) -> float:
     """Returns how long the way that is left at its beginning, `q_held`, takes."""
     way = 0.0
@@ -122,67 +82,60 @@ def _align_s(site: Row) -> float:
 
 
 @leaf
-def _begin_aligning(t_ns: int, site: Row, reason: int) -> None:
-    """Begins to align from the held reference, if the peers are no farther than the limit."""
+def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> None:
+    """Begins to align from a reference q that moves at qd, if the peers are no farther than the limit."""
     turn = rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
-        turn, rate = _find_turn(t_ns, site)
+        turn = turn_between(rotation_matrix(three(q[3:])), rotation_matrix(three(site.q_des[3:])))
+        rate = turn_rate(turn, subtract(three(qd[3:]), rotate_by(turn, three(site.qd_des[3:]))))
     near = length(turn) <= site.align_limit
     for i in range(straight_coordinates(site)):
-        q, _ = _find_held(t_ns, site, i)
-        near = near and abs(q - site.q_des[i]) <= site.align_limit
+        near = near and abs(q[i] - site.q_des[i]) <= site.align_limit
     if not near:
         site.reason = _ALIGN_LIMIT
         return
     for i in range(straight_coordinates(site)):
-        q, qd = _find_held(t_ns, site, i)
-        site.q_held[i], site.qd_held[i] = q - site.q_des[i], qd - site.qd_des[i]
+        site.q_held[i], site.qd_held[i] = q[i] - site.q_des[i], qd[i] - site.qd_des[i]
     if has_orientation(site):
         put_three(site.q_held[3:], turn)
         put_three(site.qd_held[3:], rate)
     put(site.tau_held, site.tau_before)
-    _enter(t_ns, _ALIGN, reason, site)
+    site.mode, site.reason, site.return_from_ns = _ALIGN, reason, t_ns
 
 
 @leaf
-def _wait(t_ns: int, site: Row, reason: int) -> None:
-    """Begins to wait for the peers, at the own pose and at rest."""
-    for i in range(site.q_held.shape[0]):
-        site.q_held[i] = site.x[i] if site.task else site.q[i]
-        site.qd_held[i] = 0.0
-    put(site.q_rest, site.q)
-    site.rest_share = 1.0 if site.task else 0.0
-    put(site.tau_held, site.tau_before)
-    _enter(t_ns, _WAITING, reason, site)
+def _leave_rest(t_ns: int, site: Row, reason: int) -> None:
+    """Begins to align from the reference of an arm at rest."""
+    put_rest_reference(t_ns, site, site.q_followed, site.qd_followed)
+    _begin_aligning(t_ns, site, reason, site.q_followed, site.qd_followed)
+
+
+@leaf
+def _carry_on(site: Row) -> None:
+    """Moves the reference of the tick before to where its rate takes it until now."""
+    h_s = 1.0 / site.rate_hz
+    for i in range(straight_coordinates(site)):
+        site.q_followed[i] += h_s * site.qd_followed[i]
+    if has_orientation(site):
+        turn = scale(h_s, three(site.qd_followed[3:]))
+        put_three(site.q_followed[3:], add_turn(turn, three(site.q_followed[3:])))
 
 
 @leaf
 def is_law_returning(t_ns: int, site: Row) -> bool:
-    """True if a site waits, or aligns, that was stopped or in fault until a moment ago."""
-    again = site.mode == _WAITING and site.return_from_ns > tick_ns(site.first, site.rate_hz)
-    soon: bool = t_ns - site.return_from_ns < RETURN_NS
-    return soon and (again or (site.mode == _ALIGN and site.reason == _RESUMED))
+    """True if a site aligns that was at rest until a moment ago."""
+    rested = site.reason != _DROPPED and site.reason != _RESTORED
+    returning: bool = site.mode == _ALIGN and rested and t_ns - site.return_from_ns < RETURN_NS
+    return returning
 
 
 @leaf
-def _hold(before_ns: int, site: Row, reason: int) -> None:
-    """Begins to hold the reference that was in force at the tick before."""
-    put(site.q_held, site.q_followed)
-    put(site.qd_held, site.qd_followed)
-    if site.rest_share == 0.0:
-        put(site.q_rest, site.q)
-    put(site.tau_held, site.tau_before)
-    _enter(before_ns, _HOLD, reason, site)
-
-
-@leaf
-def latch(before_ns: int, site: Row, mode: int, reason: int) -> None:
-    """Enters FAULT or STOPPED, from the torque that was applied at the tick before, `before_ns`."""
-    put(site.tau_held, site.tau_before)
+def latch(t_ns: int, site: Row, mode: int, reason: int) -> None:
+    """Enters FAULT or STOPPED."""
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
             site.theta_hat[p] = 0.0
-    _enter(before_ns, mode, reason, site)
+    begin_rest(t_ns, mode, reason, site)
 
 
 @leaf
@@ -200,86 +153,74 @@ def _find_fault(site: Row) -> int:
 
 
 @leaf
-def _obey(t_ns: int, before_ns: int, site: Row) -> None:
+def _obey(t_ns: int, site: Row) -> None:
     """Carries out what is ordered, and what the ticks that were not made ask for."""
     order, skipped, mode = site.order, site.skipped, site.mode
     site.order = site.skipped = 0
     moves = mode in (_RUN, _ALIGN)
     if order == _TO_RESET and mode == _FAULT:
-        _wait(t_ns, site, _RESET)
+        begin_rest(t_ns, _WAITING, _RESET, site)
     elif order == _TO_ENABLE and mode == _STOPPED:
-        _wait(t_ns, site, _ENABLE)
+        begin_rest(t_ns, _WAITING, _ENABLE, site)
     elif order == _TAKE_HOLD and mode == _STOPPED and site.reason == _RELEASED:
-        _wait(t_ns, site, _HELD)
+        begin_rest(t_ns, _WAITING, _HELD, site)
     elif order == _TO_STOP and mode == _STOPPED:
         site.reason = _STOP
     elif order in (_TO_STOP, _LET_GO) and mode != _FAULT and mode != _STOPPED:
-        latch(before_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
+        latch(t_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
     elif mode in (_FAULT, _STOPPED):
         return
     elif order == _LOSE_ARM or skipped > FAULT_OVERRUN_TICKS:
-        latch(before_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
+        latch(t_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
     elif order == _HEAR_SILENCE and moves:
-        _hold(before_ns, site, _ARM_SILENT)
+        begin_rest(t_ns, _HOLD, _ARM_SILENT, site)
     elif order == _HEAR_SILENCE:
         site.reason = _ARM_SILENT
     elif order == _HEAR_ARM and site.reason == _ARM_SILENT:
         site.reason = _ARM_BACK
     elif skipped > HELD_OVERRUN_TICKS and moves:
-        _hold(before_ns, site, _OVERRUN)
+        begin_rest(t_ns, _HOLD, _OVERRUN, site)
 
 
 @leaf
-def _update_mode(t_ns: int, before_ns: int, site: Row, links: RowArray) -> None:
+def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
     """Changes the mode where limits or the peers ask for it."""
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
-        latch(before_ns, site, _FAULT, fault)
+        latch(t_ns, site, _FAULT, fault)
     if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
         return
     heard = _all_heard(t_ns, site.stale_ns, links)
     if heard and site.mode == _WAITING:
-        _begin_aligning(t_ns, site, _RESUMED if is_law_returning(t_ns, site) else _PEERS_HERE)
-    elif heard and site.mode == _HOLD and site.return_from_ns != before_ns:
-        _begin_aligning(t_ns, site, _PEERS_BACK)
+        _leave_rest(t_ns, site, _PEERS_HERE)
+    elif heard and site.mode == _HOLD and site.return_from_ns != t_ns:
+        _leave_rest(t_ns, site, _PEERS_BACK)
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
-        _hold(before_ns, site, _PEER_SILENT)
+        begin_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
-        _hold(before_ns, site, site.regrouped)
-        _begin_aligning(t_ns, site, site.regrouped)
+        _carry_on(site)
+        _begin_aligning(t_ns, site, site.regrouped, site.q_followed, site.qd_followed)
     elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
-        _enter(t_ns, _RUN, _ALIGNED, site)
+        site.mode, site.reason, site.return_from_ns = _RUN, _ALIGNED, t_ns
 
 
 @leaf
-def update_session_life(t_ns: int, before_ns: int, site: Row, links: RowArray) -> None:
+def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
     """Changes the mode, and from the peers' reference makes the one that the mode asks for.
 
-    The tick before was at `before_ns`, and its reference is in `q_followed` and `qd_followed`.
+    The reference of the tick before is in `q_followed` and `qd_followed`.
     """
     if site.mode == _DIVERGED:
         return
-    if t_ns == tick_ns(site.first, site.rate_hz):  # from its own pose, at rest
-        _wait(t_ns, site, _START)
+    if t_ns == tick_ns(site.first, site.rate_hz):
+        begin_rest(t_ns, _WAITING, _START, site)
     if site.order != 0 or site.skipped != 0:
-        _obey(t_ns, before_ns, site)
-    _update_mode(t_ns, before_ns, site, links)
-    keep_rest(site)
-    if site.mode == _RUN:
-        return
-    if site.mode == _FAULT or site.mode == _STOPPED:
-        for i in range(site.q_held.shape[0]):
-            site.q_des[i] = site.x[i] if site.task else site.q[i]
-            site.qd_des[i] = 0.0
-    elif site.mode == _ALIGN:
+        _obey(t_ns, site)
+    _update_mode(t_ns, site, links)
+    if site.mode == _ALIGN:
         _put_aligning(t_ns, site)
-    else:
-        for i in range(straight_coordinates(site)):
-            site.q_des[i], site.qd_des[i] = _find_held(t_ns, site, i)
-        if has_orientation(site):
-            held, velocity = _find_held_orientation(t_ns, site)
-            put_three(site.q_des[3:], held)
-            put_three(site.qd_des[3:], velocity)
+    elif rests(site):
+        put_rest_reference(t_ns, site, site.q_des, site.qd_des)
 
 
 @leaf

@@ -33,7 +33,8 @@ _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0
 _PER_JOINT = (
     *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
     *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
-    *("q_min", "q_max", "tau_rate", "tau_held", "damping", "q_rest"),
+    *("q_min", "q_max", "tau_rate", "tau_held", "q_rest", "qd_rest"),
+    *("damping", "integral", "deceleration"),
 )
 _PER_COORDINATE = (
     *(
@@ -74,7 +75,7 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
     """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
     fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")]
     fields += [
-        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit", "rest_share")),
+        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit")),
         ("lengths", "f8", (2,)),
     ]
     fields += [("k", "i8"), ("t_s", "f8"), ("h_s", "f8"), ("M", "f8", (layout.joints, layout.joints))]
@@ -322,7 +323,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
     vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
-    vectors |= {**setup.limits._asdict(), "damping": setup.damping}
+    vectors |= {**setup.limits._asdict(), **setup.rest.vectors()}
     vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
     if gains.law is Law.OWN and setup.theta_known:
         vectors["known"] = setup.theta

@@ -9,6 +9,8 @@ from enum import IntEnum
 from itertools import accumulate
 from typing import NamedTuple
 
+import numpy as np
+
 from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
 from .exogenous import LIVE_KINDS, TorqueKind, TorqueSource
@@ -42,6 +44,10 @@ class Law(IntEnum):
     ADAPTIVE = 0
     KNOWN = 1
     OWN = 2
+
+
+LEAST_STOP_S = 0.1
+"""The least time in which the reference of an arm that is to rest comes to rest."""
 
 
 class StaleAction(IntEnum):
@@ -92,6 +98,30 @@ class MotionLimits(NamedTuple):
     q_max: Vector = (math.inf,)
     qd_des_limit: Vector = (math.inf,)
     tau_rate: Vector = (math.inf,)
+
+
+class RestGains(NamedTuple):
+    """How an arm comes to rest and stays there, see `resting`; one number, or one per joint.
+
+    Attributes:
+        damping: B, N m s/rad.
+        time_s: time in which B alone brings the joint to rest whose inertia it was made for, s.
+        deceleration: of the reference, rad/s^2.
+    """
+
+    damping: Vector = (0.0,)
+    time_s: float = 1.0
+    deceleration: Vector = (math.inf,)
+
+    def vectors(self) -> dict[str, Vector]:
+        """Returns the gains that the core has: k B besides, k one eighth of 1 / time_s."""
+        integral = tuple(float(B) / (8.0 * self.time_s) for B in self.damping)
+        return {"damping": self.damping, "integral": integral, "deceleration": self.deceleration}
+
+    def stop_s(self, qd: Array) -> Array:
+        """Returns the time in which the reference comes to rest from velocities of shape (..., n), rad/s."""
+        found: Array = np.maximum(LEAST_STOP_S, (np.abs(qd) / self.deceleration).max(axis=-1))
+        return found
 
 
 class LinkSetup(NamedTuple):
@@ -185,16 +215,16 @@ class Layout(NamedTuple):
     def life_memory(self, peers: int, *, degrades: bool = False) -> int:
         """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`.
 
-        In task space there are the share and the joint pose of `rest_columns`. Of one that degrades the last
+        In task space there are the pose and the velocities of `rest_columns`. Of one that degrades the last
         of them are `gone` of its peers.
         """
         end: int = self.rest_columns(peers).stop
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns where `mem` has the share of the joint pose that is held, and the pose, if there is one."""
+        """Returns where `mem` has the joint pose and the velocities from which an arm in task space rests."""
         first = 2 * (self.shared + 1) + peers + self.joints
-        return slice(first, first + (1 + self.joints) * self.task)
+        return slice(first, first + 2 * self.joints * self.task)
 
     def find_lost(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
         """Returns the peers without which a site that degrades goes on, by a record's `mem`."""
@@ -310,7 +340,7 @@ class SiteSetup(NamedTuple):
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
         channel: what the site's law sends to its peers.
         limits: further limits.
-        damping: of a site that is stopped, per joint, N m s/rad.
+        rest: how its arm comes to rest.
         bit: of the site in sets of sites.
     """
 
@@ -335,7 +365,7 @@ class SiteSetup(NamedTuple):
     chain: ChainSetup | None = None
     channel: LawChannel = LawChannel()
     limits: MotionLimits = MotionLimits()
-    damping: Vector = (0.0,)
+    rest: RestGains = RestGains()
     bit: int = 0
 
     @property

@@ -97,7 +97,7 @@ class Site:
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
         own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
-        rest = s["rest_share"], s["q_rest"][0]
+        rest = s["q_rest"][0], s["qd_rest"][0]
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
@@ -238,13 +238,13 @@ class Site:
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
-        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone, share, pose = self._held_fields
+        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone, pose, speed = self._held_fields
         held = [*q_held.tolist(), float(return_from_ns.item())]
         if not self._glides:
             return held
         heard = map(float, used_ns.tolist())
         lost = gone.tolist() if self._degrades else ()
-        rest = (share.item(), *pose.tolist()) if self.layout.task else ()
+        rest = (*pose.tolist(), *speed.tolist()) if self.layout.task else ()
         return [*held, *qd_held.tolist(), float(reason.item()), *heard, *tau_held.tolist(), *rest, *lost]
 
     def counts(self) -> tuple[LinkCounts, ...]:
@@ -292,7 +292,7 @@ class Site:
             self._links["used_ns"], s.tau_held = rest[:peers], rest[peers : peers + joints]
             rest = rest[peers + joints :]
             if self.layout.task:
-                s.rest_share, s.q_rest, rest = rest[0], rest[1 : 1 + joints], rest[1 + joints :]
+                s.q_rest, s.qd_rest, rest = rest[:joints], rest[joints : 2 * joints], rest[2 * joints :]
             if self._degrades:
                 self._links["gone"], rest = rest[:peers], rest[peers:]
             s.order = s.skipped = 0

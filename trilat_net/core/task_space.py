@@ -9,9 +9,7 @@ velocity of the joints and its derivative are
     v = psi + J' y,    J J' y = -Lambda e - J psi            (v = J+ (-Lambda e) + (I - J+ J) psi)
     a = v' ,           J J' y' = -Lambda e' - J' psi - J psi' - (J' J^T + J J'^T) y
 
-with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = x' + Lambda e. A site that
-waits or holds under the rule `glide` goes over, in `REST_S`, to the psi of the joint pose in which it began
-to, so that no joint drifts; r stays what it is, and so does what is claimed of it.
+with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = x' + Lambda e.
 
 J J' gets a damping that is zero while 1 / trace((J J')^-1), a lower bound of the square of the least singular
 value, is above that of `singular_value`.
@@ -24,19 +22,12 @@ solutions with singularity robustness", J. Dynamic Systems, Measurement, and Con
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
 from .jit import leaf
 from .rotation import add_turn, rotation_matrix, turn_between
-from .ticks import Mode
 from .vectors import Array, Row, RowArray
 
 PLACE, POSE = 3, 6
 """Numbers of a task without and with an orientation."""
 TINY = 1e-12
 """A pivot of J J' below this is of an axis along which the end effector cannot move at all."""
-REST_RATE_1_S = 2.0
-"""By how much of the way a joint pose that is held is gone back to, in a second."""
-REST_S = 0.1
-"""Time in which the joint pose that is held takes the place of the posture, and the posture its place."""
-
-_HOLD, _WAITING = int(Mode.HOLD), int(Mode.WAITING)
 
 
 @leaf
@@ -50,37 +41,6 @@ def has_orientation(s: Row) -> bool:
 def straight_coordinates(s: Row) -> int:
     """Returns how many of the first coordinates have differences: all but those of an orientation."""
     return PLACE if has_orientation(s) else s.q_des.shape[0]
-
-
-@leaf
-def rests(s: Row) -> bool:
-    """True in a mode in which a site in task space holds its joint pose too."""
-    found: bool = s.task != 0 and (s.mode == _HOLD or s.mode == _WAITING)
-    return found
-
-
-@leaf
-def rest_weight(s: Row) -> float:
-    """Returns the weight of the joint pose that is held, from 0 to 1."""
-    share: float = s.rest_share
-    return share * share * (3.0 - 2.0 * share)
-
-
-@leaf
-def rest_velocity(s: Row, i: int) -> float:
-    """Returns the velocity of a joint towards the pose that is held, by its weight."""
-    speed: float = -rest_weight(s) * REST_RATE_1_S * (s.q[i] - s.q_rest[i])
-    return speed
-
-
-@leaf
-def keep_rest(s: Row) -> None:
-    """Lets the weight of the joint pose that is held grow while it is, and fall while it is not."""
-    step = 1.0 / (REST_S * s.rate_hz)
-    if rests(s):
-        s.rest_share = min(s.rest_share + step, 1.0)
-    elif s.rest_share > 0.0:
-        s.rest_share = max(s.rest_share - step, 0.0)
 
 
 @leaf
@@ -197,21 +157,6 @@ def _factor_damped(s: Row) -> None:
 
 
 @leaf
-def _add_rest(s: Row) -> None:
-    """Adds the velocity towards the joint pose that is held to v and J v, its derivative to a."""
-    growing = 1.0 / REST_S if rests(s) else -1.0 / REST_S
-    weight_rate = 6.0 * s.rest_share * (1.0 - s.rest_share) * growing
-    for i in range(s.joints):
-        speed = rest_velocity(s, i)
-        to_posture = s.posture_rate * (s.q[i] - s.posture[i])
-        s.v[i] += speed
-        s.a[i] += weight_rate * (to_posture - REST_RATE_1_S * (s.q[i] - s.q_rest[i]))
-        s.a[i] -= rest_weight(s) * REST_RATE_1_S * s.qd[i]
-        for j in range(s.shared):
-            s.b[j] -= s.J[j, i] * speed
-
-
-@leaf
 def update_task_errors(s: Row) -> None:
     """Writes e and ed of the followed axes, v and a of the joints, and r."""
     n, m = s.joints, s.shared
@@ -224,7 +169,7 @@ def update_task_errors(s: Row) -> None:
         s.e[j] *= s.axes[j]
         s.ed[j] *= s.axes[j]
     _factor_damped(s)
-    k = s.posture_rate * (1.0 - rest_weight(s))
+    k = s.posture_rate
     for j in range(m):
         s.b[j] = -s.Lambda[j] * s.e[j]
         for i in range(n):
@@ -232,8 +177,6 @@ def update_task_errors(s: Row) -> None:
     for i in range(n):
         s.v[i] = -k * (s.q[i] - s.posture[i])
         s.a[i] = -k * s.qd[i]
-    if s.rest_share > 0.0:
-        _add_rest(s)
     _solve(s, s.b, s.y)
     for i in range(n):
         s.stage_q[i] = s.stage_qd[i] = 0.0  # J'^T y and J^T y

@@ -22,9 +22,11 @@ from ..core.chain import MAX_JOINTS
 from ..core.law_channel import LawChannel
 from ..core.philox import link_key
 from ..core.site_setup import (
+    Gains,
     Layout,
     LinkSetup,
     MotionLimits,
+    RestGains,
     Scheme,
     SiteSetup,
     StaleAction,
@@ -42,6 +44,7 @@ from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from .imported_law import PluggedLaw
 from .laws import ControlLaw
 from .operators import Environment, Operator, find_live_hand
+from .resting_arm import add_credible_box, find_rest_gains
 from .sent_vectors import SentVectorSpecs, build_channel
 
 
@@ -239,10 +242,6 @@ def _drop_unused(arm: dict[str, Any]) -> None:
             del arm[key]
 
 
-STOPPING_S = 0.1
-"""Time in which a joint's speed falls to a third, of a site that is stopped and whose law damps nothing."""
-
-
 class Scenario(Frozen, frozen=True, dict=True):
     """An experiment, resolved: every value of every site and link is explicit.
 
@@ -391,7 +390,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             name=site,
             rate_hz=spec.rate_hz,
             scheme=Scheme[self.scheme.upper()],
-            gains=spec.control.gains(arm.theta),
+            gains=self.gains(site),
             theta=arm.theta,
             g_m_s2=spec.arm.g_m_s2,
             lengths_m=arm.lengths_m,
@@ -415,21 +414,26 @@ class Scenario(Frozen, frozen=True, dict=True):
             chain=arm.chain,
             channel=self.channel(site),
             limits=spec.limits.motion,
-            damping=self._stopping_damping(site) if spec.on_stale.action == "glide" else (0.0,),
+            rest=self._rest_gains(site) if spec.on_stale.action == "glide" else RestGains(),
             bit=1 << self.names.index(site),
         )
 
-    def _stopping_damping(self, site: str) -> Array:
-        """Returns the damping of a site that is stopped, shape (n,), N m s/rad: that of its law.
+    def gains(self, site: str) -> Gains:
+        """Returns the gains of a site's law; under the rule `glide` its estimates are in a box."""
+        spec, arm = self.sites[site], self.arms[site]
+        gains = spec.control.gains(arm.theta)
+        if spec.on_stale.action != "glide":
+            return gains
+        return add_credible_box(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
-        Where the law has none of its own it brings each joint by itself to rest in `STOPPING_S`.
-        """
+    def _rest_gains(self, site: str) -> RestGains:
         spec, arm = self.sites[site], self.arms[site]
         control = spec.control
         gains = control.linear_gains(arm.theta) if isinstance(control, PluggedLaw) else None
         gains = gains or control.gains(arm.theta)
         own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
-        return np.where(own > 0.0, own, arm.joint_inertias(spec.q0_rad) / STOPPING_S)
+        limit, known = spec.limits.tau_limit_nm, spec.arm.known
+        return find_rest_gains(arm, spec.q0_rad, own, limit, spec.rate_hz, known=known)
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
         name = f"{peer}->{site}"

@@ -94,7 +94,7 @@ class SiteConstants(NamedTuple):
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
     spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
-    gains = spec.control.gains(arm.theta)
+    gains = scenario.gains(site)
     names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction")
     of_law = {name: np.array(getattr(gains, name)) for name in names}
     task = arm.task
@@ -171,7 +171,7 @@ class SiteMotion:
     def follows(self) -> Following:
         """How an error of the reference becomes motion and torque of the joints."""
         at, c = self.records, self.constants
-        return follow_rows(c.arm, at.q, at.qd, c.Lambda, at.rest)
+        return follow_rows(c.arm, at.q, at.qd, c.Lambda)
 
     @cached_property
     def r(self) -> Array:
@@ -203,10 +203,10 @@ class SiteMotion:
         return found - (1.0 - c.friction) * c.arm.friction(v)
 
     @property
-    def stopped(self) -> Bools:
-        """True if the torque is that of a site that is stopped, shape (K,)."""
+    def rests(self) -> Bools:
+        """True if the torque may not be that of the law alone, shape (K,)."""
         at = self.records
-        return at.stopped if at.stopped.size else np.zeros(len(at.known), dtype=np.bool_)
+        return at.rests if at.rests.size else np.zeros(len(at.known), dtype=np.bool_)
 
     @cached_property
     def nearest_torques(self) -> tuple[Array, Array]:
@@ -232,7 +232,7 @@ class SiteMotion:
         )
         tau = self.records.tau
         found: Bools = (tau <= low + near) | (tau >= high - near)
-        return found & ~self.stopped[:, np.newaxis]
+        return found & ~self.rests[:, np.newaxis]
 
     @cached_property
     def ends(self) -> PeriodEnds:
@@ -451,9 +451,9 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work of what limits, or a stop, kept from the arm: int r' (tau - tau of Eq. (13))."""
+    """Returns the work of what limits, or a rest, kept from the arm: int r' (tau - tau of Eq. (13))."""
     at = site.records
-    cut = np.flatnonzero(site.cut.any(axis=1) | site.stopped)
+    cut = np.flatnonzero(site.cut.any(axis=1) | site.rests)
     power = np.zeros(len(at.known))
     if len(cut):
         power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
@@ -498,25 +498,25 @@ def singular_pose_work(site: SiteMotion) -> Increment:
 def measure_torque_error(site: SiteMotion) -> Array:
     """Returns by how much recorded torques differ from Eq. (13) within its limits, shape (K,), N m.
 
-    The largest of all joints; 0 where there is no record, or where the site is stopped.
+    The largest of all joints; 0 where there is no record, or where the site rests.
     """
     at = site.records
     law = site.law_torque(np.arange(len(at.known)))
     error: Array = np.abs(at.tau - np.clip(law, *site.nearest_torques)).max(axis=1)
-    return np.where(at.known & ~site.stopped, error, 0.0)
+    return np.where(at.known & ~site.rests, error, 0.0)
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or stopped.
+    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or at rest.
 
     The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the truth; a
     parameter that is not adapted leaves r' Y (theta_hat - theta) without its counterpart.
     """
     at, c = site.records, site.constants
     off = at.theta_hat - c.theta
-    at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts
-    still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)])
-    wrong = (off != 0.0) & (~c.adapts | (site.stopped & still)[:, np.newaxis])
+    still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)]) & site.rests
+    at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts & ~still[1:, np.newaxis]
+    wrong = (off != 0.0) & (~c.adapts | still[:, np.newaxis])
     if not (at_edge.any() or wrong.any()):
         return _nothing(site)
     held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr  # what the box kept the estimate from
@@ -561,7 +561,7 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     v, a = site.follows.reference(later, e, ed)
     Yr[rows] = c.arm.gradient(at.q[later], at.qd[later], v, a, r)
     found = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
-    bound = site.stopped | (site.cut.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
+    bound = site.rests | (site.cut.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
     tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)  # then no jump of e moves it
     return tau, Yr
 

@@ -14,7 +14,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
-from ..aligned import STOPPED_MODES, Bools, find_unlimited
+from ..aligned import Bools, find_unlimited
 from ..dominance_history import list_losses
 from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
@@ -157,7 +157,7 @@ def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
 def _check_following(log: Log) -> Premise:
     found = {site: find_mode_intervals(log[site]) for site in log.sites}
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
-    stops = any(one.mode in STOPPED_MODES for intervals in found.values() for one in intervals)
+    stops = any(one.mode in ("fault", "stopped") for intervals in found.values() for one in intervals)
     for site in log.sites:
         held = ~find_unlimited(log.scenario.sites[site].limits, log[site].qd_des)
         if held.any():
