@@ -335,7 +335,9 @@ class RunningSite:
         if output.mode is not self._mode:
             self._mode = output.mode
             glides = self._parts.setup.on_stale.action is StaleAction.GLIDE
-            self._publisher.publish("mode", describe_mode(name, output, glides=glides), **at)
+            failure = self._parts.site.law_failure
+            text = describe_mode(name, output, glides=glides, law_failure=failure)
+            self._publisher.publish("mode", text, **at)
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:

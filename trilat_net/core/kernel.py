@@ -186,8 +186,9 @@ def _advance(
         _advance_estimate(s, chain, h_s, s.Yr)
     for i in range(s.tau.shape[0]):
         s.tau_before[i] = s.tau[i]
+    adapts = _adapts(s)
     for p in range(s.Yr.shape[0]):
-        s.Yr_before[p] = s.Yr[p]
+        s.Yr_before[p] = s.Yr[p] if adapts else 0.0
 
 
 @leaf

@@ -7,12 +7,14 @@ the same bits.
 `Site` is thin Python around `kernel.site_tick`: it packs arrivals and unpacks the record.
 """
 
+import math
 import struct
 import zlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from ..errors import LawFailed
 from .channel import LOST
 from .compiled_law import plug_law
 from .delay import DelayKind
@@ -57,6 +59,7 @@ class Site:
         rate_hz: its tick rate, Hz.
         peers: names of its peers, in scenario order.
         layout: how many numbers its vectors have.
+        law_failure: why a plugged law last failed, under the rule `glide`; None: it never did.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -83,6 +86,8 @@ class Site:
         self._sends = bool(self._sent.size)
         self._user_law = None if setup.own is None else setup.own(setup.law_context())
         self._law = None
+        self.law_failure: LawFailed | None = None
+        self._law_memory: list[float] = []
         if self._user_law is not None:
             a, b = self._arrays, self._buffers
             self._law = plug_law(self._user_law, setup, a, self._sent)
@@ -94,6 +99,8 @@ class Site:
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
+        if self._law is not None and self._glides:
+            self._law_memory = self._law.memory
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
         own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
@@ -149,7 +156,7 @@ class Site:
 
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
-            LawFailed: a user's law did.
+            LawFailed: a user's law did, and the site does not go on without it, as under `glide`.
         """
         packed, count = self._pack(tick.arrivals), len(tick.arrivals)
         t_ns = tick.k * NS_PER_S // self.rate_hz
@@ -168,7 +175,7 @@ class Site:
         else:
             self._sense(tick.k, t_ns, count, self._arrays, self._buffers)
             a = self._arrays
-            memory = self._law.compute(tick.k, t_ns)
+            memory = self._ask_law(tick.k, t_ns)
             self._act(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
         q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
@@ -191,6 +198,27 @@ class Site:
             *(row[column] for column in task),
         )
         return record._replace(ch=self._sent.tolist(), hand=hand) if self._sends or hand else record
+
+    def _ask_law(self, k: int, t_ns: int) -> list[float]:
+        """Stage 6 of a plugged law; returns its memory.
+
+        Under the rule `glide` a law that fails gives no torque, which is a FAULT: it is not asked until that
+        is reset, and then goes on from the memory that it had before it failed.
+        """
+        assert self._law is not None
+        s: Row = self._site[0]
+        if not self._glides:
+            return self._law.compute(k, t_ns)
+        if s.mode == Mode.FAULT and s.reason == LifeReason.NOT_FINITE:
+            s.tau = math.nan
+            return self._law_memory
+        try:
+            self._law_memory = self._law.compute(k, t_ns)
+        except LawFailed as failure:
+            self.law_failure = failure
+            self._law.recall(self._law_memory)
+            s.tau = math.nan
+        return self._law_memory
 
     @property
     def speed_limits(self) -> list[float]:
@@ -300,6 +328,7 @@ class Site:
         self._take_hand(last.hand)
         if self._law is not None:
             self._law.recall(rest)
+            self._law_memory = list(rest)
         resume_stages(last.tick, self._arrays)
 
     def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:

@@ -344,7 +344,9 @@ def find_alarm(
     return LifeAlarm(mode.upper(), _REASONS.get(reason, reason.name.lower().replace("_", " ")), advice)
 
 
-def describe_mode(site: str, output: TickRecord, *, glides: bool = False) -> str:
+def describe_mode(
+    site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
+) -> str:
     """Returns the text of the event that a site changes its mode; one that `glides` says why."""
     doing = {
         Mode.RUN: "follows its peers",
@@ -356,6 +358,8 @@ def describe_mode(site: str, output: TickRecord, *, glides: bool = False) -> str
         Mode.STOPPED: "is STOPPED",
     }
     why = _REASONS.get(find_life_reason(output), "") if glides else "a peer is stale"
+    if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
+        why = str(law_failure)
     regrouped = glides and find_life_reason(output) in (LifeReason.DROPPED, LifeReason.RESTORED)
     aligns = output.mode is Mode.RETURN and not regrouped
     if aligns or output.mode is Mode.RUN or (output.mode is Mode.BRAKE and not glides):

@@ -48,7 +48,9 @@ class SiteChannels:
         self._t_ns = 0
         self.ticks = 0
 
-    def follow(self, output: TickRecord, stats: LinkStats | None) -> Sequence[SiteEntry]:
+    def follow(
+        self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
+    ) -> Sequence[SiteEntry]:
         """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
         self.ticks, self._t_ns = output.tick + 1, output.t_ns
         self._excuse_skipped(output.tick, output.cmd)
@@ -59,7 +61,7 @@ class SiteChannels:
             text = (
                 describe_divergence(self._site, output)
                 if diverged
-                else describe_mode(self._site, output, glides=self._glides)
+                else describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
             )
             entries.append(self.new_event("diverged" if diverged else "mode", text, output.t_ns))
         return entries

@@ -132,7 +132,7 @@ class _VirtualChannels(SiteChannels):
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = virtual_boot(scenario, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
-        self._writer = writer
+        self._writer, self._runs = writer, site
         self._stats = LoopStats(site, boot, [scenario.sites[p].rate_hz for p in site.peers])
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
@@ -141,7 +141,7 @@ class _VirtualChannels(SiteChannels):
         self._writer.add(self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output)
         due = self._stats.due(output.tick, count_skipped_ticks(output.cmd))
         stats = self._stats.take(output) if due else None
-        for entry in self.follow(output, stats):
+        for entry in self.follow(output, stats, self._runs.law_failure):
             self.write(entry, self._writer)
 
 

@@ -1,0 +1,297 @@
+"""How arms come to rest: of all that waits, holds, is stopped or in fault, by the equations of `resting`."""
+
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import trilat_net
+from tests.core.test_safeguards import adaptive_text, guarded, ordered
+from tests.core.test_session_life import TEXT
+from trilat_net.analysis.arm_rows import build_arm_rows, inertia_product_rows
+from trilat_net.core.resting import limit_torque_rate
+from trilat_net.core.site_arrays import build_site_arrays
+from trilat_net.core.site_setup import LEAST_STOP_S, RestGains
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import CoreChange, LifeOrder, Mode, TickInput
+from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.vectors import Array
+from trilat_net.execution.resumption import read_output
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log
+from trilat_net.log.site_log import SiteLog
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.laws import LAWS
+
+AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
+
+
+def gravity_of(theta: Array, q: Array) -> Array:
+    """G of the planar arm, rows of q, by the paper's Eq. (2)."""
+    outer = theta[4] * np.cos(q[:, 0] + q[:, 1])
+    return 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
+
+
+def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
+    """q_ref and qd_ref of an arm that comes to rest from its record `first` on."""
+    q, v = part.q[first], part.qd[first]
+    stop_s = max(LEAST_STOP_S, float((np.abs(v) / gains.deceleration).max()))
+    t = np.minimum(np.arange(rows) / part.rate_hz, stop_s)[:, None]
+    return q + v * (t - t**2 / (2.0 * stop_s)), v * (1.0 - t / stop_s)
+
+
+def integrals(part: SiteLog, rows: slice) -> Array:
+    """w of some records: what `mem` has of the torque at rest."""
+    first = 2 * (part.layout.shared + 1) + len(part.peers)
+    return np.array(
+        [part.mem[row][first : first + part.layout.joints] for row in range(*rows.indices(10**9))]
+    )
+
+
+@functools.cache
+def stopped(law: str) -> Log:
+    """The slave is stopped at 2 s, while it moves, and enabled at 3.5 s."""
+    return ordered(
+        guarded(text=adaptive_text() if law == "adaptive" else TEXT), {"s": {2000: "stop", 3500: "enable"}}
+    )
+
+
+@pytest.mark.parametrize("law", ["adaptive", "pd_d"])
+def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
+    """q_ref = q + v (t - t^2 / 2 T), and qd_ref is its derivative."""
+    log = stopped(law)
+    part, gains = log["s"], log.scenario.setup("s").rest
+    assert set(part.mode[2000:3500]) == {"stopped"}
+    assert np.abs(part.qd[2000]).max() > 0.05
+    wanted = reference(gains, part, 2000, 1500)
+    assert np.abs(part.q_des[2000:3500] - wanted[0]).max() <= 1e-12
+    assert np.abs(part.qd_des[2000:3500] - wanted[1]).max() <= 1e-12
+
+
+def test_the_torque_of_a_stop_is_the_law_and_what_rests() -> None:
+    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s, and no step where it begins."""
+    log = stopped("pd_d")
+    part, rows = log["s"], slice(2000, 3500)
+    gains, theta = log.scenario.setup("s").rest, log.scenario.arms["s"].theta
+    q, qd = part.q[rows], part.qd[rows]
+    e, ed = q - part.q_des[rows], qd - part.qd_des[rows]
+    law = gravity_of(theta, q) - 60.0 * e - 12.0 * qd - 4.0 * ed
+    B, slip = np.array(gains.damping), ed + e  # Lambda = 1
+    before = part.tau[1999] - law[0]
+    w = before - np.cumsum(np.vstack([np.zeros(2), slip[:-1]]), axis=0) * B / (8.0 * gains.time_s) * 1e-3
+    assert np.abs(part.tau[rows] - law - w + B * slip).max() <= 1e-9
+    assert np.abs(integrals(part, rows)[:-1] - w[1:]).max() <= 1e-9
+    assert np.abs(part.tau[2000] - part.tau[1999]).max() <= 1e-12
+    assert part.mode[3500] == "return"  # its peers are there
+    assert part.mode[-1] == "run"
+
+
+@pytest.mark.parametrize("how", ["stop", "cut"])
+def test_storage_falls_by_what_is_dissipated(how: str) -> None:
+    """V = S + 1/2 w'(k B)^-1 w: V' = -r'(Kp + B) r - qd'Kd qd at a reference at rest, learning."""
+    keys: dict[str, Any] = {"duration_s": 6.0, "outages_s": "[[1.0, 20.0]]"} if how == "cut" else {}
+    text = adaptive_text().replace("[[sites.m.hands]]", "[[sites.s.hands]]")
+    log = ordered(guarded(text=text, **keys), {} if how == "cut" else {"m": {1500: "stop"}})
+    part, theta = log["m"], log.scenario.arms["m"].theta
+    first = int(np.argmax(part.mode == ("hold" if how == "cut" else "stopped")))
+    gains = log.scenario.setup("m").rest
+    still = int(np.argmax((part.qd_des == 0.0).all(axis=1) & (np.arange(len(part)) > first)))
+    rows = slice(still, 5900)
+    q, qd, tau = part.q[rows], part.qd[rows], part.tau[rows]
+    e = q - part.q_des[rows]
+    r, off, w, B = qd + 2.0 * e, part.theta_hat[rows] - theta, integrals(part, rows), np.array(gains.damping)
+    w = np.vstack([integrals(part, slice(still - 1, still)), w[:-1]])  # mem has that of the next tick
+    V = 0.5 * (
+        (r * inertia_product_rows(theta, q, r)).sum(axis=1)
+        + 2.0 * 5.0 * (e**2).sum(axis=1)
+        + (off**2).sum(axis=1) / 3.0
+        + (w**2 / (B / (8.0 * gains.time_s))).sum(axis=1)
+    )
+    power = -(r * (4.0 + B) * r).sum(axis=1) - 5.0 * (qd**2).sum(axis=1)
+    gave = np.concatenate([[0.0], np.cumsum(0.5e-3 * (power[1:] + power[:-1]))])
+    assert np.abs(np.diff(tau, axis=0)).max() < 0.5  # no limit acts
+    assert np.abs(V - V[0] - gave).max() <= 0.02 * (V[0] - V[-1])
+    assert np.diff(V).max() <= 1e-9 * V[0]
+    assert np.ptp(part.theta_hat[first:5900], axis=0).max() > 1e-3
+
+
+class Broken:
+    """A law that gives no number from a tick on."""
+
+    remembers = ()
+
+    def __init__(self, _facts: LawContext, at: int = 2000) -> None:
+        self.at = at
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            now.tau[i] = now.gravity[i] - 12.0 * now.qd[i] if now.k < self.at else np.nan
+
+
+def test_an_arm_whose_law_failed_is_held_where_it_is() -> None:
+    text = TEXT.replace('law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:Broken"')
+    log = trilat_net.simulate(guarded({}, text, duration_s=4.0))
+    part = log["s"]
+    assert set(part.mode[2000:]) == {"fault"}
+    assert np.abs(part.q[2000:] - part.q[2000]).max() <= 0.02
+    assert np.abs(part.tau[-1] - gravity_of(log.scenario.arms["s"].theta, part.q[-1:])).max() <= 1e-3
+    assert verify(log).identical == 8000
+
+
+@given(
+    rate=st.floats(50.0, 5000.0),
+    before=st.floats(-60.0, 60.0),
+    wanted=st.floats(-80.0, 80.0),
+    speed=st.floats(-10.0, 10.0),
+)
+def test_a_limit_of_rate_never_holds_back_what_brakes(
+    rate: float, before: float, wanted: float, speed: float
+) -> None:
+    """Against its motion a torque reaches B |qd| farther; along it, and in RUN, as far as the rate."""
+    arrays = build_site_arrays(guarded().setup("s"))
+    s = arrays.site[0]
+    for mode in (Mode.RUN, Mode.STOPPED, Mode.HOLD):
+        s.mode, s.tau_rate, s.tau_before, s.tau, s.qd = mode, rate, before, wanted, speed
+        limit_torque_rate(s)
+        most = rate / 1000.0
+        brake = s.damping[0] * abs(speed) if mode is not Mode.RUN else 0.0
+        low = before - most - (brake if speed > 0.0 else 0.0)
+        high = before + most + (brake if speed < 0.0 else 0.0)
+        assert s.tau[0] == pytest.approx(np.clip(wanted, low, high), abs=1e-12)
+
+
+def test_credible_estimates_are_those_that_the_motors_can_hold() -> None:
+    """T = 200 N m, g = 9.81 m/s^2, links of 1 m: first moments to T/g, second ones to l T/g."""
+    gains = load_scenario("free", {"on_stale.action": "glide"}).setup("m1").gains
+    moment = 200.0 / 9.81
+    assert gains.low == (0.0,) * 5
+    assert gains.high == pytest.approx((2.0 * moment, moment, moment, moment, moment))
+    own = {"control.law": "adaptive_box", "control.theta_low": [-1.0] * 5, "control.theta_high": [9.0] * 5}
+    assert load_scenario("free", {"on_stale.action": "glide", **own}).setup("m1").gains.high == (9.0,) * 5
+    assert np.isinf(load_scenario("free").setup("m1").gains.high).all()
+
+
+RULE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 4.0, "on_stale.align_speed_rad_s": 2.0}
+HARNESS = {
+    "duration_s": 4.0,
+    "link": {"delay_ms": 30.0},
+    **RULE,
+    "limits": {"tau_limit_nm": 80.0, "tau_rate_limit_nm_s": 300.0, "qd_limit_rad_s": 10.0},
+}
+
+
+@pytest.mark.parametrize("at", [530, 1200])
+def test_one_stop_of_an_arm_that_still_learns_stops_it(at: int) -> None:
+    """Damping and a frozen estimate took it from 0.61 rad/s to 5.12, over 1.92 rad."""
+    log = ordered(load_scenario("free", HARNESS), {"m1": {at: "stop"}})
+    part = log["m1"]
+    speed = np.abs(part.qd[at:]).max(axis=1)
+    assert speed[0] > 0.5
+    assert speed.max() <= 1.02 * speed[0]
+    assert speed[700:].max() <= AT_REST_RAD_S
+    assert np.abs(part.q[at:] - part.q[at]).max() <= 0.07
+
+
+class Stop(NamedTuple):
+    """One stop of one site: speed at the order, the largest after it, when it rested, and the way."""
+
+    at: int
+    site: str
+    begin_rad_s: float
+    most_rad_s: float
+    rest_s: float
+    travel_rad: float
+
+
+def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
+    """Stops one site in turn at instants of a run, each from the two records before; nobody else matters."""
+    names = log.scenario.names
+    for n, at in enumerate(np.linspace(5, len(log[names[0]]) - 5, count).astype(int).tolist()):
+        part = log[names[n % len(names)]]
+        site = Site(log.scenario.setup(part.name))
+        site.resume(*(read_output(part.states[row], part.peers) for row in (at - 2, at - 1)))
+        order = [CoreChange("stop", order=LifeOrder.STOP)]
+        made = [site.step(TickInput(k, commands=order if k == at else ())) for k in range(at, at + ticks)]
+        speed = np.abs([record.qd for record in made]).max(axis=1)
+        q = np.array([record.q for record in made])
+        moving = np.flatnonzero(speed > AT_REST_RAD_S)
+        rest_s = float(moving[-1] + 1) / part.rate_hz if len(moving) else 0.0
+        yield Stop(at, part.name, speed[0], speed.max(), rest_s, float(np.abs(q - q[0]).max()))
+
+
+@functools.cache
+def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
+    """The largest |M^-1 G| of an arm over two hundred poses, rad/s^2, and the largest |G|, N m."""
+    arm, rows = scenario.arms[site], build_arm_rows(scenario, site)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, arm.counts.joints))
+    still = np.zeros_like(q)
+    G = rows.law_torque(np.broadcast_to(arm.theta, (200, len(arm.theta))), q, still, still, still)
+    unit = np.eye(arm.counts.joints)
+    M = np.stack([rows.multiply_inertia(q, np.broadcast_to(row, q.shape)) for row in unit], axis=-1)
+    return float(np.abs(np.linalg.solve(M, G[..., None])).max()), float(np.abs(G).max())
+
+
+def gravity_gives(scenario: Scenario, stop: Stop) -> float:
+    """The speed that gravity may give an arm until w has taken it on, rad/s.
+
+    That of a free fall for the time in which B brakes; in the first 0.1 s of a start also for the time that
+    the limit of rate takes from no torque to G.
+    """
+    fall, most = largest_fall(scenario, stop.site)
+    setup = scenario.setup(stop.site)
+    ramp_s = most / float(np.min(setup.limits.tau_rate)) if stop.at < 100 else 0.0
+    return fall * (setup.rest.time_s + ramp_s)
+
+
+def assert_stops(log: Log, count: int) -> None:
+    for stop in stop_at_instants(log, count):
+        assert stop.most_rad_s <= 1.1 * stop.begin_rad_s + gravity_gives(log.scenario, stop), stop
+        assert stop.rest_s <= REST_WITHIN_S, stop
+
+
+def run_of(name: str, law: str, settings: dict[str, Any], duration_s: float = 6.0) -> Log:
+    keys = {"duration_s": duration_s, "control.law": law, **RULE, **settings}
+    return trilat_net.simulate(load_scenario(name, keys))
+
+
+def test_a_stop_at_ten_instants_ends_in_rest() -> None:
+    assert_stops(run_of("free", "adaptive", {}, 2.0), 10)
+
+
+TWO: dict[str, dict[str, Any]] = {
+    "p_f": {},
+    "four_channel": {"control.acceleration": 0.5},
+    "smith": {"sites.m.control.predicts": True},
+    **{name: {"scheme": "digital"} for name in ("wave", "tdpa", "tanks")},
+}
+"""Laws of two sites, and settings."""
+THREE: dict[str, dict[str, Any]] = {
+    "six_channel": {"control.acceleration": 0.5, "control.force_own": 0.1},
+    "authority": {"sites.s.control.leads": False},
+    "impedance": {"sites.s.control.follows": True},
+    "adaptive_kinematics": {"arm.g_m_s2": 0.0},
+    **{name: {} for name in ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d", "saturated_pd")},
+    **{name: {} for name in ("lee_spong", "sync")},
+}
+CHAINS = ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d")
+RUNS = [
+    *(("two_sites", law, settings) for law, settings in TWO.items()),
+    *((name, law, settings) for law, settings in THREE.items() for name in ("free", "paper", "handover")),
+    *(("six_joints", law, {}) for law in CHAINS),
+]
+
+
+def test_every_law_is_stopped_in_some_run() -> None:
+    assert {law for _, law, _ in RUNS} == {law for law in LAWS if law != "own"}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "law", "settings"), RUNS, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_a_stop_at_two_hundred_instants_ends_in_rest(name: str, law: str, settings: dict[str, Any]) -> None:
+    assert_stops(run_of(name, law, settings), 200)
