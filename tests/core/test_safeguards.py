@@ -125,7 +125,7 @@ def largest_step(log: Log, site: str, first: int = 0) -> float:
     Less what brakes an arm that comes to rest, B |qd| against its motion.
     """
     part = log[site]
-    steps = np.diff(np.vstack([np.zeros(2), part.tau]), axis=0)
+    steps = np.diff(np.vstack([np.zeros_like(part.tau[:1]), part.tau]), axis=0)
     resting = np.isin(part.mode, RESTING_MODES)[:, None]
     brake = np.abs(part.qd) * resting * np.array(log.scenario.setup(site).rest.damping)
     against = np.where(steps * part.qd < 0.0, brake, 0.0)

@@ -163,7 +163,7 @@ def check_liveness(session: FaultSession) -> Iterator[str]:
     timetable = session.timetable
     last = round(timetable.length_s * rate_hz)
     too_fast = any(states[-1].mode == "fault" for states in session.published.states.values())
-    too_fast = too_fast and session.scenario.setup(SITES[0]).qd_limit_rad_s[0] < FAST_ENOUGH_RAD_S
+    too_fast = too_fast and np.max(session.scenario.setup(SITES[0]).qd_limit_rad_s) < FAST_ENOUGH_RAD_S
     for name, states in session.published.states.items():
         modes = {state.mode for state in states if state.tick >= last - timetable.engaged_s * rate_hz}
         if modes != {"run"} and not (too_fast and modes <= {"hold", "run", "return", "waiting", "fault"}):

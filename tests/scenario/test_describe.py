@@ -72,3 +72,16 @@ def test_it_says_how_often_a_site_will_hold_and_it_holds_so_often() -> None:
     entered = int(np.count_nonzero((modes[1:] == "hold") & (modes[:-1] != "hold")))
     assert entered > 3
     assert f"will hold {10 * entered:.3g} times a minute" in line
+
+
+def test_an_arm_that_takes_long_to_stop_says_so() -> None:
+    """T = qd_limit / a of the slowest joint, and the way T qd_limit / 2."""
+    scenario = load_scenario("free", {"on_stale.action": "glide"})
+    stop_s = 100.0 / min(scenario.setup("s").rest.deceleration)
+    (line,) = (line for line in describe_scenario(scenario) if "to stop from" in line)
+    assert line == (
+        f"arms of m1, m2, s take {stop_s:.3g} s and {50.0 * stop_s:.3g} rad to stop from "
+        "limits.qd_limit_rad_s = 100"
+    )
+    slow = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 10.0})
+    assert not [line for line in describe_scenario(slow) if "to stop from" in line]
