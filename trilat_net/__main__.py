@@ -1,6 +1,21 @@
-"""Entry point of `python -m trilat_net`, the same as `trilat`."""
+"""Entry point of `trilat` and of `python -m trilat_net`; who stops arms does not wait for the other commands."""
 
-from .cli import main
+import sys
+
+
+def main() -> None:
+    """Runs `trilat`."""
+    if sys.argv[1:2] == ["stop"]:
+        from .net.emergency_stop import stop_at_once
+
+        left = stop_at_once(sys.argv[2:])
+        if isinstance(left, int):
+            sys.exit(left)
+        sys.argv[2:] = left
+    from .cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()
