@@ -1,4 +1,4 @@
-"""Entry point of `trilat` and of `python -m trilat_net`; who stops arms does not wait for the other commands."""
+"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands."""
 
 import sys
 
@@ -6,7 +6,7 @@ import sys
 def main() -> None:
     """Runs `trilat`."""
     if sys.argv[1:2] == ["stop"]:
-        from .net.emergency_stop import stop_at_once
+        from .net.known_sites import stop_at_once
 
         left = stop_at_once(sys.argv[2:])
         if isinstance(left, int):
