@@ -258,14 +258,14 @@ class PageServer:
             ticking.cancel()
 
     async def _tick(self) -> None:
-        """Takes in the session's messages and makes a frame, thirty times a second; a failure ends that turn."""
+        """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
         while True:
             begun_ns = self._clock.monotonic_ns()
             for step in (self._desk.poll, self.view.poll, self._settle_asked, self._make_frame):
                 try:
                     step()
                 except Exception as error:
-                    self._count_failure(step.__name__.strip("_"), error)
+                    self._count_failure(step.__qualname__, error)
             for page in self._pages:
                 page.wake.set()
             spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
