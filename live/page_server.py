@@ -242,7 +242,7 @@ class PageServer:
             max_queue=32,
             compression=None,
             ping_interval=5,
-            ping_timeout=10,
+            ping_timeout=30,  # a busy machine is no dead page
             open_timeout=3,
             close_timeout=1,
             logger=_SILENT,

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from playwright.sync_api import Page
 
 from tests.cli.running import COMMAND, PLAIN
 from tests.net.waiting import until
@@ -20,6 +19,7 @@ from trilat_net.scenario import list_shipped, load_scenario
 from trilat_net.scenario.operators import find_live_hand
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .page_client import PageClient, page_client
 from .processes import Process, Stage, executed_again
 
 HELD = [
@@ -28,7 +28,6 @@ HELD = [
     if any(find_live_hand(site.hands) is not None for site in load_scenario(name).sites.values())
 ]
 """Shipped scenarios whose arms people hold."""
-MODES = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')"
 
 
 @contextmanager
@@ -64,37 +63,52 @@ def run(stage: Stage, *words: str) -> Process:
     return done
 
 
-def enabled(stage: Stage, page: Page, session: str) -> None:
-    shows(page, MODES.format("stopped"))
-    run(stage, "enable", "--session", session)
-    shows(page, MODES.format("run"))
+def enabled(stage: Stage, page: PageClient) -> None:
+    page.shows("stopped")
+    run(stage, "enable", "--session", page.hello["session"])
+    page.shows("run")
 
 
-@needs_browser
 @pytest.mark.parametrize("scenario", HELD)
 def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again(
     scenario: str, stage: Stage
 ) -> None:
     running = stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"))
-    with browser_page(page_address(running)) as page:
-        shows(page, "trilat.frame && " + MODES.format("run"))
-        session = page.evaluate("trilat.hello.session")
+    with page_client(page_address(running)) as page:
+        page.shows("run")
+        session = page.hello["session"]
         stop = run(stage, "stop", "--session", session).text()
         assert stop.startswith(f"stopping every arm of session {session} ...\n")
-        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == 3
-        enabled(stage, page, session)
-        page.click("#stop")
-        enabled(stage, page, session)
-        page.keyboard.press("Escape")
-        enabled(stage, page, session)
+        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(page.frame["sites"])
+        enabled(stage, page)
+        page.send(do="stop")
+        enabled(stage, page)
         with watching(stage, session) as keys:
             os.write(keys, b"s")
-            enabled(stage, page, session)
+            enabled(stage, page)
+        page.send(do="end")
+        running.prints("checking the log")  # as `demo` does
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    executed_again(open_log(stage.folder / "out" / "run.mcap"))
+
+
+@needs_browser
+@pytest.mark.long
+def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
+    running = stage.start("live", "live", "play", "--no-browser", "--out", str(stage.folder / "out"))
+    modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
+    with browser_page(page_address(running)) as page:
+        shows(page, "trilat.frame && " + modes("run"))
+        for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
+            stop()
+            shows(page, modes("stopped"))
+            if "TRILAT_PICTURES" in os.environ:
+                page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stop.png")
+            run(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
+            shows(page, modes("run"))
     running.signal(signal.SIGINT)
     running.prints("checking the log")
-    running.signal(signal.SIGINT)
-    running.code()
-    executed_again(open_log(stage.folder / "out" / "run.mcap"))
 
 
 @needs_browser
@@ -103,7 +117,7 @@ def test_whoever_holds_an_arm_is_asked_before_another_page_takes_part(stage: Sta
     running = stage.start("live", "live", "play", "--no-browser", "--out", str(stage.folder / "out"))
     address = page_address(running)
     with browser_page(address) as first:
-        shows(first, "trilat.frame && trilat.takesPart && " + MODES.format("run"))
+        shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
         second = first.context.new_page()
         second.goto(address)
         shows(second, "trilat.frame && trilat.frame.pages === 2")
