@@ -1,11 +1,15 @@
 """Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands."""
 
+import os
 import sys
+from contextlib import suppress
 
 
 def main() -> None:
     """Runs `trilat`."""
     if sys.argv[1:2] == ["stop"]:
+        with suppress(AttributeError, OSError):  # before the other programs of a busy machine, if it may
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net.known_sites import stop_at_once
 
         left = stop_at_once(sys.argv[2:])

@@ -110,8 +110,9 @@ def answer_to(address: str, request: bytes) -> bytes:
     ("count", "raw"), [(150, 30), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
 )
 def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage) -> None:
-    out = ("--no-browser", "--duration", "600", "--out", str(stage.folder / "out"))
-    running: Process = stage.start("live", "live", "play", *out)
+    rare = ("--set", "rate_hz=250")  # records are few, messages are not
+    words = ("live", "play", "--no-browser", "--duration", "600", "--out", str(stage.folder / "out"), *rare)
+    running: Process = stage.start("live", *words)
     address = page_address(running)
     with page_client(address) as page:
         page.shows("run")
