@@ -56,6 +56,11 @@ def own_terminal() -> None:
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
+def live(stage: Stage, scenario: str, *options: str) -> Process:
+    """A session with a page."""
+    return stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options)
+
+
 def run(stage: Stage, *words: str) -> Process:
     """A command that ends with 0."""
     done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
@@ -73,7 +78,7 @@ def enabled(stage: Stage, page: PageClient) -> None:
 def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again(
     scenario: str, stage: Stage
 ) -> None:
-    running = stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"))
+    running = live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
         session = page.hello["session"]
@@ -96,9 +101,9 @@ def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again
 @needs_browser
 @pytest.mark.long
 def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
-    running = stage.start("live", "live", "play", "--no-browser", "--out", str(stage.folder / "out"))
+    running = live(stage, "play", "--set", "rate_hz=250")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
-    with browser_page(page_address(running)) as page:
+    with browser_page(page_address(running), gl=False) as page:
         shows(page, "trilat.frame && " + modes("run"))
         for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
             stop()
@@ -114,11 +119,11 @@ def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
 @needs_browser
 @pytest.mark.long
 def test_whoever_holds_an_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
-    running = stage.start("live", "live", "play", "--no-browser", "--out", str(stage.folder / "out"))
+    running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
-    with browser_page(address) as first:
+    with browser_page(address, gl=False) as first:
         shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
-        second = first.context.new_page()
+        second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)
         shows(second, "trilat.frame && trilat.frame.pages === 2")
         first.bring_to_front()
