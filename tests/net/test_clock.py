@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.clock import Clock, ManualClock, SkewedClock, SystemClock, make_system_clock
+from tests.net.manual_clock import ManualClock
+from trilat_net.net.clock import Clock, SkewedClock, SystemClock, make_system_clock
 
 CLOCKS = {
     "system": SystemClock,

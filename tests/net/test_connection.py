@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
 from trilat_net.net.bus import Bus, LocalNetwork
-from trilat_net.net.clock import ManualClock
 from trilat_net.net.connection import (
     ROUTER_POLL_NS,
     Connection,

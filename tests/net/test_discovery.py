@@ -8,10 +8,11 @@ import msgspec
 import pytest
 
 from sites.change_server import ChangeServer
+from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
 from trilat_net.net.bus import LocalNetwork
-from trilat_net.net.clock import ManualClock, SystemClock
+from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
 from trilat_net.net.discovery import connect_to_session, find_members, request_change
 from trilat_net.net.membership import EventPublisher, liveliness_token

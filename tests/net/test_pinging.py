@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.net.manual_clock import ManualClock
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, LocalNetwork
-from trilat_net.net.clock import ManualClock, SkewedClock
+from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import exact_offset
 from trilat_net.net.pinging import (

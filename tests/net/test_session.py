@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox, LocalNetwork
-from trilat_net.net.clock import ManualClock
 from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import VERSION, Event, Info
 from trilat_net.net.session import DECIDE_NS, EPOCH_AHEAD_NS

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recorder.backfill import ANSWER_NS, GIVE_UP_NS, MAX_VAIN_REQUESTS, SILENT_NS
+from tests.net.manual_clock import ManualClock
 from trilat_net.net import topics
-from trilat_net.net.clock import ManualClock
 from trilat_net.net.messages import Event, RecorderStats, State
 from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill
 from trilat_net.net.wire import decode, encode

@@ -4,7 +4,7 @@ import pytest
 
 from recorder import inbound_queue as module
 from recorder.inbound_queue import InboundQueue
-from trilat_net.net.clock import ManualClock
+from tests.net.manual_clock import ManualClock
 
 
 def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:

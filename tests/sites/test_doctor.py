@@ -14,7 +14,8 @@ import pytest
 from sites import doctor
 from sites.doctor import examine_clock, examine_keys, examine_links, examine_machine, examine_room
 from tests.cli.running import trilat
-from trilat_net.net.clock import ManualClock, SystemClock
+from tests.net.manual_clock import ManualClock
+from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, find_free_endpoints
 from trilat_net.net.member_keys import create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus

@@ -7,10 +7,11 @@ import pytest
 
 from sites.law_watchdog import HICCUP_NS, MOST_NS, SHARE, LawWatchdog
 from tests.core.sites import setup
+from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.errors import LawFailed
-from trilat_net.net.clock import ManualClock, SystemClock
+from trilat_net.net.clock import SystemClock
 
 PERIOD_NS = 1_000_000
 TICKS = 3000

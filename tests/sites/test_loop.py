@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from sites.site_loop import PeerInbox, StateBlock, run_loop
+from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
@@ -15,7 +16,6 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.clock import ManualClock
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import LinkStats, PeerSample, State
 from trilat_net.net.timing import SiteTiming

@@ -89,27 +89,3 @@ def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
     if not offset_s and not drift_ppm:
         return SystemClock()
     return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))
-
-
-class ManualClock:
-    """A clock that a test moves by hand; sleeping moves it to the deadline."""
-
-    def __init__(self, start_ns: int = 0, epoch_unix_ns: int = 0) -> None:
-        self._now_ns = start_ns
-        self._epoch_unix_ns = epoch_unix_ns
-
-    def monotonic_ns(self) -> int:
-        """See `Clock`."""
-        return self._now_ns
-
-    def unix_ns(self) -> int:
-        """See `Clock`."""
-        return self._epoch_unix_ns + self._now_ns
-
-    def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`."""
-        self._now_ns = max(self._now_ns, deadline_ns)
-
-    def identity(self) -> str:
-        """See `Clock`."""
-        return "manual"

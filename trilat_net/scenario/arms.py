@@ -5,7 +5,7 @@ compute with the same leaves; the planar arm is then written as a chain of two j
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
 
@@ -261,12 +261,6 @@ class ArmModel(NamedTuple):
             return ()
         upper, lower = (abs(float(share)) * g_m_s2 for share in self.theta[3:5])
         return upper + lower, lower
-
-    def joint_inertias(self, q: Sequence[float]) -> Array:
-        """Returns the diagonal of M(q), shape (n,): the inertia that each joint moves by itself."""
-        if self.chain is not None:
-            return np.diag(self.inertia(np.array(q)))
-        return np.array([self.theta[0] + 2.0 * self.theta[1] * math.cos(q[1]), self.theta[2]])
 
     def inertia(self, q: Array) -> Array:
         """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""

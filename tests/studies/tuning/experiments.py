@@ -4,6 +4,7 @@ from pathlib import Path
 
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.studies.tuning import TuningPlan, plan_tuning
+from trilat_net.studies.tuning.pareto_search import ObjectivePoint
 
 TRIO = """
 name = "trio"
@@ -38,3 +39,8 @@ def asked(folder: Path, *overrides: str, text: str = TRIO, **settings: object) -
     path = folder / "trio.toml"
     path.write_text(text)
     return plan_tuning(path, overrides, **settings)  # type: ignore[arg-type]
+
+
+def dominates(a: ObjectivePoint, b: ObjectivePoint) -> bool:
+    """True where a is no worse than b in both, and better in one."""
+    return a[0] <= b[0] and a[1] <= b[1] and a != b

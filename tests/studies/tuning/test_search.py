@@ -13,10 +13,11 @@ from trilat_net.studies.tuning.pareto_search import (
     CandidateSearch,
     Objective,
     compute_crowding,
-    dominates,
     find_pareto_front,
 )
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+
+from .experiments import dominates
 
 BUDGETS = st.integers(1, 40)
 SEEDS = st.integers(0, 2**63 - 1)

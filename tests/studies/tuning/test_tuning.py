@@ -15,7 +15,6 @@ from trilat_net.studies.tuning.final_posture import CandidateClass
 from trilat_net.studies.tuning.pareto_search import (
     CandidateSearch,
     Objective,
-    dominates,
     find_pareto_front,
 )
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
@@ -26,7 +25,7 @@ from trilat_net.studies.tuning.tuning_report import (
     write_tuning,
 )
 
-from .experiments import asked
+from .experiments import asked, dominates
 
 LAWS = ("adaptive", "p_d", "known")
 

@@ -38,11 +38,6 @@ class Objective(StrEnum):
         return value, score.effort_nm
 
 
-def dominates(a: ObjectivePoint, b: ObjectivePoint) -> bool:
-    """True where a is no worse than b in both, and better in one."""
-    return a[0] <= b[0] and a[1] <= b[1] and a != b
-
-
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
     """Returns the places of the points that none dominates, by rising effort.
 
