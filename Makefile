@@ -42,8 +42,8 @@ $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/dev.lock
 	@touch $@
 
-$(VENV)/robots.stamp: requirements/robots.lock $(VENV)/dev.stamp
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/robots.lock
+$(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/long.lock
 	@touch $@
 
 test: pytest
@@ -60,7 +60,7 @@ compiled: setup
 sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
-test-long: $(VENV)/robots.stamp $(VENV)/docs.stamp
+test-long: $(VENV)/long.stamp $(VENV)/docs.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
@@ -81,7 +81,7 @@ lint: $(VENV)/dev.stamp
 faults: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.faults --seeds 2000 --write
 
-$(VENV)/docs.stamp: requirements/docs.lock $(VENV)/dev.stamp
+$(VENV)/docs.stamp: requirements/docs.lock $(VENV)/runtime.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/docs.lock
 	@touch $@
 
@@ -94,11 +94,11 @@ bench: $(VENV)/dev.stamp
 
 lock:
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		pyproject.toml --extra frames --group build -o requirements/runtime.lock
+		pyproject.toml --group build -o requirements/runtime.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		--group robots -c requirements/dev.lock -o requirements/robots.lock
+		--group long -c requirements/dev.lock -o requirements/long.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group docs -c requirements/dev.lock -o requirements/docs.lock
 
