@@ -88,6 +88,7 @@ $(VENV)/docs.stamp: requirements/docs.lock $(VENV)/runtime.stamp
 docs: $(VENV)/docs.stamp
 	$(BIN)/python docs/site/make_pages.py
 	cd build/site && ../../$(BIN)/zensical build --strict -f zensical.toml
+	@echo "open build/site/html/index.html in a browser; it needs no server and no network"
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks

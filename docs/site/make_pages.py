@@ -15,10 +15,11 @@ from pathlib import Path
 import trilat_net as tn
 from trilat_net.reporting.figures.registry import write_figures
 
-ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
 SITE = ROOT / "build" / "site"
 PAGES = SITE / "docs"
-LINK = re.compile(r"(?<=\]\()(?P<up>(?:\.\./)*)(?P<to>[\w./-]+?)(?P<at>#[\w-]+)?(?=\))")
+LINK = re.compile(r"""(?P<mark>\]\(|<img src=")docs/""")
 
 
 def main() -> None:
@@ -28,14 +29,16 @@ def main() -> None:
     for name in ("CHANGELOG.md", "SECURITY.md", "LICENSE"):
         shutil.copy(ROOT / name, PAGES / (name if name.endswith(".md") else f"{name}.md"))
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    write("index.md", LINK.sub(lambda one: one["to"].removeprefix("docs/") + (one["at"] or ""), readme))
+    write("index.md", LINK.sub(r"\g<mark>", readme))
     for page in PAGES.glob("*.md"):  # what stands beside docs in the repository stands in it here
         page.write_text(page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8")
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
     write("gallery.md", "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]))
-    shutil.copy(ROOT / "docs" / "site" / "zensical.toml", SITE)
+    shutil.copy(HERE / "zensical.toml", SITE)
+    (PAGES / "assets").mkdir()
+    shutil.copy(HERE / "iframe-worker.js", PAGES / "assets")
 
 
 def write(name: str, text: str) -> None:
@@ -83,7 +86,7 @@ def show_template() -> str:
 
 def list_scenarios(*, pictures: bool) -> Iterator[str]:
     """Yields a section per shipped scenario: what it shows, and a run of it in virtual time."""
-    for name in tn.list_shipped():
+    for name in sorted(tn.list_shipped(), key=lambda one: one != "paper"):  # the paper's first
         scenario = tn.load_scenario(name)
         parts = [
             f"## {name}",
