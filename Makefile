@@ -18,10 +18,10 @@ help:
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 
 demo: setup
-	@$(BIN)/trilat demo paper
+	@$(BIN)/trilat demo paper $(OPTIONS)
 
 play: setup
-	@$(BIN)/trilat live play
+	@$(BIN)/trilat live play $(OPTIONS)
 
 setup: $(VENV)/runtime.stamp
 
