@@ -10,6 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
 	@echo "make play    take hold of three arms on a page in the browser, and look at what you made"
+	@echo "             OPTIONS='--duration 5' gives options to either"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
