@@ -10,6 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
 	@echo "make play    take hold of three arms on a page in the browser, and look at what you made"
+	@echo "             OPTIONS='--duration 5' gives options to either"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
@@ -18,10 +19,10 @@ help:
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 
 demo: setup
-	@$(BIN)/trilat demo paper
+	@$(BIN)/trilat demo paper $(OPTIONS)
 
 play: setup
-	@$(BIN)/trilat live play
+	@$(BIN)/trilat live play $(OPTIONS)
 
 setup: $(VENV)/runtime.stamp
 
@@ -42,8 +43,8 @@ $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/dev.lock
 	@touch $@
 
-$(VENV)/robots.stamp: requirements/robots.lock $(VENV)/dev.stamp
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/robots.lock
+$(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
+	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/long.lock
 	@touch $@
 
 test: pytest
@@ -60,7 +61,7 @@ compiled: setup
 sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
-test-long: $(VENV)/robots.stamp $(VENV)/docs.stamp
+test-long: $(VENV)/long.stamp $(VENV)/docs.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
@@ -81,24 +82,25 @@ lint: $(VENV)/dev.stamp
 faults: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.faults --seeds 2000 --write
 
-$(VENV)/docs.stamp: requirements/docs.lock $(VENV)/dev.stamp
+$(VENV)/docs.stamp: requirements/docs.lock $(VENV)/runtime.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/docs.lock
 	@touch $@
 
 docs: $(VENV)/docs.stamp
 	$(BIN)/python docs/site/make_pages.py
 	cd build/site && ../../$(BIN)/zensical build --strict -f zensical.toml
+	@echo "open build/site/html/index.html in a browser; it needs no server and no network"
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks
 
 lock:
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		pyproject.toml --extra frames --group build -o requirements/runtime.lock
+		pyproject.toml --group build -o requirements/runtime.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
-		--group robots -c requirements/dev.lock -o requirements/robots.lock
+		--group long -c requirements/dev.lock -o requirements/long.lock
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group docs -c requirements/dev.lock -o requirements/docs.lock
 

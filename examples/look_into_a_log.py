@@ -64,7 +64,7 @@ except ImportError:
     print("no polars: what follows is left out")
 
 if pl is not None:
-    frame = log.frame(slave)  # log.frame(slave).to_pandas() where you prefer pandas
+    frame = log.frame(slave)  # log.to_frame(slave) where you prefer pandas
     print(frame.select("t_s", "q1_rad", "q2_rad", "tau1_nm", "tau2_nm", "mode").tail(3))
 
 # %% Per second: how large the error was, how old the samples were

@@ -69,7 +69,7 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
 
 
 ELSEWHERE = {
-    "README.md: $ make demo": "tests/live/test_demo.py",
+    "README.md": ".ci/readme",
     "docs/bench.md: trilat bench --small": "tests/cli/test_benches.py",
     "docs/external-arm.md: from trilat_net.net.arm_port import ArmPort": "tests/sites/test_external_arm.py",
     "docs/external-arm.md: from trilat_net.net.arm_port import Enable": "tests/sites/test_external_arm.py",

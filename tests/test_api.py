@@ -3,7 +3,6 @@
 import doctest
 import inspect
 import json
-import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -167,12 +166,6 @@ def test_a_scenario_is_a_name_a_text_its_tables_or_itself(tmp_path: Path) -> Non
     for source in (named, text, tmp_path / "mine.toml"):
         assert tn.load_scenario(source) == named
     assert tn.load_scenario("two_sites", {"control.Kd": 5}, seed=3).seed == 3
-
-
-def test_without_pandas_an_error_says_what_to_install(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UsageError, match=r"pip install 'trilat-net\[frames\]'"):
-        tn.metrics(file).to_frame()
 
 
 def test_a_law_is_given_as_its_class() -> None:

@@ -16,7 +16,7 @@ import pytest
 import tomli_w
 
 import trilat_net as tn
-from tests.cli.running import parses, started, trilat
+from tests.cli.running import parses, trilat
 from tests.documentation import (
     ELSEWHERE,
     NOT_RUN,
@@ -44,7 +44,7 @@ def test_every_exception_is_one_and_its_test_is_there() -> None:
 
 
 def test_every_block_is_run_or_there_is_a_reason() -> None:
-    runs = {"sh": SESSION_PAGES | COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
+    runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
     known = [block for block in BLOCKS if block.language]
     assert len(known) > 60
     assert not [b.name for b in known if b.page not in runs[b.language] and not find_exception(b)]
@@ -124,7 +124,6 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 # --- commands ---------------------------------------------------------------------------------------------
 
-SESSION_PAGES = {"README.md"}
 COMMAND_PAGES = {
     "docs/arms.md",
     "docs/errata.md",
@@ -169,24 +168,6 @@ def test_the_commands_of_a_page_run_and_print_what_stands_there(page: str, tmp_p
 
 @pytest.mark.long
 @pytest.mark.live
-def test_the_sessions_of_the_readme_run(tmp_path: Path) -> None:
-    """Four terminals as the page has them, for 2 s, and then its Python on the log that they left."""
-    (block,) = (b for b in find_blocks("README.md") if b.text.startswith("trilat record"))
-    short = ("--set", "duration_s=2")
-    processes = [
-        started(*words[1:], *(short if words[1] == "site" else ()), cwd=tmp_path)
-        for words, _ in read_commands(block.text)
-    ]
-    for process in processes:
-        said = process.communicate(timeout=120)
-        assert process.returncode == 0, said
-    printed = run_python("README.md", tmp_path)
-    assert "6000/6000 records" in printed
-    assert printed.startswith("1.999 ")
-
-
-@pytest.mark.long
-@pytest.mark.live
 def test_the_code_of_a_hand_takes_hold_of_an_arm_and_lets_go(tmp_path: Path) -> None:
     words = ("--scenario", "play", "--set", "duration_s=600")
     sites = [Process(name, ["site", name, *words], tmp_path) for name in tn.load_scenario("play").names]
@@ -203,7 +184,6 @@ def test_the_code_of_a_hand_takes_hold_of_an_arm_and_lets_go(tmp_path: Path) -> 
 # --- Python -----------------------------------------------------------------------------------------------
 
 PYTHON_PAGES = {
-    "README.md",
     "docs/certificate.md",
     "docs/linear.md",
     "docs/live-hands.md",
@@ -213,7 +193,7 @@ PYTHON_PAGES = {
     "docs/rerun.md",
     "docs/sweep.md",
 }
-OF_THEIR_OWN = {"README.md", "docs/live-hands.md", "docs/sweep.md"}
+OF_THEIR_OWN = {"docs/live-hands.md", "docs/sweep.md"}
 """Pages whose code needs a session or a sweep, which a test of their own makes."""
 AT_HAND = {
     "docs/certificate.md": "import numpy as np\nfrom trilat_net.core.law_energy import *\n",

@@ -68,6 +68,28 @@ def test_it_is_built_once_installed_everywhere_and_then_published_without_a_secr
     assert PROJECT["project"]["requires-python"] == f">={stated[0]}"
 
 
+def names_of(stated: list[str]) -> set[str]:
+    return {re.split(r"[^\w-]", one)[0] for one in stated}
+
+
+def locked(name: str) -> set[str]:
+    text = (ROOT / "requirements" / f"{name}.lock").read_text(encoding="utf-8")
+    return set(re.findall(r"^([\w-]+)==", text, re.MULTILINE))
+
+
+def test_every_lock_has_what_is_stated_for_it_and_setup_installs_no_extra() -> None:
+    """A lock that is made once and not again with a new dependency lacks it: `make lock`."""
+    groups = {key: names_of(stated) for key, stated in PROJECT["dependency-groups"].items()}
+    needed, extras = PROJECT["project"]["dependencies"], PROJECT["project"]["optional-dependencies"]
+    every_extra = {name for stated in extras.values() for name in names_of(stated)}
+    assert names_of(needed) | groups["build"] <= locked("runtime")
+    assert not every_extra & locked("runtime")
+    assert locked("runtime") | groups["dev"] | names_of(extras["frames"]) <= locked("dev")
+    assert groups["docs"] <= locked("docs")
+    assert groups["long"] <= locked("long")
+    assert len(locked("docs")) < 40  # no environment of a developer
+
+
 def check_release(tag: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [sys.executable, ROOT / ".ci" / "check-release", tag, folder], capture_output=True, text=True

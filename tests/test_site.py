@@ -1,39 +1,89 @@
-"""The site of documentation: its links hold, and it has every name, command and key."""
+"""The site of documentation: links and pictures hold, it has every name, and takes nothing from a network."""
 
+import re
+import runpy
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import unquote, urlsplit
 
 import pytest
 
 import trilat_net as tn
 from tests.golden.surface import all_options
+from tests.live.browsers import browser_page, needs_browser
 
 ROOT = Path(__file__).resolve().parents[1]
 HTML = ROOT / "build" / "site" / "html"
+MAKE = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site" / "make_pages.py")))
 
 
-class Ids(HTMLParser):
-    """What a page's parts are called."""
+class Page(HTMLParser):
+    """What a page's parts are called, where it leads to, and what a browser loads for it."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
-        self.found: set[str] = set()
+        self.ids: set[str] = set()
+        self.leads: set[str] = set()
+        self.loads: set[str] = set()
         self.feed(page.read_text(encoding="utf-8"))
 
-    def handle_starttag(self, _: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found |= {value for key, value in attrs if key == "id" and value}
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {key: value for key, value in attrs if value}
+        self.ids |= {given[key] for key in ("id",) if key in given}
+        self.leads |= {given["href"]} if tag == "a" and "href" in given else set()
+        self.loads |= {given[key] for key in ("src", "href") if tag != "a" and key in given}
+
+
+def test_every_picture_and_page_that_the_first_page_names_is_there() -> None:
+    text = MAKE.make_first_page()
+    named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
+    assert len(named) > 40
+    places = [ROOT / "docs" / one for one in named if one not in MAKE.BESIDE]
+    assert [place for place in places if not place.is_file()] == []
+
+
+def test_the_gallery_begins_with_the_paper() -> None:
+    sections = list(MAKE.list_scenarios(pictures=False))
+    assert sections[0].startswith("## paper\n")
+    assert len(sections) == len(tn.list_shipped())
 
 
 @pytest.mark.long
+@needs_browser
 def test_the_site_is_whole() -> None:
-    """Zensical refuses a link or an anchor that leads nowhere."""
+    """Zensical refuses a Markdown link or an anchor that leads nowhere; pictures in HTML it does not see."""
     subprocess.run([sys.executable, "docs/site/make_pages.py", "--no-gallery"], cwd=ROOT, check=True)
     build = [Path(sys.executable).with_name("zensical"), "build", "--strict", "-f", "zensical.toml"]
     subprocess.run(build, cwd=ROOT / "build" / "site", check=True)
-    names = {name.rpartition(".")[2] for name in Ids(HTML / "reference" / "python.html").found}
+    names = {name.rpartition(".")[2] for name in Page(HTML / "reference" / "python.html").ids}
     assert not {name for name in tn.__all__ if name != "__version__"} - names
-    commands = Ids(HTML / "reference" / "commands.html").found
+    commands = Page(HTML / "reference" / "commands.html").ids
     assert not {command.replace(" ", "-") for command in all_options()} - {"trilat"} - commands
     assert (HTML / "search.js").exists()
+    absent, foreign = [], []
+    for path in HTML.rglob("*.html"):
+        page = Page(path)
+        foreign += [(path.name, one) for one in page.loads if urlsplit(one).netloc]
+        for one in map(urlsplit, page.leads | page.loads):
+            if not (one.scheme or one.netloc) and one.path and path.name != "404.html":
+                target = path.parent / unquote(one.path)
+                absent += [(path.name, one.path)] if not target.exists() else []
+    assert absent == []
+    assert foreign == []
+    check_search()
+
+
+def check_search() -> None:
+    """From a page in a folder, opened as a file: what is found leads to its place, and nothing is fetched."""
+    with browser_page("about:blank") as page:
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto((HTML / "maps" / "p_d.html").as_uri())
+        page.locator(".md-search__button").first.click()
+        page.locator("dialog input").first.fill("dominance")
+        page.locator("dialog a", has_text="trilat set dominance").first.click()
+        page.wait_for_url("**/reference/commands.html*#trilat-set-dominance")
+        assert {urlsplit(url).scheme for url in asked} <= {"file", "data", "blob"}

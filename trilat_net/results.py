@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .files import import_extra
-
 if TYPE_CHECKING:
     import pandas
 
@@ -32,12 +30,10 @@ class Result:
         return str(_texts().summarize(self))
 
     def to_frame(self) -> "pandas.DataFrame":
-        """Returns a pandas data frame.
+        """Returns a pandas data frame."""
+        from pandas import DataFrame
 
-        Raises:
-            UsageError: pandas is not installed.
-        """
-        return import_extra("pandas", "frames", "data frames").DataFrame(list(self.to_rows()))
+        return DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
         """Returns the result in one line."""

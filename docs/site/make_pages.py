@@ -15,27 +15,30 @@ from pathlib import Path
 import trilat_net as tn
 from trilat_net.reporting.figures.registry import write_figures
 
-ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
 SITE = ROOT / "build" / "site"
 PAGES = SITE / "docs"
-LINK = re.compile(r"(?<=\]\()(?P<up>(?:\.\./)*)(?P<to>[\w./-]+?)(?P<at>#[\w-]+)?(?=\))")
+BESIDE = ("CHANGELOG.md", "SECURITY.md", "LICENSE")
+"""Pages that stand beside docs in the repository, and in it here."""
 
 
 def main() -> None:
     """Gathers all pages, and the settings of Zensical beside them."""
     shutil.rmtree(SITE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site"))
-    for name in ("CHANGELOG.md", "SECURITY.md", "LICENSE"):
+    for name in BESIDE:
         shutil.copy(ROOT / name, PAGES / (name if name.endswith(".md") else f"{name}.md"))
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    write("index.md", LINK.sub(lambda one: one["to"].removeprefix("docs/") + (one["at"] or ""), readme))
-    for page in PAGES.glob("*.md"):  # what stands beside docs in the repository stands in it here
+    write("index.md", make_first_page())
+    for page in PAGES.glob("*.md"):
         page.write_text(page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8")
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
     write("gallery.md", "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]))
-    shutil.copy(ROOT / "docs" / "site" / "zensical.toml", SITE)
+    shutil.copy(HERE / "zensical.toml", SITE)
+    (PAGES / "assets").mkdir()
+    shutil.copy(HERE / "iframe-worker.js", PAGES / "assets")
 
 
 def write(name: str, text: str) -> None:
@@ -43,6 +46,12 @@ def write(name: str, text: str) -> None:
     path = PAGES / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text.rstrip() + "\n", encoding="utf-8")
+
+
+def make_first_page() -> str:
+    """Returns the README with its links and pictures as docs has them."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    return re.sub(r'(\]\(|src=")docs/', r"\1", readme)
 
 
 def list_commands() -> str:
@@ -83,7 +92,7 @@ def show_template() -> str:
 
 def list_scenarios(*, pictures: bool) -> Iterator[str]:
     """Yields a section per shipped scenario: what it shows, and a run of it in virtual time."""
-    for name in tn.list_shipped():
+    for name in sorted(tn.list_shipped(), key=lambda one: one != "paper"):  # the paper's first
         scenario = tn.load_scenario(name)
         parts = [
             f"## {name}",

@@ -366,13 +366,10 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
 
 
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers.
+    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers."""
+    from pandas import DataFrame
 
-    Raises:
-        UsageError: pandas is not installed.
-    """
-    pd = import_extra("pandas", "frames", "data frames")
-    return cast("pandas.DataFrame", pd.DataFrame({one.name: _pandas_values(one) for one in table.columns}))
+    return DataFrame({one.name: _pandas_values(one) for one in table.columns})
 
 
 def _pandas_values(column: Column) -> NDArray[Any] | list[Any]:

@@ -136,11 +136,7 @@ class Log(Result):
         ]
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
-        """Returns a table of the log as a pandas data frame, see `table`; without a name a row per site.
-
-        Raises:
-            UsageError: pandas is not installed.
-        """
+        """Returns a table of the log as a pandas data frame, see `table`; without a name a row per site."""
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
 
     def _ipython_key_completions_(self) -> list[str]:
