@@ -69,7 +69,7 @@ def stop_command(
     They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
     Without endpoints it asks the first site, at its loopback port, for the others.
     """
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys, operates=end)
     if not end:
         _order(session, connection, sites, "stop")
         return
