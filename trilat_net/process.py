@@ -87,11 +87,12 @@ ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) 
 class Interrupt:
     """A context that records the first signal that ends a program, as `number` (else 0).
 
-    Whoever ignores the end of its terminal (`nohup`) goes on doing so.
+    Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it `compiles`, and nothing else
+    is to be ended in order, a signal ends the process at once while the compiler runs.
     """
 
-    def __init__(self) -> None:
-        self.number = 0
+    def __init__(self, *, compiles: bool = False) -> None:
+        self.number, self.compiles = 0, compiles
         self._before: dict[int, Any] = {}
         self.raises = False
 
@@ -159,7 +160,7 @@ def let_signals_kill() -> Callable[[], None]:
 
 
 def _breaks_off(owner: object) -> bool:
-    return isinstance(owner, Interrupt) and owner.raises
+    return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
 def count_cores() -> int:

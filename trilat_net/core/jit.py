@@ -69,9 +69,9 @@ class _CompilingNotice(event.Listener):
         self._restore: list[Callable[[], None]] = []  # of compilations inside one another
 
     def on_start(self, begun: Any) -> None:
-        """Says so as the kernel is compiled."""
+        """Says so as anything of the core is compiled."""
         self._restore.append(let_signals_kill())
-        if not self.said and begun.data["dispatcher"].py_func.__module__ == f"{__package__}.kernel":
+        if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(__package__):
             self.said = True
             print(COMPILING, file=sys.stderr, flush=True)
 
