@@ -83,7 +83,7 @@ def serve_page(
             if options.opens and _has_browser():
                 webbrowser.open(page.address)
         yield page
-        for reason, count in sorted(page.refused.items()):
+        for reason, count in sorted((+page.refused).items()):
             say(f"the page refused {count} messages or requests: {reason}")
 
 

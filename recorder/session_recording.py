@@ -110,6 +110,7 @@ class Recording:
         self._admit_starts()
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in list(self._repairs.items()):
+            self._sites[name].since_ns = now_ns - self.epoch.mono_ns
             for channel, message, payload in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
                 key = topics.key(self.session, name, channel)
                 sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
@@ -201,6 +202,7 @@ class Recording:
             return
         if arrived.key not in self._channels:
             raise WireError("stranger", arrived.key)
+        self._channels[arrived.key][0].since_ns = since_ns
         site, message = self._read(arrived.key, arrived.payload)
         channel = self._channels[arrived.key][1]
         self._note_admission(message.content)

@@ -1,10 +1,12 @@
 """Reception state of one site at the recorder: messages received, and messages still missing.
 
 Invariant: a message counts only when it is decoded, of this site, of this boot, and has a number that the
-scenario allows; each such message may imply that others exist. Records and statistics are as many as the
-scenario has ticks; of events a log takes so many bytes, and the first word of an end all the same.
+scenario and the clock allow; each such message may imply that others exist. Records and statistics are as
+many as the scenario has ticks, and none is of a tick still to come; of events a log takes so many bytes, and
+the first word of an end all the same.
 """
 
+import math
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
@@ -19,9 +21,12 @@ from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
-_MANY = 1 << 40
+_LEAD_NS, _DRIFT = 2_000_000_000, 1e-3
+"""By so much, and this share of the session's time, clocks of sites may be ahead of the recorder's."""
 EVENT_BYTES, EVENT_BYTES_PER_S = 512 << 10, 4 << 10
 """Bytes of a site's events that a log takes, and more for each of its seconds: ten events a second."""
+_LEAST_EVENT_BYTES = 128
+"""No event is shorter."""
 
 
 class SiteMessage(NamedTuple):
@@ -55,6 +60,7 @@ class SiteReception:
         event_accounts: those of the starts before.
         made: number of its ticks, once its end event has arrived; else None.
         heard_ns: arrival of its last message, on the recorder's clock; None before.
+        since_ns: time since the epoch on that clock: what claims to be later is not believed.
         period_ns: its tick period.
     """
 
@@ -69,6 +75,7 @@ class SiteReception:
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
         self.made: int | None = None
         self.heard_ns: int | None = None
+        self.since_ns: float = math.inf if before is None else before.since_ns
         self._boot = boot
         self._rate_hz, self._layout = scenario.sites[name].rate_hz, scenario.layout(name)
         self.period_ns = 1_000_000_000 // self._rate_hz
@@ -80,7 +87,7 @@ class SiteReception:
         self._event_room = EVENT_BYTES + round(EVENT_BYTES_PER_S * scenario.duration_s)
         self._most = {
             channel: count_messages(channel, self._ticks, self._rate_hz) for channel in SITE_CHANNELS
-        } | {topics.EVENT: _MANY}
+        } | {topics.EVENT: self._event_room // _LEAST_EVENT_BYTES}
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
         """Decodes a payload.
@@ -105,9 +112,17 @@ class SiteReception:
             raise WireError("stranger", f"{sender}, start {message.content.boot}, on a key of {self.name}")
         if message.number >= self._most[channel]:
             raise WireError("out of range", f"{self.name}/{channel} number {message.number}")
+        if _count_ticks(message.content) > self._possible_ticks:
+            raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {message.number}")
         if isinstance(message.content, Event):
             self._take_room(message.content, len(payload))
         return message
+
+    @property
+    def _possible_ticks(self) -> int:
+        """How many ticks a site can have made by now."""
+        latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
+        return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
     def _take_room(self, event: Event, size: int) -> None:
         """Refuses the events of a flood, which would make a log of nothing else."""
@@ -139,8 +154,11 @@ class SiteReception:
             raise WireError("stranger", f"{past.member}, start {past.boot}, answers for {self.name}")
 
     def expect(self, channel: str, made: int) -> None:
-        """Counts the messages of a channel that exist at least; no more than the scenario allows."""
-        self.accounts[channel].expect(min(made, self._most[channel]))
+        """Counts the messages of a channel that exist at least; no more than scenario and clock allow."""
+        most = self._most[channel]
+        if channel != topics.EVENT:
+            most = min(most, count_messages(channel, self._possible_ticks, self._rate_hz))
+        self.accounts[channel].expect(min(made, most))
 
     def hear_of_start_before(self, ticks: int) -> None:
         """Counts what the start before published at least, of which another site heard so many ticks."""
@@ -183,3 +201,10 @@ class SiteReception:
             for channel, account in self.accounts.items()
             if account.missing
         )
+
+
+def _count_ticks(content: State | LinkStats | Event) -> int:
+    """Returns how many ticks a message says that its site has made."""
+    if isinstance(content, Event):
+        return content.ticks if content.kind in ("join", "end") else 0
+    return content.tick + 1

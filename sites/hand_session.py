@@ -9,6 +9,7 @@ import numpy as np
 from trilat_net.core.chain import build_chain, place_end_effector, place_joints
 from trilat_net.core.vectors import Vector
 from trilat_net.errors import SessionError, UsageError
+from trilat_net.net.access_rules import OPERATOR
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import resolve_member_connection, secure_connection
@@ -54,7 +55,7 @@ def hand(
     clock = SystemClock()
     known = None if keys is None else read_member_keys(Path(keys))
     connection = resolve_member_connection(None, connect, router, None, [], None)
-    connection = secure_connection(connection, known, insecure=False)
+    connection = secure_connection(connection, known, insecure=False).require(OPERATOR)
 
     names = embedded_names_reader(session)
     reached = connect_to_session(

@@ -61,8 +61,6 @@ class SessionDisplay:
         self._updates = 0
 
     def __enter__(self) -> "SessionDisplay":
-        if self._live:
-            self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,6 +71,7 @@ class SessionDisplay:
         """Shows the latest statistics of every site."""
         self._updates += 1
         if self._live:
+            self._live.start()  # not before: what ends at a signal until then could not restore the terminal
             self._live.update(self._table(latest), refresh=True)
         elif latest and self._updates % LINE_EVERY == 0:
             self._console.print(self._line(latest), highlight=False, markup=False, soft_wrap=True)

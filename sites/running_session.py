@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from trilat_net.errors import RunFailed
+from trilat_net.net.access_rules import OPERATOR
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
@@ -33,7 +34,9 @@ class RunningSession:
     def __init__(self, name: str, connection: Connection) -> None:
         self.name, self._connection = name, connection
 
-    def _act(self, act: Callable[[Bus, Clock], T]) -> T:
+    def _act(self, act: Callable[[Bus, Clock], T], *, operates: bool = True) -> T:
+        if operates:
+            self._connection.require(OPERATOR)
         clock, names = SystemClock(), embedded_names_reader(self.name)
         reached = connect_to_session(
             self._connection, clock, self.name, names, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
@@ -43,7 +46,9 @@ class RunningSession:
             return act(bus, clock)
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
-        replies = self._act(lambda bus, clock: order_sites(bus, clock, self.name, sites, order))
+        replies = self._act(
+            lambda bus, clock: order_sites(bus, clock, self.name, sites, order), operates=order != "stop"
+        )
         if refused := [reply.text for reply in replies if not reply.accepted]:
             raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
         return [reply.text for reply in replies]
@@ -75,7 +80,9 @@ class RunningSession:
     def _change(self, site: str, **change: Any) -> str:
         names = embedded_names_reader(self.name)
         request = ChangeRequest(**change)
-        reply = request_change(self._connection, SystemClock(), self.name, site, request, names)
+        reply = request_change(
+            self._connection.require(OPERATOR), SystemClock(), self.name, site, request, names
+        )
         if not reply.accepted:
             raise RunFailed(f"refused: {reply.text}")
         return reply.text
@@ -105,7 +112,7 @@ def session(
         name: the session's name.
         connect: endpoints, as of --connect; without them the session's default ones on this machine.
         router: endpoints of routers to go through instead, as of --router.
-        keys: folder of the operator's keys, as of --keys.
+        keys: folder of the operator's keys, as of --keys; of any member's, to stop arms and to ping.
 
     Raises:
         UsageError: an endpoint or the keys cannot be used.

@@ -75,7 +75,8 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         if bus is None:
             return interrupt.exit_code
         with closing(bus), LinePrinter(say) as printer:
-            parts = SiteParts(scenario, name, options, bus, clock, interrupt, printer.put)
+            with interrupt.raising():  # it may compile for minutes
+                parts = SiteParts(scenario, name, options, bus, clock, interrupt, printer.put)
             if options.connection.listen:
                 parts.say(f"others connect to {', '.join(map(str, options.connection.listen))}")
             return take_part(parts)

@@ -201,7 +201,7 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
         LogRefused: the disk refused it.
     """
     refuse_existing(path, force=force, manifest=manifest)
-    remedy = "nothing is left of it. Make room, or take another disk with -o"
+    remedy = "nothing is left of it. Make room, or take another disk"
     try:
         scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:

@@ -87,13 +87,14 @@ ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) 
 class Interrupt:
     """A context that records the first signal that ends a program, as `number` (else 0).
 
-    Whoever ignores the end of its terminal (`nohup`) goes on doing so.
+    Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it `compiles`, and nothing else
+    is to be ended in order, a signal ends the process at once while the compiler runs.
     """
 
-    def __init__(self) -> None:
-        self.number = 0
+    def __init__(self, *, compiles: bool = False) -> None:
+        self.number, self.compiles = 0, compiles
         self._before: dict[int, Any] = {}
-        self._raises = False
+        self.raises = False
 
     def __enter__(self) -> "Interrupt":
         for name in ENDING_SIGNALS:
@@ -106,10 +107,13 @@ class Interrupt:
     ) -> None:
         for name, handler in self._before.items():
             signal.signal(name, handler)
+        outer = getattr(self._before.get(signal.SIGINT), "__self__", None)
+        if kind is KeyboardInterrupt and isinstance(outer, Interrupt):
+            outer.number = outer.number or self.number
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number
-        if self._raises:
+        if self.raises:
             raise KeyboardInterrupt
 
     @contextmanager
@@ -118,11 +122,11 @@ class Interrupt:
 
         Python swallows an exception raised inside a `__del__`; then the block is left at its end.
         """
-        self._raises = True
+        self.raises = True
         try:
             yield
         finally:
-            self._raises = False
+            self.raises = False
         if self.requested():
             raise KeyboardInterrupt
 
@@ -134,6 +138,29 @@ class Interrupt:
     def exit_code(self) -> int:
         """Exit code of a process that the signal ended, by the shell's convention."""
         return 128 + self.number
+
+
+def let_signals_kill() -> Callable[[], None]:
+    """Lets signals end the process at once where they may break off work; the function returned ends that.
+
+    Python sees a signal between two of its instructions: one call of a compiler takes minutes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return lambda: None
+    handlers = ((name, signal.getsignal(name)) for name in ENDING_SIGNALS)
+    taken = {name: one for name, one in handlers if _breaks_off(getattr(one, "__self__", None))}
+    for name in taken:
+        signal.signal(name, signal.SIG_DFL)
+
+    def restore() -> None:
+        for name, handler in taken.items():
+            signal.signal(name, handler)
+
+    return restore
+
+
+def _breaks_off(owner: object) -> bool:
+    return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
 def count_cores() -> int:

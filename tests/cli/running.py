@@ -13,6 +13,7 @@ from unittest import mock
 from typer.main import get_command
 
 from trilat_net.cli import app, main
+from trilat_net.core.jit import compiling_notice
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""
@@ -85,6 +86,7 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         contextlib.redirect_stderr(err),
         mock.patch.object(sys, "argv", ["trilat", *map(str, arguments)]),
         mock.patch.dict(os.environ, PLAIN),
+        mock.patch.object(compiling_notice, "said", True),  # by which worker it is compiled is chance
     ):
         try:
             main()

@@ -98,14 +98,31 @@ def test_a_silent_hand_lets_go_and_fades() -> None:
 
 def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
     release = at(50, (), n=50, grip=False)
-    second = {40: [HandCommand(9, 0, True, (2.0, 2.0), 0)], 60: [HandCommand(9, 1, True, (1.0, 0.6), 0)]}
-    steps = run(at(0, (1.1, 0.5)) | release | second, 100)
+    second = {40: [HandCommand(9, 0, True, (2.0, 2.0), 0)], 160: [HandCommand(9, 1, True, (1.0, 0.6), 0)]}
+    steps = run(at(0, (1.1, 0.5)) | release | second, 200)
     assert steps[40].refused == (ANOTHER_HOLDS,)
     assert steps[50].changes == ((7, RELEASED),)
-    assert steps[60].changes == ((9, TAKEN),)
-    again = hands(steps)[60]
+    assert steps[160].changes == ((9, TAKEN),)
+    again = hands(steps)[160]
     assert again.target == ARM
     assert again.grip == 0.0
+
+
+@pytest.mark.parametrize("source", [7, 9], ids=["the same", "another"])
+@pytest.mark.parametrize("from_arm", [True, False], ids=["a target", "a force"])
+def test_who_takes_hold_of_a_fading_grip_goes_on_from_it(source: int, from_arm: bool) -> None:
+    """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
+    rules = RULES._replace(from_arm=from_arm)
+    again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
+    steps = run(at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again, 400, rules)
+    assert [steps[k].changes for k in (199, 220)] == [((7, RELEASED),), ((source, TAKEN),)]
+    held = hands(steps)
+    assert held[220].grip == pytest.approx(0.79)
+    assert held[220].target == held[219].target
+    grips = [hand.grip for hand in held]
+    assert np.abs(np.diff(grips)).max() <= 1e6 / GRIP_NS + 1e-12
+    assert max(math.dist(a.target, b.target) for a, b in pairwise(held[1:])) <= 1.5e-3 + 1e-12
+    assert grips[-1] == 1.0
 
 
 def test_a_message_that_was_overtaken_changes_nothing() -> None:
@@ -140,11 +157,11 @@ COMMANDS = st.builds(
 
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
-def test_whatever_comes_in_the_grip_never_jumps_up_and_the_target_keeps_its_limit(messages: Any) -> None:
+def test_whatever_comes_in_the_grip_never_jumps_and_the_target_keeps_its_limit(messages: Any) -> None:
     steps = hands(run(messages, 500))
     most = 1e6 / GRIP_NS + 1e-12
     for before, now in pairwise(steps):
-        assert now.grip <= before.grip + most
+        assert abs(now.grip - before.grip) <= most
         assert math.hypot(*now.rate) <= 1.5 + 1e-9
         if before.source and now.source == before.source and now.grip > 0.0:
             moved = math.dist(before.target, now.target)

@@ -298,7 +298,7 @@ def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
         read_member_keys(tmp_path)
     with pytest.raises(UsageError, match="name a new folder"):
         create_keys(folder, SITES, [], 30)
-    with pytest.raises(UsageError, match=r"letters, digits, _ and -, not 'm\*'"):
+    with pytest.raises(UsageError, match=r"letters, digits, _ and -, and not authority, not 'm\*'"):
         create_keys(tmp_path / "k", ["m*"], [], 30)
     create_keys(tmp_path / "old", SITES, [], 0)
     with pytest.raises(UsageError, match="ended on"):
@@ -366,12 +366,16 @@ def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
 
 def test_with_keys_links_are_encrypted(folder: Path) -> None:
     keys = read_member_keys(folder / "m1")
-    safe = secure_connection(Connection(["tcp/127.0.0.1:1"], ["tls/192.0.2.1:7"]), keys, insecure=False)
-    assert (safe.reach(safe.listen), safe.reach(safe.connect or ())) == (
-        ["tls/127.0.0.1:1"],
-        ["tls/192.0.2.1:7"],
+    safe = secure_connection(Connection(["tls/127.0.0.1:1"], ["quic/192.0.2.1:7"]), keys, insecure=False)
+    assert safe.reach(["tcp/127.0.0.1:1"]) == ["tls/127.0.0.1:1"]  # where it finds a session by default
+    plain_ones = (
+        "tcp/192.0.2.1:7",
+        "tcp/127.0.0.1:7",
+        "udp/192.0.2.1:7",
+        "ws/192.0.2.1:7",
+        "unixsock-stream/x",
     )
-    for plain in ("tcp/192.0.2.1:7", "udp/192.0.2.1:7", "ws/192.0.2.1:7"):
+    for plain in plain_ones:
         with pytest.raises(UsageError, match="tls"):
             secure_connection(Connection([], [plain]), keys, insecure=True)
     with pytest.raises(UsageError, match="one place"):

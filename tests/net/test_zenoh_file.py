@@ -154,7 +154,7 @@ def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_pa
     [
         ("", "a Zenoh configuration is one object in braces; here are 0"),
         ("{}, {}", "here are 2"),
-        ("[1]", r"a Zenoh configuration is one object in braces, not \[1\]"),
+        ("[1]", r"a Zenoh configuration is one object in braces$"),
         ("{\n  mode: 'peer',\n  a: [1\n}", "line 3, column 7: no JSON5: expected"),
         ("{mode:", "line 2, column 1: no JSON5: expected"),
         ("[" * 100_000, f"no JSON5: nested deeper than {MAX_DEPTH}"),

@@ -33,6 +33,7 @@ from .desk import (
     TICKS,
     UNIX_NS,
     Desk,
+    Memory,
     end,
     happening,
     states,
@@ -88,6 +89,64 @@ def test_what_does_not_belong_is_counted_and_dropped_and_the_rest_is_written_byt
     assert log.accounts[f"dropped: {reason}"] == "1"
     assert [message.data for message in written] == states("m")
     assert [message.publish_time - UNIX_NS for message in written] == [MS * k for k in range(TICKS)]
+
+
+LONG = load_scenario("two_sites", {"duration_s": 60.0})
+
+
+def ahead(tick: int) -> bytes:
+    site = Site(LONG.setup("m"))
+    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=tick), [], 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("reason", "channel", "payload"),
+    [
+        ("m is ahead of the clock", topics.STATE, ahead(50_000)),
+        ("m is ahead of the clock", topics.STATE, ahead(2_100)),
+        ("m is ahead of the clock", topics.LINK, statistics("m", 50_000, LONG)),
+        ("m is ahead of the clock", topics.EVENT, end("m", 50_000)),
+        ("m is ahead of the clock", topics.EVENT, happening("m", -1, "join", ticks=50_000)),
+        ("out of range", topics.EVENT, happening("m", 100_000)),
+    ],
+    ids=["a record", "just too early", "statistics", "an end", "a beginning", "the number of an event"],
+)
+def test_a_member_that_says_more_than_the_clock_allows_is_not_believed(
+    reason: str, channel: str, payload: bytes
+) -> None:
+    """It has valid keys and says that it made 50 s of records after some milliseconds."""
+    desk = Desk(LONG)
+    records = states("m")
+    desk.take("m", topics.STATE, *records[:10])
+    desk.take("m", channel, payload)
+    assert desk.recording.dropped == {reason: 1}
+    desk.take("m", topics.STATE, *records[10:])
+    desk.take("m", topics.LINK, statistics("m"))
+    desk.take("m", topics.EVENT, end("m", n=0))
+    account = desk.recording.accounts[topics.key(SESSION, "m", topics.STATE)]
+    assert (account.expected, account.received, account.missing) == (TICKS, TICKS, 0)
+    desk.whole("s")
+    assert desk.recording.problem() is None
+    assert any(f"1 messages dropped: {reason}" in line for line in desk.recording.summary())
+
+
+def test_an_answer_for_more_than_the_clock_allows_is_not_believed() -> None:
+    desk = Desk(LONG)
+    memory = Memory(desk.network, "m")
+    memory.made["state"] = [b""] * 50_000
+    desk.take("m", topics.STATE, states("m")[0], states("m")[2])
+    desk.rounds(60, memory)
+    assert memory.asked
+    account = desk.recording.accounts[topics.key(SESSION, "m", topics.STATE)]
+    assert account.expected <= 2_000 + 60 * 10 + 10
+
+
+def test_clocks_may_differ_by_what_clocks_differ() -> None:
+    """Two seconds, and a thousandth of the time."""
+    desk = Desk(LONG)
+    desk.wait(40 * 1_000_000_000)
+    desk.take("m", topics.STATE, ahead(42_000))
+    assert desk.recording.dropped == {}
 
 
 @pytest.mark.parametrize("t_ns", [-(2**63), 2**64 - 1])

@@ -122,7 +122,7 @@ def test_a_column_says_its_unit_and_whether_it_is_a_round_trip(tmp_path: Path) -
         ("irtt", "[1", "is not of the form irtt"),
         ("ping", "nothing", "no line tells of an answer"),
         ("csv", "a,b\n1,2\n", "has no column like t_ms"),
-        ("csv", "t_s,delay_ms\n0,x\n", "it reads '0,x'"),
+        ("csv", "t_s,delay_ms\n0,x\n", "line 2 is not as its head says"),
         ("csv", "t_s,delay_ms\n", "it has no samples"),
     ],
 )

@@ -65,7 +65,7 @@ class _Commands(TyperGroup):
                     return super().invoke(ctx)
             except KeyboardInterrupt:
                 err.print("interrupted")
-                raise typer.Exit(interrupt.exit_code or 130) from None
+                raise typer.Exit(interrupt.exit_code if interrupt.requested() else 130) from None
 
 
 app = typer.Typer(
@@ -102,7 +102,8 @@ def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any
     group = typer.Typer(**options)
     for name, (run, *examples) in commands.items():
         epilog = "\n\n".join(f"Example: trilat {words}{name} {example}".rstrip() for example in examples)
-        paragraphs = inspect.cleandoc(run.__doc__).split("\n\n")  # else lines break where the source's do
+        text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
+        paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
         text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
         group.command(name, help=text, epilog=epilog)(run)
     return group
@@ -204,6 +205,15 @@ app.add_typer(
 )
 
 
+_TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
+
+
+def _is_short_of_memory(error: Exception) -> bool:
+    """True of what Python, Numba and threads say who get no memory."""
+    texts = ("failed to map segment", "libllvmlite", "start new thread", "allocate memory")
+    return isinstance(error, MemoryError) or any(text in str(error) for text in texts)
+
+
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
     try:
@@ -217,8 +227,18 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:  # a full disk, a folder that vanished
-        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+        short = _is_short_of_memory(error)
+        print_error(
+            _TOO_LITTLE
+            if short
+            else f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
+        )
         bad_name = error.errno == errno.ENAMETOOLONG
         sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
+    except (MemoryError, ImportError, RuntimeError) as error:
+        if not _is_short_of_memory(error):
+            raise
+        print_error(_TOO_LITTLE)
+        sys.exit(1)
     finally:
         gc.freeze()  # at exit, Python need not traverse every record

@@ -256,10 +256,21 @@ def resolve_connection(
 
 
 def resolve_client_connection(
-    connect: list[str] | None, routers: list[str] | None, zenoh_config: Path | None, keys: Path | None
+    connect: list[str] | None,
+    routers: list[str] | None,
+    zenoh_config: Path | None,
+    keys: Path | None,
+    *,
+    operates: bool = True,
 ) -> "Connection":
-    """Returns how a command reaches a session of which it is no member, by its options."""
-    return resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
+    """Returns how a command reaches a session of which it is no member, by its options.
+
+    Keys must be the operator's, unless every member may do what the command does (`operates` is False).
+    """
+    from ..net.access_rules import OPERATOR
+
+    connection = resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
+    return connection.require(OPERATOR) if operates else connection
 
 
 def read_keys(folder: Path | None) -> "MemberKeys | None":

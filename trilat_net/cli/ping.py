@@ -83,7 +83,7 @@ def ping_command(
     from ..net.clock import make_system_clock
     from ..process import Interrupt
 
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys, operates=False)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         probe = ping_session(

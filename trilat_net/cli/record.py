@@ -87,10 +87,11 @@ def record_command(
     from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
     from ..net.clock import make_system_clock
+    from ..net.topics import RECORDER
 
     connection = options.resolve_connection(
         listen, connect, router, zenoh_config, [], None, keys, insecure=insecure
-    )
+    ).require(RECORDER)
     path = _choose_path(output, options.check_session_name(session), concluded=concluded)
     place = LogStorage(
         path,

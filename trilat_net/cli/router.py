@@ -38,6 +38,7 @@ def router_command(
     Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
     continues when the router is restarted. Routers that --connect to each other act as one.
     """
+    from ..net.access_rules import ROUTER
     from ..net.clock import SystemClock
     from ..net.connection import open_bus, resolve_router_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
@@ -48,7 +49,7 @@ def router_command(
     places = [LOOPBACK if owned is None else ANY_ADDRESS]
     connection = secure_connection(
         resolve_router_connection(listen, connect, file, places), owned, insecure=insecure
-    )
+    ).require(ROUTER)
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)

@@ -29,7 +29,7 @@ def sim_command(
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
-    with Interrupt() as interrupt:
+    with Interrupt(compiles=True) as interrupt:
         within = record_virtual(chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz)
     if interrupt.requested():
         terminal.err.print(f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True)

@@ -92,7 +92,7 @@ def site_command(
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     find_site(chosen, name)
     identity = options.check_session_name(session or chosen.name)
-    places = default_endpoints(identity, chosen.names)
+    places = default_endpoints(identity, chosen.names, encrypted=keys is not None)
     before = chosen.names[: chosen.names.index(name)]
     connection = options.resolve_connection(
         listen,
@@ -103,7 +103,7 @@ def site_command(
         [places[peer] for peer in before],
         keys,
         insecure=insecure,
-    )
+    ).require(name)
     how = SiteOptions(
         session=identity,
         connection=connection,

@@ -25,7 +25,7 @@ def _find(
 ) -> "RunningSession":
     from sites.running_session import RunningSession
 
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys, operates=False)
     return RunningSession(options.check_session_name(session), connection)
 
 
@@ -46,7 +46,7 @@ def stop_command(
     zenoh_config: options.ZenohConfigOption = None,
     keys: options.KeysOption = None,
 ) -> None:
-    """Stops arms at once while the session goes on: their torque blends into damping and gravity in 100 ms.
+    """Stops arms at once while the session goes on: they come to rest where they are.
 
     They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
     Without endpoints it asks sites on this machine at once where their files say that they are, else the

@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numba
 from numba.core import event
 
+from ..process import let_signals_kill
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -52,27 +54,30 @@ _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 
 
 def is_core_cached() -> bool:
-    """True if the cache holds compiled leaves of this version of the core."""
-    return _CACHE is not None and next(_CACHE.rglob("*.nbc"), None) is not None
+    """True if the cache holds a whole tick of this version of the core, which is compiled last."""
+    return _CACHE is not None and next(_CACHE.rglob("kernel.site_tick-*.nbc"), None) is not None
 
 
 COMPILING = "compiling, once for this machine and each number of joints ..."
 
 
 class _CompilingNotice(event.Listener):
-    """Says once, at a terminal or in a notebook, why the first run takes longer."""
+    """Says once, wherever errors go, why the first run takes longer; a signal may end it at any time."""
 
     def __init__(self) -> None:
-        self.said = not (sys.stderr.isatty() or "ipykernel" in sys.modules)
+        self.said = False
+        self._restore: list[Callable[[], None]] = []  # of compilations inside one another
 
     def on_start(self, begun: Any) -> None:
-        """Says so as the kernel is compiled."""
-        if not self.said and begun.data["dispatcher"].py_func.__module__ == f"{__package__}.kernel":
+        """Says so as anything of the core is compiled."""
+        self._restore.append(let_signals_kill())
+        if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(__package__):
             self.said = True
             print(COMPILING, file=sys.stderr, flush=True)
 
-    def on_end(self, ended: Any) -> None:
+    def on_end(self, _: Any) -> None:
         """Says nothing."""
+        self._restore.pop()()
 
 
 compiling_notice = _CompilingNotice()

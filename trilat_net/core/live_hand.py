@@ -4,10 +4,11 @@ Invariant: `advance_hand` is the whole state machine, a pure function of what it
 messages that came in before a tick. What is in force in a tick is an input of the tick and stands in its
 record, so a log repeats people without their messages.
 
-Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`. A
-target glides to its newest goal in a straight line, over a quarter more than the time between the last two
-messages, so that it does not stop where one is a little late. A hand that is silent for `SILENCE_NS` lets go:
-the target stays where it is and the grip fades within `GRIP_NS`.
+Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`; while
+a grip still fades, from that grip and its target. A target glides to its newest goal in a straight line, over
+a quarter more than the time between the last two messages, so that it does not stop where one is a little
+late. A hand that is silent for `SILENCE_NS` lets go: the target stays where it is and the grip fades within
+`GRIP_NS`.
 """
 
 import math
@@ -197,8 +198,9 @@ def _take_command(
     if not command.grip:
         return (_let_go(memory, command.number), RELEASED) if memory.source else (memory, "")
     if not memory.source:
-        start = tuple(map(float, place())) if rules.from_arm else (0.0,) * rules.size
-        held = HandMemory(command.source, command.number, 0.0, start, (0.0,) * rules.size)
+        still = (0.0,) * rules.size
+        start = memory.target or (tuple(map(float, place())) if rules.from_arm else still)
+        held = HandMemory(command.source, command.number, memory.grip, start, still)
         held = held._replace(heard_ns=t_ns, before=memory.before)
         return _aim(held, command, t_ns + GLIDE_NS), TAKEN
     memory = memory._replace(heard_ns=t_ns)

@@ -19,7 +19,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
-from ..files import open_regular
+from ..files import describe_write_error, open_regular
 from ..net import topics
 from ..results import Result
 from .accounting import Coverage, open_session_accounts, parse_counts
@@ -171,6 +171,8 @@ def recover_log(
         with open_regular(path) as stream:
             return _recover(stream, Recovery(path, made), force, progress)
     except OSError as error:
+        if error.filename not in (None, str(path)):
+            raise describe_write_error(Path(error.filename), error) from None
         raise LogError(f"{path}: cannot be read: {error.strerror}{describe_unfinished(path)}") from None
 
 

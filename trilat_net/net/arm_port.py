@@ -18,6 +18,7 @@ from typing import Self
 
 from ..core.ticks import LifeReason
 from . import topics
+from .access_rules import OPERATOR
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
@@ -37,6 +38,8 @@ class OutsidePort(SitePort):
 
     channel = ""
     """The last part of that key."""
+    member = ""
+    """Whose keys it takes; "": those of its site."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         super().__init__(bus, clock, session, site)
@@ -61,6 +64,7 @@ class OutsidePort(SitePort):
         """
         known = None if keys is None else read_member_keys(Path(keys))
         reached = secure_connection(Connection((), list(connect)), known, insecure=False)
+        reached.require(cls.member or site)
         bus = ZenohBus([], reached.reach(list(connect)), own=reached.own)
         return cls(bus, SystemClock(), session, site)
 
@@ -74,7 +78,7 @@ class EnablePort(OutsidePort):
             time.sleep(0.02)
     """
 
-    channel = topics.ENABLE
+    channel, member = topics.ENABLE, OPERATOR
 
     def send(self, *, held: bool) -> None:
         """Says that somebody holds it, or has let it go."""

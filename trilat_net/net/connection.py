@@ -35,9 +35,10 @@ def default_endpoint(session: str, index: int) -> str:
     return f"tcp/127.0.0.1:{port}"
 
 
-def default_endpoints(session: str, sites: Sequence[str]) -> dict[str, str]:
+def default_endpoints(session: str, sites: Sequence[str], *, encrypted: bool = False) -> dict[str, str]:
     """Returns the default endpoint of every site of a session."""
-    return {site: default_endpoint(session, index) for index, site in enumerate(sites)}
+    places = {site: default_endpoint(session, index) for index, site in enumerate(sites)}
+    return {site: place.replace("tcp/", "tls/") if encrypted else place for site, place in places.items()}
 
 
 @contextmanager
@@ -87,14 +88,15 @@ class Connection:
         connect: endpoints to connect to; a client takes the first that answers. None: still to be found.
         mode: peer of the other members, client of a router, or a router.
         own: Zenoh settings of a user's file, or of a member's keys.
-        keyed: true: links are encrypted, and both ends prove by certificates who they are.
+        keys_of: the member whose keys it has: links are encrypted, and both ends prove by certificates who
+            they are; "": none.
     """
 
     listen: Sequence[Endpoint] = ()
     connect: Sequence[Endpoint] | None = ()
     mode: ZenohMode = "peer"
     own: Mapping[str, Any] = field(default_factory=dict)
-    keyed: bool = False
+    keys_of: str = ""
 
     @property
     def places(self) -> Sequence[Endpoint]:
@@ -103,9 +105,21 @@ class Connection:
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
         """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
-        if not self.keyed:
+        if not self.keys_of:
             return list(endpoints)
         return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
+
+    def require(self, member: str) -> "Connection":
+        """Returns itself.
+
+        Raises:
+            UsageError: it has the keys of another member than this.
+        """
+        if self.keys_of not in ("", member):
+            raise UsageError(
+                f"--keys: these are the keys of {self.keys_of}, and this takes those of {member}"
+            )
+        return self
 
 
 def secure_connection(connection: Connection, keys: "MemberKeys | None", *, insecure: bool) -> Connection:
@@ -119,16 +133,22 @@ def secure_connection(connection: Connection, keys: "MemberKeys | None", *, inse
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
     if keys is not None:
-        plain = [place for place in find_endpoint_addresses(named) if not place.startswith(ENCRYPTED)]
-        if plain := [place for place in plain if not is_loopback(place)]:
-            raise UsageError(
-                f"{plain[0]}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
-            )
+        for place in find_endpoint_addresses(named):
+            if not place.startswith(ENCRYPTED):
+                raise UsageError(
+                    f"{place}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
+                )
+            if re.search(r"[#;](?!(iface|bind|dscp)=|so_)", place):
+                raise UsageError(
+                    f"{place}: how it is encrypted comes from --keys; leave out what follows the #"
+                )
         if twice := sorted(set(own) & {"access_control", "low_pass_filter", "adminspace"}):
             raise UsageError(f"--zenoh-config: {twice[0]}: comes from --keys; give it in one place")
-        if "tls" in own.get("transport", {}).get("link", {}):
-            raise UsageError("--zenoh-config: transport/link/tls: comes from --keys; give it in one place")
-        return replace(connection, own=merge_settings(keys.settings, own), keyed=True)
+        if twice := sorted(set(own.get("transport", {}).get("link", {})) & {"tls", "protocols"}):
+            raise UsageError(
+                f"--zenoh-config: transport/link/{twice[0]}: comes from --keys; give it in one place"
+            )
+        return replace(connection, own=merge_settings(keys.settings, own), keys_of=keys.member)
     mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
     for place in find_endpoint_addresses(connection.listen):
         if not (insecure or is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):

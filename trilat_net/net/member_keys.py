@@ -2,13 +2,16 @@
 
 Invariant: a private authority signs one certificate per member, which ends after some days, and is kept
 apart. A member's folder holds its own key, which nobody else may read, its certificate, that of the
-authority, and the list of members, from which its access rules follow.
+authority, and the list of members, from which its access rules follow; nobody else may write any of it.
+Keys are made whole or not at all.
 """
 
 import datetime
 import ipaddress
 import json
 import os
+import re
+import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
-from ..files import open_regular
+from ..files import make_folder, open_regular, stage_output
 from .access_rules import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
@@ -35,6 +38,9 @@ _BEFORE = datetime.timedelta(hours=1)
 """Clocks of machines may differ by so much."""
 MOST_KEY_BYTES = 65_536
 """Of a file of keys; the rest of a longer one is not read."""
+_DATE = "%Y-%m-%d %H:%M UTC"
+MOST_DAYS, MOST_LETTERS = 3_650, 64
+"""For which certificates may hold, and of a name in one."""
 
 
 class MemberKeys(NamedTuple):
@@ -68,16 +74,47 @@ def create_keys(
         days: how long the certificates hold.
 
     Raises:
-        UsageError: a name cannot be one, or the folder is not empty.
+        UsageError: a name cannot be one, or the folder is not empty, or cannot be made.
+        LogRefused: the disk refused it; nothing is left of it.
     """
     folder = Path(folder)
-    for name in members:
-        if not name or not all(c.isalnum() or c in "_-" for c in name) or name == _AUTHORITY_FOLDER:
-            raise UsageError(f"a member's name is letters, digits, _ and -, not {name!r}")
-    if len(set(members)) < len(members):
-        raise UsageError("every member is named once")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
+    if not 0 <= days <= MOST_DAYS:
+        faults.append(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
+    if fault := next(filter(None, faults), ""):
+        raise UsageError(fault)
+    if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise UsageError(f"{folder}: there is something already; keys are never replaced, name a new folder")
+    make_folder(folder.parent)
+    with stage_output(folder, force=False, manifest=MEMBERS) as staged:
+        staged.chmod(0o700)
+        _make_all(staged, members, hosts, days)
+    return [folder / member for member in members]
+
+
+def _find_name_fault(members: Sequence[Any]) -> str:
+    """Returns why these cannot be the members of a session, "" if they can."""
+    for name in members:
+        of_letters = isinstance(name, str) and all(c.isalnum() or c in "_-" for c in name)
+        if not of_letters or not 0 < len(name) <= MOST_LETTERS or name == _AUTHORITY_FOLDER:
+            most = f"at most {MOST_LETTERS} letters, digits, _ and -"
+            return f"a member's name is {most}, and not {_AUTHORITY_FOLDER}, not {str(name)[:80]!r}"
+    return "" if 0 < len(members) == len(set(members)) else "every member is named once, and there is one"
+
+
+def _find_host_fault(host: str) -> str:
+    """Returns why a certificate cannot be made for a host, "" if it can: no certificate is good for many."""
+    label = "(?!-)[A-Za-z0-9_-]{1,63}(?<!-)"
+    try:
+        one = not ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        one = bool(re.fullmatch(rf"({label}\.)*(?!\d+$){label}", host)) and len(host) <= 253
+    return (
+        "" if one else f"--host: a certificate is for one host name or address, without a port, not {host!r}"
+    )
+
+
+def _make_all(folder: Path, members: Sequence[str], hosts: Sequence[str], days: int) -> None:
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
     key, issuer = ec.generate_private_key(ec.SECP256R1()), _name("trilat-net authority")
     constraints = x509.BasicConstraints(ca=True, path_length=0)
@@ -87,7 +124,6 @@ def create_keys(
         .sign(key, hashes.SHA256())
     )
     _write(folder / _AUTHORITY_FOLDER, authority, authority, key)
-    made = []
     for member in members:
         own = ec.generate_private_key(ec.SECP256R1())
         builder = _certificate(_name(member), issuer, own, ends).add_extension(
@@ -97,9 +133,7 @@ def create_keys(
         certificate = builder.add_extension(uses, critical=False).sign(key, hashes.SHA256())
         _write(folder / member, authority, certificate, own)
         listed = json.dumps({"member": member, "members": list(members)})
-        (folder / member / MEMBERS).write_text(listed + "\n", encoding="utf-8")
-        made.append(folder / member)
-    return made
+        _put(folder / member / MEMBERS, f"{listed}\n".encode())
 
 
 def _name(common: str) -> x509.Name:
@@ -134,20 +168,34 @@ def _write(
     folder: Path, authority: x509.Certificate, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey
 ) -> None:
     folder.mkdir(mode=0o700, parents=True)
-    (folder / AUTHORITY).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
+    _put(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
     if certificate is not authority:
-        (folder / CERTIFICATE).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        _put(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
     private = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    with os.fdopen(os.open(folder / PRIVATE_KEY, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(private)
+    _put(folder / PRIVATE_KEY, private)
+
+
+def _put(path: Path, content: bytes) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(content)
 
 
 def _read(path: Path) -> bytes:
     with open_regular(path) as stream:
+        _refuse_of_others(path, os.fstat(stream.fileno()))
         content: bytes = stream.read(MOST_KEY_BYTES)
     return content
+
+
+def _refuse_of_others(path: Path, facts: os.stat_result) -> None:
+    """Refuses what another user can change; in a folder of many (sticky) nobody changes files of others."""
+    if os.geteuid() and facts.st_uid not in (0, os.geteuid()):
+        raise UsageError(f"{path}: belongs to another user, who can change it: take keys of your own")
+    shared = stat.S_ISDIR(facts.st_mode) and facts.st_mode & stat.S_ISVTX
+    if facts.st_mode & 0o022 and not shared:
+        raise UsageError(f"{path}: others may write it, and so say who takes part: chmod go-w {path}")
 
 
 def read_member_keys(folder: str | Path) -> MemberKeys:
@@ -163,35 +211,46 @@ def read_member_keys(folder: str | Path) -> MemberKeys:
     if (folder / _AUTHORITY_FOLDER).is_dir():
         raise UsageError(f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1")
     try:
-        listed = json.loads(_read(folder / MEMBERS))
-        member, members = str(listed["member"]), tuple(map(str, listed["members"]))
-        authority, certificate = (
-            x509.load_pem_x509_certificate(_read(folder / name)) for name in (AUTHORITY, CERTIFICATE)
+        _refuse_of_others(folder, folder.stat())
+        listed, *pems, private = map(
+            _read, (folder / one for one in (MEMBERS, AUTHORITY, CERTIFICATE, PRIVATE_KEY))
         )
-        key = serialization.load_pem_private_key(_read(folder / PRIVATE_KEY), password=None)
-        certificate.verify_directly_issued_by(authority)
     except OSError as error:
         raise UsageError(f"{error.filename}: {error.strerror}: no keys of `trilat keys new`") from None
-    except (ValueError, TypeError, KeyError) as error:
+    try:
+        named = json.loads(listed)
+        member, members = named["member"], tuple(named["members"])
+        authority, certificate = map(x509.load_pem_x509_certificate, pems)
+        key = serialization.load_pem_private_key(private, password=None)
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise UsageError(f"{folder}: damaged, no keys of `trilat keys new` ({error})") from None
     except Exception as error:  # cryptography's errors have no common base
         raise UsageError(f"{folder}: the authority has not signed this certificate ({error!r})") from None
-    mode = (folder / PRIVATE_KEY).stat().st_mode
-    common = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
+    if fault := _find_name_fault(members) or _find_fault(folder, member, members, certificate, key):
+        raise UsageError(f"{folder}: {fault}")
     ends = certificate.not_valid_after_utc
-    faults = {
-        f"{PRIVATE_KEY} can be read by others: chmod 600 {folder / PRIVATE_KEY}": mode & 0o077,
-        f"the certificate is that of {common!s}, and {MEMBERS} names {member}": common != member,
-        f"{MEMBERS} does not list {member}": member not in members,
-        "the private key is not that of the certificate": key.public_key() != certificate.public_key(),
-        f"the certificate ended on {ends:%Y-%m-%d %H:%M} UTC: make new keys for all with trilat keys new": (
-            ends <= datetime.datetime.now(datetime.UTC)
-        ),
-    }
-    for text, fault in faults.items():
-        if fault:
-            raise UsageError(f"{folder}: {text}")
     return MemberKeys(member, members, ends, _make_settings(folder.resolve(), members))
+
+
+def _find_fault(
+    folder: Path, member: str, members: Sequence[str], certificate: x509.Certificate, key: Any
+) -> str:
+    """Returns why the files of a member do not belong together, or do not hold now; "" if they do."""
+    common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
+    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)
+    for fault, text in (
+        (private.stat().st_mode & 0o077, f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
+        (common != member, f"the certificate is that of {common}, and {MEMBERS} names {member}"),
+        (member not in members, f"{MEMBERS} does not list {member}"),
+        (key.public_key() != certificate.public_key(), "the private key is not that of the certificate"),
+        (begins > now, f"the certificate begins on {begins:{_DATE}}: is the clock of this machine right?"),
+        (ends <= now, f"the certificate ended on {ends:{_DATE}}: make new keys for all with trilat keys new"),
+    ):
+        if fault:
+            return text
+    return ""
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:

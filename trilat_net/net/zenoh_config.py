@@ -188,9 +188,7 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
         UsageError: it is no Zenoh configuration, or contradicts a requirement of a session.
     """
     if not isinstance(stated, dict):
-        raise UsageError(
-            f"{source}: a Zenoh configuration is one object in braces, not {_short_json(stated)}"
-        )
+        raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
     settings = _without_nulls(stated)
     if refusal(settings):
         path, reason = _find_refused_key(settings, refusal, ()) or ((), refusal(settings))

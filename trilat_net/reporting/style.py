@@ -6,6 +6,7 @@ Invariant: matplotlib's global state stays unchanged. Equal figures give equal b
 fonts are embedded as TrueType.
 """
 
+import io
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from ..analysis.timeline import recorded_end_s
 from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
+from ..files import write_whole
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario.arms import TASK_AXES
@@ -301,7 +303,14 @@ _UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "png": {},
 
 
 def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of a .png."""
+    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of a .png.
+
+    Raises:
+        UsageError: it cannot be made.
+        LogRefused: the disk refused it.
+    """
+    drawing = io.BytesIO()
     kind = path.suffix.removeprefix(".").lower()
     with mpl.rc_context(_FILE_RC):
-        drawn.savefig(path, format=kind, dpi=dpi, metadata=_UNDATED[kind])
+        drawn.savefig(drawing, format=kind, dpi=dpi, metadata=_UNDATED[kind])
+    write_whole(path, drawing.getvalue())

@@ -50,8 +50,7 @@ def _read_csv(path: Path) -> list[TracePoint]:
                 time_text, delay_text = (cell.strip() for cell in cells)
                 rows.append((float(time_text), math.inf if delay_text == _LOST else float(delay_text)))
             except ValueError:
-                text = f"line {number} reads {','.join(cells)!r}; a line is t_s,delay_ms or t_s,{_LOST}"
-                raise ValueError(text) from None
+                raise ValueError(f"line {number}: a line is t_s,delay_ms or t_s,{_LOST}") from None
     return rows
 
 

@@ -213,20 +213,21 @@ def _read_ping(text: str, way: str, _: str, every_s: float) -> Sent:
 
 def _read_table(text: str, way: str, column: str, _: float) -> Sent:
     """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or t_s,delay_ms."""
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    cells = _split_cells(lines[0])
+    numbered = enumerate(text.splitlines(), start=1)
+    (_, head), *lines = [(n, line) for n, line in numbered if line.strip() and not line.startswith("#")]
+    cells = _split_cells(head)
     time, time_s = _find_column(cells, _TIMES, "")
     delay, delay_s = _find_column(cells, _DELAYS, column)
     half = way == "half" or (not way and "rtt" in cells[delay].lower())
     unit_ms = delay_s * (500.0 if half else 1e3)
     sent: Sent = []
-    for line in lines[1:]:
+    for number, line in lines:
         row = _split_cells(line)
         try:
             ms = math.inf if row[delay] in ("lost", "-1", "") else unit_ms * float(row[delay])
             sent.append((float(row[time]) * time_s, ms))
         except (IndexError, ValueError):
-            raise ValueError(f"it reads {line[:60]!r} where {lines[0][:60]!r} is due") from None
+            raise ValueError(f"line {number} is not as its head says") from None
     return sent
 
 
@@ -243,7 +244,7 @@ def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple
             if unit is None:
                 raise ValueError(f"its column {cell!r} names no unit, as {cell}_ms would")
             return place, _UNIT_S[unit]
-    raise ValueError(f"its head {' '.join(cells)[:80]!r} has no {wanted or f'column like {names[0]}_ms'}")
+    raise ValueError(f"its head has no {wanted or f'column like {names[0]}_ms'}")
 
 
 _READERS: dict[str, Callable[[str, str, str, float], Sent]] = {

@@ -103,7 +103,7 @@ def write_bench_figures(results: BenchResults, folder: Path) -> list[Path]:
     """Writes all figures into a folder, and returns their paths."""
     paths = [folder / f"bench-{name}.png" for name in FIGURES_OF_BENCH]
     for path, name in zip(paths, FIGURES_OF_BENCH, strict=True):
-        draw_bench(results, name).savefig(path, dpi=style.REPORT_DPI)
+        style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
     return paths
 
 

@@ -333,5 +333,5 @@ def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     figure = draw_front(tuned)
     pictures = [folder / "front.png", folder / "front.pdf"]
     for path in pictures:
-        figure.savefig(path, dpi=style.REPORT_DPI)
+        style.write_figure(figure, path, style.REPORT_DPI)
     return [data, text, *pictures]

@@ -1,0 +1,301 @@
+"""Keys that do not fit: every row is a command with a folder of keys, and the reason for which it refuses.
+
+Nothing is reached: what is refused is refused before a connection is opened.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sites.hand_session import hand
+from sites.running_session import session
+from tests.cli.running import COMMAND, PLAIN, trilat
+from trilat_net.errors import LogRefused, TrilatError, UsageError
+from trilat_net.net import member_keys
+from trilat_net.net.arm_port import ArmPort, EnablePort
+from trilat_net.net.member_keys import CERTIFICATE, MEMBERS, PRIVATE_KEY, create_keys, read_member_keys
+
+MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router")
+AUTHORITY = "authority.pem"
+Change = Callable[[Path], object]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys of a session, and as `old`, `early` and `others` such as have ended, begin later, are foreign."""
+    folder = tmp_path_factory.mktemp("keys")
+    create_keys(folder / "k", MEMBERS_MADE)
+    create_keys(folder / "others", MEMBERS_MADE)
+    create_keys(folder / "old", MEMBERS_MADE, days=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(member_keys, "_BEFORE", -timedelta(days=2))
+        create_keys(folder / "early", MEMBERS_MADE)
+    return folder
+
+
+@pytest.fixture
+def keys(made: Path, tmp_path: Path) -> Path:
+    """A copy of them, whose modes are theirs, that a case may spoil."""
+    shutil.copytree(made, tmp_path / "made")
+    return tmp_path / "made" / "k"
+
+
+SITE = ("site", "m1", "--scenario", "paper", "--keys")
+RECORD = ("record", "--session", "paper", "--keys")
+TWO_NAMES = "--keys: these are the keys of {}, and this takes those of {}"
+
+OF_ANOTHER = [
+    (("site", "m1", "--scenario", "paper"), "m2", "m1"),
+    (("site", "m1", "--scenario", "paper"), "recorder", "m1"),
+    (("site", "m1", "--scenario", "paper"), "operator", "m1"),
+    (("site", "s", "--scenario", "paper"), "router", "s"),
+    (("record", "--session", "paper"), "m1", "recorder"),
+    (("record", "--session", "paper"), "operator", "recorder"),
+    (("router",), "m1", "router"),
+    (("set", "--session", "paper", "link", "m1->s", "--delay", "1ms"), "m1", "operator"),
+    (("enable", "--session", "paper"), "m1", "operator"),
+    (("reset", "--session", "paper", "s"), "recorder", "operator"),
+    (("stop", "--session", "paper", "--end"), "s", "operator"),
+    (("watch", "--session", "paper"), "m1", "operator"),
+    (("live", "--session", "paper"), "recorder", "operator"),
+]
+
+
+@pytest.mark.parametrize(("words", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40])
+def test_a_command_takes_the_keys_of_who_it_is(
+    words: Sequence[str], whose: str, due: str, made: Path, tmp_path: Path
+) -> None:
+    place = words.index("link") if "link" in words else len(words)
+    given = [*words[:place], "--keys", str(made / "k" / whose), *words[place:]]
+    trilat(*given, cwd=tmp_path).refuses(TWO_NAMES.format(whose, due))
+    assert list(tmp_path.iterdir()) == []
+
+
+FROM_PYTHON = [
+    (lambda keys: hand("paper", "m1", keys=keys).__enter__(), "m1", "operator"),
+    (lambda keys: session("paper", keys=keys).enable(), "m1", "operator"),
+    (lambda keys: session("paper", keys=keys).end(), "recorder", "operator"),
+    (lambda keys: session("paper", keys=keys).set_link("m1->s", delay_ms=1), "s", "operator"),
+    (lambda keys: ArmPort.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "operator", "s"),
+    (lambda keys: EnablePort.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "s", "operator"),
+]
+
+
+@pytest.mark.parametrize(("act", "whose", "due"), FROM_PYTHON)
+def test_python_takes_the_keys_of_who_it_is(act: Any, whose: str, due: str, made: Path) -> None:
+    with pytest.raises(UsageError, match=TWO_NAMES.format(whose, due)):
+        act(made / "k" / whose)
+
+
+ENDPOINTS = [
+    ("--listen", "tcp/127.0.0.1:7447", "with --keys an endpoint is encrypted"),
+    ("--listen", "tcp/[::1]:7447", "with --keys an endpoint is encrypted"),
+    ("--listen", "tcp/192.0.2.1:7447", "with --keys an endpoint is encrypted"),
+    ("--connect", "tcp/localhost:7447", "with --keys an endpoint is encrypted"),
+    ("--connect", "unixsock-stream//tmp/x", "with --keys an endpoint is encrypted"),
+    ("--connect", "udp/127.0.0.1:7447", "UDP loses, repeats and trusts everything"),
+    ("--router", "tcp/127.0.0.1:7447", "with --keys an endpoint is encrypted"),
+    ("--connect", "tls/127.0.0.1:7447#verify_name_on_connect=false", "how it is encrypted comes from --keys"),
+]
+
+
+@pytest.mark.parametrize(("option", "place", "reason"), ENDPOINTS)
+def test_an_endpoint_with_keys_is_encrypted_as_they_say(
+    option: str, place: str, reason: str, made: Path, tmp_path: Path
+) -> None:
+    trilat(*SITE, made / "k" / "m1", option, place, cwd=tmp_path).refuses(place, reason)
+
+
+ZENOH_FILES = [
+    ('{ listen: { endpoints: ["tcp/127.0.0.1:7447"] } }', "with --keys an endpoint is encrypted"),
+    ("{ transport: { link: { protocols: ['tcp', 'tls'] } } }", "transport/link/protocols: comes from --keys"),
+    ("{ transport: { link: { tls: { enable_mtls: false } } } }", "transport/link/tls: comes from --keys"),
+    ("{ access_control: { enabled: false } }", "access_control: comes from --keys"),
+]
+
+
+@pytest.mark.parametrize(("text", "reason"), ZENOH_FILES)
+def test_ones_own_zenoh_settings_do_not_loosen_keys(
+    text: str, reason: str, made: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "own.json5"
+    file.write_text(text)
+    trilat(*SITE, made / "k" / "m1", "--zenoh-config", file, cwd=tmp_path).refuses(reason)
+
+
+def take(name: str, source: str) -> Change:
+    """Puts a file of another folder in the place of one's own."""
+    return lambda keys: (keys / "m1" / name).write_bytes((keys.parent / source / name).read_bytes())
+
+
+def say(**facts: object) -> Change:
+    """Says something else in the list of members."""
+
+    def change(keys: Path) -> None:
+        listed = json.loads((keys / "m1" / MEMBERS).read_text())
+        (keys / "m1" / MEMBERS).write_text(json.dumps({**listed, **facts}))
+
+    return change
+
+
+def mode(name: str, bits: int) -> Change:
+    return lambda keys: (keys / "m1" / name).chmod(bits)
+
+
+def whole(source: str) -> Change:
+    """Puts another folder in the place of one's own."""
+
+    def change(keys: Path) -> None:
+        shutil.rmtree(keys / "m1")
+        (keys.parent / source / "m1").rename(keys / "m1")
+
+    return change
+
+
+SPOILT: list[tuple[Change, str]] = [
+    (mode("", 0o777), "others may write it, and so say who takes part: chmod go-w"),
+    (mode("", 0o770), "others may write it"),
+    (mode(MEMBERS, 0o666), "members.json: others may write it"),
+    (mode(MEMBERS, 0o620), "members.json: others may write it"),
+    (mode(AUTHORITY, 0o664), "authority.pem: others may write it"),
+    (mode(CERTIFICATE, 0o646), "certificate.pem: others may write it"),
+    (mode(PRIVATE_KEY, 0o640), "can be read by others: chmod 600"),
+    (lambda keys: (keys / "m1" / MEMBERS).unlink(), "members.json: No such file"),
+    (lambda keys: (keys / "m1" / PRIVATE_KEY).unlink(), "private.key: No such file"),
+    (lambda keys: (keys / "m1" / MEMBERS).write_text("secret"), "damaged, no keys of `trilat keys new`"),
+    (lambda keys: (keys / "m1" / MEMBERS).write_text("[" * 9999), "damaged, no keys of `trilat keys new`"),
+    (lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"), "damaged, no keys of `trilat keys new`"),
+    (say(member="m2"), "the certificate is that of m1, and members.json names m2"),
+    (say(members=["m2", "s"]), "members.json does not list m1"),
+    (say(members=["m1", "*"]), "a member's name is at most 64 letters"),
+    (say(members=["m1", "m1"]), "every member is named once"),
+    (say(members=["m1", 7]), "a member's name is at most 64 letters"),
+    (take(CERTIFICATE, "k/m2"), "the certificate is that of m2, and members.json names m1"),
+    (take(PRIVATE_KEY, "k/m2"), "the private key is not that of the certificate"),
+    (take(AUTHORITY, "others/m1"), "the authority has not signed this certificate"),
+    (take(CERTIFICATE, "others/m1"), "the authority has not signed this certificate"),
+    (whole("old"), "the certificate ended on"),
+    (whole("early"), "the certificate begins on"),
+]
+
+
+@pytest.mark.parametrize(("change", "reason"), SPOILT, ids=[reason[:40] for _, reason in SPOILT])
+def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Path) -> None:
+    read_member_keys(keys / "m1")
+    change(keys)
+    done = trilat(*SITE, keys / "m1", cwd=keys)
+    done.refuses(reason)
+    assert "secret" not in done.err
+
+
+def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
+    trilat(*RECORD, made / "k", cwd=tmp_path).refuses("holds the keys of all; name the folder of one member")
+
+
+def test_a_folder_of_many_where_nobody_changes_files_of_others_will_do(keys: Path) -> None:
+    """As the volumes of containers are: sticky."""
+    (keys / "m1").chmod(0o1777)
+    assert read_member_keys(keys / "m1").member == "m1"
+
+
+def test_files_of_another_user_are_refused(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may write the folder above puts a folder of his own there."""
+    own = (made / "k" / "m1" / MEMBERS).stat()
+    theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
+    monkeypatch.setattr(os, "geteuid", lambda: 65534)
+    with pytest.raises(UsageError, match="belongs to another user, who can change it"):
+        member_keys._refuse_of_others(made / MEMBERS, theirs)
+
+
+NEW = [
+    (["m1", "--host", "*"], "one host name or address, without a port, not '*'"),
+    (["m1", "--host", "*.example"], "one host name or address"),
+    (["m1", "--host", "0.0.0.0"], "one host name or address"),
+    (["m1", "--host", "::"], "one host name or address"),
+    (["m1", "--host", "10.0.0.0/8"], "one host name or address"),
+    (["m1", "--host", "robot:7447"], "one host name or address"),
+    (["m1", "--host", ""], "one host name or address"),
+    (["m1", "--host", "robot.example\n"], "one host name or address"),
+    (["*"], "a member's name is at most 64 letters, digits, _ and -"),
+    (["m" * 65], "a member's name is at most 64 letters"),
+    (["authority"], "and not authority"),
+    (["../m1"], "a member's name is at most 64 letters"),
+    (["m1", "m1"], "every member is named once"),
+]
+
+
+@pytest.mark.parametrize(("words", "reason"), NEW, ids=lambda value: str(value)[:40])
+def test_no_keys_are_made_for_many_and_nothing_is_left(words: list[str], reason: str, tmp_path: Path) -> None:
+    trilat("keys", "new", "k", *words, cwd=tmp_path).refuses(reason)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_keys_are_never_replaced(keys: Path) -> None:
+    before = sorted(keys.rglob("*"))
+    trilat("keys", "new", keys, "m1", cwd=keys).refuses("keys are never replaced, name a new folder")
+    assert sorted(keys.rglob("*")) == before
+
+
+def test_python_makes_keys_for_so_many_days(tmp_path: Path) -> None:
+    for days in (-1, 3651, 10**9):
+        with pytest.raises(UsageError, match=f"0 to 3650 days, not {days}"):
+            create_keys(tmp_path / "k", ["m1"], days=days)
+
+
+@pytest.mark.parametrize("failing", range(1, 11))
+def test_keys_are_made_whole_or_not_at_all(
+    failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk refuses the n-th file, or Ctrl-C comes there: what was made before goes too."""
+    put, written = member_keys._put, list[Path]()
+
+    def refuse(error: BaseException) -> Callable[[Path, bytes], None]:
+        def act(path: Path, content: bytes) -> None:
+            if len(written) + 1 == failing:
+                raise error
+            written.append(path)
+            put(path, content)
+
+        return act
+
+    for error, kind in ((OSError(28, "No space left on device"), LogRefused), (KeyboardInterrupt(),) * 2):
+        written.clear()
+        monkeypatch.setattr(member_keys, "_put", refuse(error))
+        caught: Any = kind if isinstance(kind, type) else KeyboardInterrupt
+        with pytest.raises(caught) as raised:
+            create_keys(tmp_path / "k", ["m1", "m2"])
+        if isinstance(raised.value, TrilatError):
+            assert f"{tmp_path / 'k'}: cannot be written: No space left on device" in str(raised.value)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_made_nobody_else_can_read_or_write_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        create_keys(tmp_path / "k", ["m1", "recorder"], ["192.0.2.1", "robot.example", "2001:db8::1"])
+    finally:
+        os.umask(before)
+    assert {path.stat().st_mode & 0o077 for path in (tmp_path / "k").rglob("*")} == {0}
+    assert read_member_keys(tmp_path / "k" / "m1").ends > datetime.now(UTC) + timedelta(days=29)
+
+
+def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
+    """By a process of its own, which listens over TLS where it would over TCP, and waits for the others."""
+    words = [*COMMAND, *SITE, str(made / "k" / "m1"), "--join-timeout", "0"]
+    done = subprocess.run(
+        words, cwd=tmp_path, env={**PLAIN, "NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True
+    )
+    assert "m1: others connect to tls/127.0.0.1:" in done.stdout
+    assert "never came" in done.stderr
+    assert done.returncode == 2
+
+
+def test_the_table_has_its_forty_rows() -> None:
+    assert sum(map(len, (OF_ANOTHER, FROM_PYTHON, ENDPOINTS, ZENOH_FILES, SPOILT, NEW))) >= 40

@@ -1,0 +1,160 @@
+"""Commands that get no disk, no memory, no help texts, or a signal as they compile: each says so plainly."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.running import COMMAND, PLAIN, trilat
+from trilat_net.core.jit import COMPILING
+from trilat_net.process import ENDING_SIGNALS, Interrupt, let_signals_kill
+
+LOG = Path(__file__).parents[1] / "golden" / "v3.mcap"
+WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1"}
+
+
+def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.CompletedProcess[str]":
+    """Runs a command that may take so much of something."""
+    return subprocess.run(
+        [*COMMAND, *map(str, words)],
+        cwd=cwd,
+        env=WITHOUT_COMPILING,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        preexec_fn=lambda: resource.setrlimit(kind, (most, most)),
+    )
+
+
+@pytest.mark.parametrize(
+    "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
+)
+def test_a_figure_that_the_disk_refuses_is_named_and_not_there(form: str, tmp_path: Path) -> None:
+    done = limited(
+        resource.RLIMIT_FSIZE, 1000, "figure", LOG, "positions", "--format", form, "-o", "f", cwd=tmp_path
+    )
+    assert done.returncode == 5
+    assert done.stderr.splitlines() == [f"error: f/positions.{form}: cannot be written: File too large"]
+    assert list((tmp_path / "f").iterdir()) == []
+
+
+def test_keys_that_the_disk_refuses_are_named_and_not_there(tmp_path: Path) -> None:
+    done = limited(resource.RLIMIT_FSIZE, 100, "keys", "new", "k", "m1", cwd=tmp_path)
+    assert done.returncode == 5
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: k: cannot be written: File too large; nothing is left of it")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("mib", [40])
+def test_too_little_memory_is_said_in_one_line(mib: int, tmp_path: Path) -> None:
+    """As `ulimit -v` leaves it, where libraries cannot be loaded."""
+    done = limited(resource.RLIMIT_AS, mib << 20, "log", "check", LOG, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "error: there is too little memory" in done.stderr
+
+
+def test_without_docstrings_commands_work_and_say_that_their_help_is_gone(tmp_path: Path) -> None:
+    program = [sys.executable, "-OO", "-m", "trilat_net"]
+    for words, said in (
+        (["keys", "new", "--help"], "left out by python -OO"),
+        (["keys", "new", "k", "m"], "k/m"),
+    ):
+        done = subprocess.run(
+            [*program, *words], cwd=tmp_path, env=PLAIN, capture_output=True, text=True, timeout=300
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert said in done.stdout
+
+
+def test_recovering_blames_the_file_that_cannot_be_written(tmp_path: Path) -> None:
+    """What an earlier recovery left there, which cannot be removed; the source can be read."""
+    (tmp_path / "run.mcap.active").write_bytes(LOG.read_bytes())
+    (tmp_path / "run.mcap.recovering").mkdir()
+    trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
+        "run.mcap.recovering: cannot be written"
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("scenario", "check"),
+        ("trace", "import", "irtt"),
+        ("trace", "import", "ping"),
+        ("trace", "import", "csv"),
+        ("record", "--session", "x", "--zenoh-config"),
+        ("log", "check", str(LOG), "--key"),
+        ("keys", "info"),
+    ],
+    ids=" ".join,
+)
+def test_what_a_foreign_file_says_is_not_repeated(words: tuple[str, ...], tmp_path: Path) -> None:
+    """It may be one that whoever reads the error may not read."""
+    for text in (
+        "root:secret:19000:0\n",
+        "secret, words\n1, 2\n",
+        '["secret"]\n',
+        "t_s,delay_ms\nsecret,1\n",
+    ):
+        (tmp_path / "foreign").write_text(text)
+        more = ("-o", "made.csv") if words[0] == "trace" else ()
+        done = trilat(*words, "foreign", *more, cwd=tmp_path)
+        assert done.code == 2, done
+        assert "foreign" in done.err
+        assert "secret" not in done.err + done.out
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "words", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
+)
+def test_a_cold_start_says_that_it_compiles_and_ends_at_once(
+    words: tuple[str, ...], number: signal.Signals, tmp_path: Path
+) -> None:
+    """Python takes a signal between two instructions, and one call of the compiler takes minutes."""
+    cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    started = subprocess.Popen([*COMMAND, *words], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True)
+    assert started.stderr is not None
+    try:
+        assert started.stderr.readline().strip() == COMPILING  # this is no terminal
+        started.send_signal(number)
+        assert started.wait(60.0) in (-number, 128 + number)
+    finally:
+        started.kill()
+        started.wait()
+        started.stderr.close()
+
+
+def test_signals_kill_while_the_compiler_runs_where_they_may_break_off_work_and_nowhere_else() -> None:
+    def handlers() -> list[object]:
+        return [signal.getsignal(name) for name in ENDING_SIGNALS]
+
+    def released() -> bool:
+        before = handlers()
+        restore = let_signals_kill()
+        during = handlers()
+        restore()
+        assert handlers() == before
+        return during == [signal.SIG_DFL] * len(before)
+
+    with Interrupt() as orderly:
+        assert not released()
+        with orderly.raising():
+            assert released()
+        with Interrupt():  # as where a session has children
+            assert not released()
+    with Interrupt(compiles=True):
+        assert released()
+
+
+def test_a_signal_that_broke_off_an_inner_part_is_that_of_the_whole() -> None:
+    with Interrupt() as outer:
+        with pytest.raises(KeyboardInterrupt), Interrupt() as inner, inner.raising():
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert outer.exit_code == 128 + signal.SIGTERM
