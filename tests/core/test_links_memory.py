@@ -47,6 +47,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
+@pytest.mark.parametrize("kind", SCENARIOS)
 def test_a_link_of_100_ms_takes_less_than_a_mebibyte(kind: str) -> None:
     """At 1 kHz, whatever the arms, the laws and the distribution; at 4 kHz twice that."""
     source, changes = SCENARIOS[kind]
