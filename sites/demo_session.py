@@ -29,6 +29,8 @@ from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
 
 POLL_NS = 100_000_000
+START_S = 10
+"""Time for a site to start, s, where many share a few processors."""
 END_TIMEOUT_NS = 15 * NS_PER_S
 """Time for a child to end after its signal; then it is killed."""
 
@@ -149,20 +151,21 @@ def _start(
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     connect = [["--connect", endpoint] for endpoint in endpoints]
+    patience = ["--join-timeout", str(max(60, START_S * len(endpoints)))]
     sites = [
         _Child(
             name,
             [
                 *("site", name, "--scenario", str(file), "--session", session, "--listen", endpoints[n]),
                 *chain(*connect[:n]),
-                "--needs-recorder",
+                *("--needs-recorder", *patience),
             ],
             output,
         )
         for n, name in enumerate(scenario.names)
     ]
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    return sites, _Child(topics.RECORDER, [*arguments, "--join-timeout", "60", "--force"], output)
+    return sites, _Child(topics.RECORDER, [*arguments, *patience, "--force"], output)
 
 
 def _is_over(children: list[_Child], result: SessionResult) -> bool:

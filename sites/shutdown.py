@@ -112,7 +112,8 @@ class LeavingSite:
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
             self._publisher.answer_queries()
             monitor.watch(self._publisher, self._t_ns)
-            if not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS:
+            gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
+            if gone and (monitor.stored or interrupted()):  # else one may come back whose connection broke
                 patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
             if monitor.read_stored(self._ticks) and monitor.all_stored:

@@ -16,11 +16,11 @@ from trilat_net.analysis import arm_rows, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
-from trilat_net.core import delay, link, live_hand, session_life, ticks, user_law
+from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
-from trilat_net.scenario import laws, operators, resolve, scenario_reader
+from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_gains, bench_tasks
 from trilat_net.studies.sweep import cell_result, live_confirmation, margin_search, sweep_plan, sweep_run
@@ -138,7 +138,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("log-tools.md", "max(64 MiB, 300 x the file's size)", 64, mcap_reader.KEPT_BYTES / 2**20),
     ("log-tools.md", "300 x the file's size", 300, mcap_reader.KEPT_RATIO),
     ("log-tools.md", "at most 32 sites", 32, resolve.MAX_SITES),
-    ("log-tools.md", "links of a site up to 64 MiB", 64, scenario_reader.MAX_LINKS_BYTES / 2**20),
+    ("log-tools.md", "links of a site up to 64 MiB", 64, site_arrays.MAX_LINKS_BYTES / 2**20),
     ("log-tools.md", "of more than 65 536 only", 65_536, site_log.MAX_DECODED_RECORDS),
     ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, difference.TOLERANCE),
     ("log-tools.md", "sleeps until 150 us before", 150, pace.SPIN_NS / 1e3),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trilat_net.core.channel import schedule_deliveries
 from trilat_net.core.delay import LINK_MODEL_DTYPE, LinkModel
-from trilat_net.core.link import link_dtype, sample_dtype
+from trilat_net.core.link import link_dtype
 from trilat_net.core.philox import link_key
 from trilat_net.core.vectors import Points
 from trilat_net.scenario.delay_models import LinkBase
@@ -21,11 +21,11 @@ _BLOCK = 8192
 
 
 class Channel(NamedTuple):
-    """The arguments of `schedule_deliveries`: a link's row, its models, its pages and its points."""
+    """The arguments of `schedule_deliveries`: a link's row, its models, its due times and its points."""
 
     row: Any
     models: NDArray[Any]
-    pages: NDArray[Any]
+    dues: Ints
     points: Points
 
 
@@ -47,20 +47,20 @@ def channel(
     return Channel(
         row,
         np.array([tuple(model) for model in models], LINK_MODEL_DTYPE),
-        np.zeros(pages, sample_dtype(2)),
+        np.zeros(pages, dtype=np.int64),
         table,
     )
 
 
 def due(made: Channel, count: int) -> Ints:
     """When the next samples up to `count` are due, ns, or LOST; shape (count,) from a fresh channel."""
-    row, models, pages, points = made
+    row, models, dues, points = made
     first = int(row.foreseen) + 1
     parts = []
-    for start in range(first, count, len(pages)):
-        end = min(start + len(pages), count)
-        schedule_deliveries(end - 1, row, models, pages, points)
-        parts.append(pages["due_ns"][np.arange(start, end) % len(pages)])
+    for start in range(first, count, len(dues)):
+        end = min(start + len(dues), count)
+        schedule_deliveries(end - 1, row, models, dues, points)
+        parts.append(dues[np.arange(start, end) % len(dues)])
     return np.concatenate(parts)
 
 

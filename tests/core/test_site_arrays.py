@@ -24,15 +24,18 @@ def test_no_sample_is_due_later_than_the_longest_delay(name: str) -> None:
     assert delay_us.max() <= longest <= MAX_DELAY_US
 
 
-def test_known_delays_take_few_pages_and_unbounded_ones_all() -> None:
+def test_links_have_pages_for_their_delays_and_not_many_more() -> None:
+    """Of a distribution without a bound for the largest number that a draw may come to."""
+
     def pages(**changes: object) -> int:
         setups = [setup(name, "free", **changes) for name in ("m1", "m2", "s")]
-        return stack_site_arrays(setups).samples.shape[2]
+        return stack_site_arrays(setups).calendars.shape[2]
 
     assert pages(link__delay_ms=200.0) == 256
     assert pages(link__delay_ms=0.0) <= 16
-    unbounded = pages(link__model="gamma", link__delay_ms=20.0, link__deviation_ms=5.0)
-    assert 10_000 < unbounded <= calendar_pages(1000)
+    assert pages(link__model="gamma", link__delay_ms=20.0, link__deviation_ms=5.0) == 128
+    heavy = pages(link__model="lognormal", link__delay_ms=100.0, link__deviation_ms=100.0)
+    assert 10_000 < heavy <= calendar_pages(1000)
 
 
 def test_stacked_tables_hold_each_site_s_own() -> None:

@@ -32,11 +32,13 @@ class Machines:
     Attributes:
         address: of each machine.
         centre: the address at which a machine of a star reaches the one in its centre.
+        end: the machine's end of its cable.
     """
 
     def __init__(self) -> None:
         self.address: dict[str, str] = {}
         self.centre: dict[str, str] = {}
+        self.end: dict[str, str] = {}
         self._spaces: dict[str, str] = {}
 
     def add(self, name: str) -> None:
@@ -85,6 +87,20 @@ class Machines:
             raise NoNamespaces(str(error)) from None
         if done.returncode:
             raise NoNamespaces(f"{' '.join(rule)}: {done.stderr.strip()}")
+
+    def shape(self, name: str, *queue: str) -> None:
+        """Puts all that a machine sends into a queue of the tool `tc`; nothing of it is lost by another one.
+
+        Raises:
+            NoNamespaces: there is no `tc`, or its kernel has no such queue.
+        """
+        words = ("tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
+        try:
+            done = subprocess.run([*self.on(name), *words], capture_output=True, text=True, timeout=30)
+        except FileNotFoundError as error:
+            raise NoNamespaces(str(error)) from None
+        if done.returncode:
+            raise NoNamespaces(f"{' '.join(words)}: {done.stderr.strip()}")
 
     def remove(self) -> None:
         """Removes all; cables go with their machines."""
@@ -141,7 +157,7 @@ def starred(made: Machines, centre: str, names: Sequence[str]) -> None:
 def _number(made: Machines, name: str, end: str, address: str) -> None:
     made.ip(name, "address", "add", f"{address}/24", "dev", end)
     made.ip(name, "link", "set", end, "up")
-    made.address[name] = address
+    made.address[name], made.end[name] = address, end
 
 
 def reaches(made: Machines, name: str, address: str) -> bool:

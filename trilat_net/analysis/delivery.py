@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.channel import LOST, schedule_deliveries
 from ..core.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
-from ..core.link import AHEAD_LIMIT_NS, link_dtype, sample_dtype
+from ..core.link import AHEAD_LIMIT_NS, link_dtype
 from ..core.site_setup import LinkSetup
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array, Row
@@ -90,11 +90,11 @@ def _schedule(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: i
     row.used, row.foreseen = -1, -1
     row.outage_first, row.outage_count = len(points) - len(setup.outages), len(setup.outages)
     due_ns = np.empty(count, dtype=np.int64)
-    pages = np.zeros(_BLOCK, sample_dtype(0))
+    dues = np.empty(_BLOCK, dtype=np.int64)
     for start in range(0, count, _BLOCK):
         end = min(start + _BLOCK, count)
-        schedule_deliveries(end - 1, row, models, pages, points)
-        due_ns[start:end] = pages["due_ns"][: end - start]
+        schedule_deliveries(end - 1, row, models, dues, points)
+        due_ns[start:end] = dues[: end - start]
     return due_ns, int(row.copies)
 
 

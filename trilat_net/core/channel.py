@@ -20,7 +20,7 @@ from .delay import (
 from .jit import leaf
 from .philox import DrawKey, uniforms
 from .ticks import tick_ns
-from .vectors import Points, Row
+from .vectors import IntArray, Points, Row
 
 LOST = -1
 """Stands for the time of a sample that is lost."""
@@ -96,12 +96,12 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
 
 
 @leaf
-def schedule_deliveries(sample: int, link: Row, models: Row, samples: Row, points: Points) -> None:
-    """Decides the delivery of every sample up to one and writes it into its page, `due_ns`.
+def schedule_deliveries(sample: int, link: Row, models: Row, dues: IntArray, points: Points) -> None:
+    """Decides when every sample up to one is due, and writes it into `dues`, the oldest ones over.
 
     `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
     """
-    pages = samples.shape[0]
+    pages = dues.shape[0]
     while link.foreseen < sample:
         m = link.foreseen + 1
         fresh = m == 0
@@ -109,6 +109,5 @@ def schedule_deliveries(sample: int, link: Row, models: Row, samples: Row, point
         while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
             link.model += 1
             fresh = True
-        page: Row = samples[m & (pages - 1)]
-        page.due_ns = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
+        dues[m & (pages - 1)] = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
         link.foreseen = m

@@ -90,19 +90,39 @@ LINK_MODEL_DTYPE = np.dtype(
 )
 
 
+_LARGEST_NORMAL, _LARGEST_EXPONENTIAL = 8.6, 36.8
+"""No draw is larger in magnitude: that of Box and Muller, and -log, of 2^-53, see `unit_interval`."""
+
+
+def _longest_us(model: LinkModel, trace: Points | None) -> float:
+    """Returns a delay that no sample exceeds, us, by the least and the largest uniform numbers."""
+    location, scale, extra, weight = model.location, model.scale, model.extra, abs(model.weight)
+    if model.kind == DelayKind.GAMMA:
+        d = extra + (extra < 1.0) - 1.0 / 3.0
+        return scale * d * (1.0 + _LARGEST_NORMAL / math.sqrt(9.0 * d)) ** 3
+    if model.kind == DelayKind.LOG_NORMAL:
+        return math.exp(min(location + _LARGEST_NORMAL * scale, math.log(MAX_DELAY_US)))
+    if model.kind == DelayKind.AR1:  # the sum of all draws, each at its largest
+        most = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
+        return location + _LARGEST_NORMAL * scale * most
+    return {
+        DelayKind.CONSTANT: location,
+        DelayKind.UNIFORM: location + scale,
+        DelayKind.NORMAL: location + _LARGEST_NORMAL * scale,
+        DelayKind.HYPER_EXPONENTIAL: location + _LARGEST_EXPONENTIAL * max(scale, extra),
+        DelayKind.SINE: location + abs(scale),
+        DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
+        DelayKind.MEASURED: 0.0,
+    }[DelayKind(model.kind)]
+
+
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
     """Returns a delay that no sample of a link exceeds, us, play-out included; traces: per model, or None."""
-    reaches = []
-    for model, trace in zip(models, traces, strict=True):
-        bounded = {
-            DelayKind.CONSTANT: model.location,
-            DelayKind.UNIFORM: model.location + model.scale,
-            DelayKind.SINE: model.location + abs(model.scale),
-            DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
-            DelayKind.MEASURED: 0.0,
-        }.get(DelayKind(model.kind), float(MAX_DELAY_US))
-        reaches.append(max(math.ceil(bounded) + 1, model.playout_us))
-    return min(MAX_DELAY_US, max(reaches))
+    longest = [
+        max(math.ceil(min(_longest_us(model, trace), MAX_DELAY_US)) + 1, model.playout_us)
+        for model, trace in zip(models, traces, strict=True)
+    ]
+    return min(MAX_DELAY_US, max(longest))
 
 
 LOSS, DUPLICATE, DELAY, COPY = 0, 1, 2, 5

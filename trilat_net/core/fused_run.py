@@ -248,7 +248,7 @@ def sense_site(
         link = LinkArrays(
             links[p : p + 1],
             arrays.models[i, p],
-            arrays.samples[i, p],
+            arrays.dues[i, p],
             arrays.calendars[i, p],
             arrays.points,
             channel_of(channel_of(arrays.channel, i), p),

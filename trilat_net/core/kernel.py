@@ -205,7 +205,7 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
     return LinkArrays(
         arrays.links[peer : peer + 1],
         arrays.models[peer],
-        arrays.samples[peer],
+        arrays.dues[peer],
         arrays.calendars[peer],
         arrays.points,
         channel_of(arrays.channel, peer),
@@ -298,8 +298,8 @@ def site_tick(
     site: RowArray,
     links: RowArray,
     models: RowArray,
-    samples: RowArray,
-    calendars: IntArray,
+    dues: IntArray,
+    calendars: RowArray,
     points: Points,
     ramps: Array,
     actors: TorqueSourceRows,
@@ -316,7 +316,7 @@ def site_tick(
     It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as tuples they would
     cost more than a microsecond.
     """
-    arrays = SiteArrays(site, links, models, samples, calendars, points, ramps, actors, table, chain, channel)
+    arrays = SiteArrays(site, links, models, dues, calendars, points, ramps, actors, table, chain, channel)
     sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, sent, record))
     torque_stage(site, chain)  # 6 torque
     act_stages(k, t_ns, site, actors, table, chain, record)

@@ -5,9 +5,10 @@ integer nanoseconds; it is in use from the receiver's first tick at or after tha
 Its real arrival has no influence if it precedes the due time. (On a measured link a sample is due at
 once, so there the arrival alone counts.)
 
-A link is a calendar. `accept_sample` files a sample under its own tick and writes its number into the page
-of the tick that releases it, if none newer is there; `recall_sample` reads the page of the present tick.
-Both cost the same at any delay. Newest wins: an older sample never replaces a newer one.
+A link is a calendar. `accept_sample` files a sample in the page of the tick that releases it, if none newer
+is there; `recall_sample` reads the page of the present tick. Both cost the same at any delay. Newest wins: an
+older sample never replaces a newer one. So a calendar need only span what may wait, while the times at which
+samples are due, eight bytes each, are kept for as long as a late one or a copy may come.
 """
 
 from functools import cache
@@ -56,19 +57,18 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of the pages where samples wait: one per sample, a power of two of them.
+    """Returns the layout of a calendar's pages: one per tick of the receiver, a power of two of them.
 
-    A page says when the sample of its index is due, and holds the sample that waits there with its own tick
-    (-1: none).
+    A page holds the newest sample that its tick releases, with the sample's own tick (-1: none).
     """
-    return np.dtype((np.record, [("due_ns", "i8"), ("tick", "i8"), *_sample_vectors(shared)]))
+    return np.dtype((np.record, [("tick", "i8"), *_sample_vectors(shared)]))
 
 
 class ChannelArrays(NamedTuple):
     """What peers' laws send besides, in the order in which the receiver's law has it; one axis more per peer.
 
     Attributes:
-        waiting: of the samples that wait, by their page, shape (pages, C).
+        waiting: of the samples that wait, by the calendar's page, shape (pages, C).
         received: of the sample in use, shape (C,); zeros before the first.
         places: where each number stands among those that come with a sample; -1: it does not, and is 0.
     """
@@ -84,16 +84,16 @@ class LinkArrays(NamedTuple):
     Attributes:
         state: shape (1,), see `link_dtype`.
         models: what its channel does, shape (M,), LINK_MODEL_DTYPE.
-        samples: where samples wait, shape (pages,), see `sample_dtype`.
-        calendar: the newest sample that each of the receiver's ticks releases, or -1, shape (pages,).
+        dues: when the last samples are due, ns, or LOST; of one that has come `_FILED` less that.
+        calendar: the samples that wait, shape (pages,), see `sample_dtype`.
         points: the site's traces and outages, shape (n, 2).
         channel: what the peer's law sends besides; None: the site's law does not look at it.
     """
 
     state: RowArray
     models: RowArray
-    samples: RowArray
-    calendar: IntArray
+    dues: IntArray
+    calendar: RowArray
     points: Points
     channel: ChannelArrays | None
 
@@ -105,26 +105,35 @@ AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
 _MEASURED = int(DelayKind.MEASURED)
 
 
-def calendar_pages(rate_hz: int) -> int:
-    """Returns the pages of a calendar: it spans the longest delay of a sample from as far ahead as any."""
-    ticks = first_tick_at(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, rate_hz) + 2
-    return 1 << int(ticks).bit_length()
+_FILED = LOST - 1
+"""No time that a sample is due is negative, so that what is not above this tells of one that has come."""
+
+
+def span_ticks(span_ns: int, rate_hz: int) -> int:
+    """Returns the ticks of a time; `first_tick_at` for those who need not load the compiled core."""
+    return -(-span_ns * rate_hz // NS_PER_S)
+
+
+def calendar_pages(rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS) -> int:
+    """Returns the pages of a calendar spanning a delay of samples from so far ahead; by default the most."""
+    return 1 << (span_ticks(delay_us * 1000 + ahead_ns, rate_hz) + 2).bit_length()
 
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by then.
 
-    LOST if it never does, or if it is so old that its page has been turned.
+    LOST if it never does, or if it is so old that its due time is kept no more.
     """
     row: Row = link.state[0]
-    samples = link.samples
-    schedule_deliveries(tick, row, link.models, samples, link.points)
-    pages = samples.shape[0]
-    page: Row = samples[tick & (pages - 1)]
-    if page.due_ns == LOST or tick <= row.foreseen - pages:
+    dues = link.dues
+    schedule_deliveries(tick, row, link.models, dues, link.points)
+    due_ns = dues[tick & (dues.shape[0] - 1)]
+    if due_ns == LOST or tick <= row.foreseen - dues.shape[0]:
         return LOST
-    return first_tick_at(max(page.due_ns, tick_ns(tick, row.rate_hz) + 1), rate_hz)
+    if due_ns <= _FILED:
+        due_ns = _FILED - due_ns
+    return first_tick_at(max(due_ns, tick_ns(tick, row.rate_hz) + 1), rate_hz)
 
 
 @leaf
@@ -159,13 +168,13 @@ def accept_sample(
     `sent` is what the peer's law sends besides its motion; a site whose law does not look at it takes any.
     """
     row: Row = link.state[0]
-    samples, calendar = link.samples, link.calendar
+    dues, calendar = link.dues, link.calendar
     row.accepted += 1
     if tick < 0 or (tick > row.foreseen and _far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
-    slot: Row = samples[tick & (samples.shape[0] - 1)]
-    if slot.tick == tick:
+    place = tick & (dues.shape[0] - 1)
+    if row.foreseen - dues.shape[0] < tick <= row.foreseen and dues[place] <= _FILED:
         row.duplicate += 1
         return
     release = release_tick(tick, rate_hz, link)
@@ -177,21 +186,23 @@ def accept_sample(
         if model.kind != _MEASURED:
             row.late += 1
         release = k
-    if slot.tick > tick:
-        row.superseded += 1
+    if release - k >= calendar.shape[0]:  # whoever steps a site makes room first
+        row.refused += 1
         return
-    slot.tick = tick
-    put(slot.q, q)
-    put(slot.qd, qd)
-    put(slot.tau_x, tau_x)
-    _file_sent(link.channel, tick & (samples.shape[0] - 1), sent)
-    if tick <= row.used:  # filed all the same: a duplicate of it is recognised
+    dues[place] = _FILED - dues[place]
+    if tick <= row.used:
         row.superseded += 1
         return
     page = release & (calendar.shape[0] - 1)
-    if calendar[page] >= 0:
+    slot: Row = calendar[page]
+    if slot.tick >= 0:
         row.superseded += 1
-    calendar[page] = max(calendar[page], tick)
+    if slot.tick < tick:
+        slot.tick = tick
+        put(slot.q, q)
+        put(slot.qd, qd)
+        put(slot.tau_x, tau_x)
+        _file_sent(link.channel, page, sent)
 
 
 @leaf
@@ -205,18 +216,18 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     row.new = 0
     calendar = link.calendar
     sample = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
-    schedule_deliveries(sample, row, link.models, link.samples, link.points)
+    schedule_deliveries(sample, row, link.models, link.dues, link.points)
     page = k & (calendar.shape[0] - 1)
-    newest = calendar[page]
+    slot: Row = calendar[page]
+    newest = slot.tick
     if newest < 0:
         return
-    calendar[page] = -1
-    slot: Row = link.samples[newest & (link.samples.shape[0] - 1)]
-    if newest > row.used and slot.tick == newest:
+    slot.tick = -1
+    if newest > row.used:
         row.used, row.used_ns, row.new = newest, tick_ns(k, rate_hz), 1
         put(row.q, slot.q)
         put(row.qd, slot.qd)
         put(row.tau_x, slot.tau_x)
-        _use_sent(link.channel, newest & (link.samples.shape[0] - 1))
+        _use_sent(link.channel, page)
     else:
         row.superseded += 1

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chain import build_chain
+from .channel import LOST
 from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
 from .link import ChannelArrays, calendar_pages, link_dtype, sample_dtype
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
-from .ticks import MAX_ARRIVALS, DominanceRamp, Mode, first_tick_at
+from .ticks import MAX_ARRIVALS, NS_PER_S, DominanceRamp, Mode
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
@@ -111,8 +112,8 @@ class SiteArrays(NamedTuple):
         site: state and constants, shape (1,), see `site_dtype`.
         links: one row per peer, shape (P,), see `link_dtype`.
         models: what the links' channels do, shape (P, M), LINK_MODEL_DTYPE.
-        samples: where samples wait, shape (P, pages), see `sample_dtype`.
-        calendars: the links' calendars, shape (P, pages).
+        dues: when the links' last samples are due, shape (P, D), ns; see `LinkArrays`.
+        calendars: the links' calendars, shape (P, pages), see `sample_dtype`.
         points: traces and outages, shape (n, 2); of stacked sites one for all.
         ramps: how dominance factors change, shape (R, RAMP_COLUMNS + P).
         actors: operators and environments, shape (A,), see `torque_source_dtype`.
@@ -124,8 +125,8 @@ class SiteArrays(NamedTuple):
     site: RowArray
     links: RowArray
     models: RowArray
-    samples: RowArray
-    calendars: IntArray
+    dues: IntArray
+    calendars: RowArray
     points: Points
     ramps: Array
     actors: TorqueSourceRows
@@ -176,27 +177,68 @@ def build_site_arrays(
     Args:
         setup: all that the site is built from.
         spare: room for so many more changes of a link, and for so many of the dominance factors.
-        pages: pages of a link; 0: as many as any delay may ever need.
+        pages: pages of a link, and samples whose due times it keeps; 0: pages for its delays, and due times
+            for as long as a sample may be late.
         layout: of the arrays, if they are to be larger than the site needs.
         plugged: with the arrays of a plugged law, also if the site's is none.
     """
     links, layout = setup.links, layout or setup.layout
     peers = len(links)
-    pages = pages or max(calendar_pages(max(link.rate_hz, setup.rate_hz)) for link in links)
-    samples = np.zeros((peers, pages), sample_dtype(layout.shared))
-    samples["tick"] = -1
+    kept, pages = pages or _kept_dues(setup), pages or needed_pages(setup)
+    calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
+    calendars["tick"] = -1
     rows, models, points = _build_links(links, spare[0], layout.shared)
     actors, table = torque_source_rows(setup.actors, layout.joints, 3 if layout.chain else 2)
     ramps = np.zeros((1 + len(setup.ramps) + spare[1], RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
-    calendars = np.full((peers, pages), -1, dtype=np.int64)
+    dues = np.full((peers, kept), LOST, dtype=np.int64)
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
     site = _build_site(setup, layout)
     channel = _build_channel(setup, pages) if plugged or setup.own is not None else None
-    arrays = SiteArrays(site, rows, models, samples, calendars, points, ramps, actors, table, chain, channel)
+    arrays = SiteArrays(site, rows, models, dues, calendars, points, ramps, actors, table, chain, channel)
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
     return arrays
+
+
+def needed_pages(setup: SiteSetup) -> int:
+    """Returns the pages of a site's links: for its delays, by senders that are ahead of it a little."""
+    longest = max(max_delay_us(link.models, link.traces) for link in setup.links)
+    return calendar_pages(setup.rate_hz, longest, _NEAR_NS)
+
+
+def links_bytes(setup: SiteSetup, pages: int) -> int:
+    """Returns the memory of a site's links with so many pages each, bytes."""
+    numbers = sum(vector.length for vector in setup.received_vectors) if setup.own is not None else 0
+    page = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
+    return len(setup.links) * (pages * page + 8 * _kept_dues(setup))
+
+
+def most_pages(setup: SiteSetup) -> int:
+    """Returns the pages to which a site's links may grow, for senders far ahead and delays that change."""
+    pages = needed_pages(setup)
+    while pages < calendar_pages(setup.rate_hz) and links_bytes(setup, 2 * pages) <= MAX_LINKS_BYTES:
+        pages *= 2
+    return pages
+
+
+def _kept_dues(setup: SiteSetup) -> int:
+    return max(calendar_pages(max(setup.rate_hz, link.rate_hz)) for link in setup.links)
+
+
+def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
+    """Returns the arrays of a site before tick k with calendars of more pages, and in them all that waits."""
+    ticks = np.arange(k, k + arrays.calendars.shape[1])
+    old, new = ticks & (len(ticks) - 1), ticks & (pages - 1)
+    calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
+    calendars["tick"] = -1
+    calendars[:, new] = arrays.calendars[:, old]
+    channel = arrays.channel
+    if channel is not None:
+        waiting = np.zeros((*calendars.shape, channel.waiting.shape[2]))
+        waiting[:, new] = channel.waiting[:, old]
+        channel = channel._replace(waiting=waiting)
+    return arrays._replace(calendars=calendars, channel=channel)
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
@@ -221,6 +263,10 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
         link.model += 1
 
 
+_NEAR_NS = NS_PER_S // 4
+"""By how much senders are ahead of a receiver that is a little late: a calendar has pages for that."""
+MAX_LINKS_BYTES = 64 << 20
+"""Most memory of a site's links, bytes."""
 _SLACK = 4
 """Ticks by which a sample may be scheduled before it is filed, and some."""
 _NEVER_SAMPLED = 2
@@ -234,7 +280,7 @@ def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
     """
     longest = max(max_delay_us(link.models, link.traces) for setup in setups for link in setup.links)
     fastest_hz = max(setup.rate_hz for setup in setups)
-    pages = 1 << (first_tick_at(longest * 1000, fastest_hz) + _SLACK).bit_length()
+    pages = calendar_pages(fastest_hz, longest, _SLACK * NS_PER_S // fastest_hz)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
     plugged = any(setup.own is not None for setup in setups)

@@ -17,13 +17,21 @@ import numpy as np
 from ..errors import LawFailed
 from .channel import LOST
 from .compiled_law import plug_law
-from .delay import DelayKind
+from .delay import DelayKind, max_delay_us
 from .dominance import fold_ramps
 from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
+from .link import AHEAD_LIMIT_NS, span_ticks
 from .live_hand import HandInForce, free_hand
-from .site_arrays import add_model, add_ramp, build_site_arrays, build_tick_buffers
+from .site_arrays import (
+    add_model,
+    add_ramp,
+    build_site_arrays,
+    build_tick_buffers,
+    most_pages,
+    widen_calendars,
+)
 from .site_setup import SiteSetup, StaleAction
 from .ticks import (
     MAX_ARRIVALS,
@@ -67,6 +75,9 @@ class Site:
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
+        self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+        self._newest_fitting = [-1] * len(setup.links)
+        self._most_pages = most_pages(setup)
         self._external = setup.external
         self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
         self.layout = setup.layout
@@ -126,6 +137,9 @@ class Site:
             if self._links[command.peer].models >= self._arrays.models.shape[1]:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
             add_model(self._arrays, command.peer, command.model)
+            longest = max_delay_us([command.model], [None])
+            self._delay_us[command.peer] = max(self._delay_us[command.peer], longest)
+            self._newest_fitting[command.peer] = -1
         if command.ramp is not None:
             s: Row = self._site[0]
             s.ramps = fold_ramps(t_ns, int(s.ramps), self._arrays.ramps)
@@ -158,10 +172,10 @@ class Site:
             ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
             LawFailed: a user's law did, and the site does not go on without it, as under `glide`.
         """
-        packed, count = self._pack(tick.arrivals), len(tick.arrivals)
-        t_ns = tick.k * NS_PER_S // self.rate_hz
+        t_ns, count = tick.k * NS_PER_S // self.rate_hz, len(tick.arrivals)
         for command in tick.commands:
             self.order(command, t_ns)
+        packed = self._pack(tick.k, tick.arrivals)
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
             s.q, s.qd = tick.measured.q, tick.measured.qd
@@ -342,8 +356,8 @@ class Site:
         Raises:
             ValueError: more than MAX_ARRIVALS of them wait.
         """
-        self._arrays.samples["tick"] = -1
-        self._arrays.calendars[:] = -1
+        self._arrays.calendars["tick"] = -1
+        self._newest_fitting = [-1] * len(self.peers)
         link: Row
         for n, (link, start, sample) in enumerate(zip(self._links, self._starts, in_use, strict=True)):
             # the channel's memory is a function of what went before
@@ -356,15 +370,33 @@ class Site:
             if (channel := self._arrays.channel) is not None:
                 sent = np.append(() if sample is None else sample.ch, 0.0)  # place -1 is this zero
                 channel.received[n] = sent[channel.places[n]] if len(sent) > 1 else 0.0
-        self._pack(waiting)
+        self._pack(k, waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
-    def _pack(self, arrivals: Sequence[Arrival]) -> int:
-        """Writes arrivals into their buffers; returns the bytes that they take."""
+    def _make_room(self, k: int, peer: int, tick: int) -> None:
+        """Widens the calendars at tick k for what a peer's sample may wait, and all up to that one.
+
+        What does not fit into `most_pages` is refused as it is filed, like a stamp out of range.
+        """
+        peer_hz, pages = self.peer_rate_hz(peer), self._arrays.calendars.shape[1]
+        wait = span_ticks(self._delay_us[peer] * 1000, self.rate_hz) + 4
+        ahead = tick * self.rate_hz // peer_hz - k
+        if ahead > span_ticks(AHEAD_LIMIT_NS, self.rate_hz):
+            return  # it is refused
+        if ahead + wait > pages < self._most_pages:
+            pages = min(1 << (ahead + wait).bit_length(), self._most_pages)
+            self._arrays = widen_calendars(self._arrays, k - int(self._site["skipped"][0]), pages)
+            self._tick_arrays = (*self._arrays, *self._buffers)
+        self._newest_fitting[peer] = (k + pages - wait) * peer_hz // self.rate_hz
+
+    def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
+        """Writes arrivals at tick k into their buffers and makes room for them; returns their bytes there."""
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
         offset = 0
         for peer, tick, q, qd, *_ in arrivals:
+            if tick > self._newest_fitting[peer]:
+                self._make_room(k, peer, tick)
             self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
             offset += self._arrival_size
         if self._reflects:

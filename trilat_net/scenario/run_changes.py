@@ -14,7 +14,7 @@ from ..core.ticks import NS_PER_S, CoreChange, LifeOrder
 from ..errors import ScenarioError
 from .resolve import resolve_dominance_row, resolve_target
 from .scenario_types import Change, Scenario, SiteOrder
-from .validate import check_change
+from .validate import check_change, check_links_memory
 
 LinkTables = dict[str, dict[str, Any]]
 
@@ -43,6 +43,9 @@ def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, A
     except msgspec.ValidationError as error:
         raise ScenarioError(str(error), path="change") from None
     check_change(complete, "change")
+    if complete.link:
+        after = msgspec.structs.replace(scenario, timeline=(*scenario.timeline, complete))
+        check_links_memory(after, find_owner(complete))
     return complete
 
 

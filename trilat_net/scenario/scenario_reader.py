@@ -1,7 +1,6 @@
 """Scenarios by name, by path or from a log, with overrides applied.
 
-Invariant: text from a log or a peer is not trusted: it names no file, and its links fit into
-`MAX_LINKS_BYTES`.
+Invariant: text from a log or a peer is not trusted: it names no file, and writes out what it has.
 """
 
 import re
@@ -13,9 +12,6 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from ..core.chain import MAX_JOINTS
-from ..core.delay import MAX_DELAY_US
-from ..core.link import AHEAD_LIMIT_S, calendar_pages, sample_dtype
 from ..errors import ScenarioError
 from ..files import open_regular
 from .fields import suggest_nearest
@@ -24,9 +20,6 @@ from .override import apply_overrides, expand_overrides, parse_overrides, split_
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
-
-MAX_LINKS_BYTES = 64 << 20
-"""Most memory of a site's links in a scenario from a log or a peer."""
 
 MAX_KEY_PARTS = 32
 """Parts of a key, as in sites.m1.arm; a scenario needs four."""
@@ -251,20 +244,6 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     traces = sum(len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed))
     if traces > len(text):
         raise ScenarioError("its traces are not written out, link by link", source=source)
-    page_bytes = sample_dtype(MAX_JOINTS).itemsize
-    for name in scenario.names:
-        rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(name)]
-        bound = sum(2 * ((MAX_DELAY_US // 1_000_000 + AHEAD_LIMIT_S) * rate_hz + 3) for rate_hz in rates)
-        if bound * page_bytes <= MAX_LINKS_BYTES:
-            continue  # `calendar_pages` is never more; calling it would load the compiled core, half a second
-        pages = sum(map(calendar_pages, rates))
-        if pages * page_bytes > MAX_LINKS_BYTES:
-            wanted = pages * page_bytes >> 20
-            raise ScenarioError(
-                f"its links would take {wanted} MiB, at most {MAX_LINKS_BYTES >> 20} are given",
-                path=f"sites.{name}",
-                source=source,
-            )
     return scenario
 
 

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from ..core.dominance import is_irreducible
+from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
 from ..errors import ScenarioError
 from ..files import find_page
 from .arms import TASK_AXES
@@ -215,6 +216,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
+    for name in scenario.names:
+        check_links_memory(scenario, name)
     joints = {name: model.counts.joints for name, model in scenario.arms.items()}
     if found := find_expect_problem(scenario.expect, joints):
         raise ScenarioError(found.problem, path=f"expect.{found.key}")
@@ -415,6 +418,22 @@ def _normalise_change(change: Change) -> Change:
     if not change.link:
         return change
     return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
+
+
+def check_links_memory(scenario: Scenario, site: str) -> None:
+    """Refuses links of a site whose delays would take more than `MAX_LINKS_BYTES`.
+
+    Raises:
+        ScenarioError: with the site's path.
+    """
+    setup = scenario.setup(site)
+    wanted = links_bytes(setup, needed_pages(setup))
+    if wanted > MAX_LINKS_BYTES:
+        raise ScenarioError(
+            f"its links would take {wanted / 2**20:.0f} MiB, at most {MAX_LINKS_BYTES >> 20} are given: "
+            "shorten the delays, lower rate_hz, or have fewer sites",
+            path=f"sites.{site}",
+        )
 
 
 def _check_stale_rules(scenario: Scenario) -> None:

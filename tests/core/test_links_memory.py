@@ -1,0 +1,194 @@
+"""The memory of links: what their delays need, more as it is needed, and at most what a site is given."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.chains import six_joints
+from tests.core.kinds import KINDS
+from tests.core.sites import linked, one_link, sample, stepped
+from tests.task_arms import planar_task
+from trilat_net.core import site_step
+from trilat_net.core.delay import LinkModel
+from trilat_net.core.link import AHEAD_LIMIT_S, calendar_pages
+from trilat_net.core.site_arrays import (
+    MAX_LINKS_BYTES,
+    SiteArrays,
+    links_bytes,
+    most_pages,
+    needed_pages,
+    widen_calendars,
+)
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import CoreChange, TickInput
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario, parse_embedded, parse_scenario
+from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
+
+MIB = 2**20
+
+
+def taken(arrays: SiteArrays) -> int:
+    """Bytes that all links of a site take for samples and their times."""
+    waiting = 0 if arrays.channel is None else arrays.channel.waiting.nbytes
+    return arrays.dues.nbytes + arrays.calendars.nbytes + waiting
+
+
+SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+    "planar": ("paper", {}),
+    "gamma": ("paper", {"link.model": "gamma", "link.deviation_ms": 20.0}),
+    "normal": ("paper", {"link.model": "normal", "link.deviation_ms": 20.0}),
+    "uniform": ("paper", {"link.model": "uniform", "link.half_width_ms": 50.0}),
+    "six joints": (six_joints(1.0), {}),
+    "a place": (planar_task(1.0), {}),
+    "a law that sends": ("paper", {"control.law": "tests.channel_law:Talking"}),
+}
+
+
+@pytest.mark.parametrize("kind", SCENARIOS)
+def test_a_link_of_100_ms_takes_less_than_a_mebibyte(kind: str) -> None:
+    """At 1 kHz, whatever the arms, the laws and the distribution; at 4 kHz twice that."""
+    source, changes = SCENARIOS[kind]
+    for rate_hz, most in ((1000, MIB), (4000, 2 * MIB)):
+        scenario = load_scenario(source, {"rate_hz": rate_hz, "link.delay_ms": 100.0, **changes})
+        for name in scenario.names:
+            setup = scenario.setup(name)
+            arrays = Site(setup)._arrays
+            assert taken(arrays) <= most * len(setup.links)
+            assert taken(arrays) == links_bytes(setup, arrays.calendars.shape[1])
+
+
+# Calendars that widen give what the widest give.
+
+
+def wide(site: Site, pages: int) -> Site:
+    site._arrays = widen_calendars(site._arrays, 0, pages)
+    site._tick_arrays = (*site._arrays, *site._buffers)
+    return site
+
+
+ORDERS = st.one_of(
+    st.none(),
+    st.builds(lambda us: LinkModel(location=float(us)), st.integers(0, 10_000_000)),
+    st.sampled_from([KINDS["gamma"], KINDS["ar1"], KINDS["in order"], KINDS["copies"], KINDS["lognormal"]]),
+)
+
+
+@pytest.mark.parametrize("rates", [(1000, 1000), (400, 900), (50, 1001)], ids=str)
+@given(data=st.data())
+def test_a_site_whose_links_widen_makes_the_records_of_one_with_the_widest(
+    rates: tuple[int, int], data: st.DataObject
+) -> None:
+    """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
+    grown, widest = (
+        linked(*rates, [LinkModel(location=1_000.0)]),
+        linked(*rates, [LinkModel(location=1_000.0)]),
+    )
+    widest = wide(widest, calendar_pages(rates[0]))
+    first = grown._arrays.calendars.shape[1]
+    now = 0
+    came = st.integers(-AHEAD_LIMIT_S * rates[1], AHEAD_LIMIT_S * rates[1] + 2)
+    for batch in data.draw(
+        st.lists(st.tuples(st.lists(came, max_size=5), ORDERS, st.integers(1, 900)), max_size=6)
+    ):
+        ahead, model, idle = batch
+        here = now * rates[1] // rates[0]
+        orders = []
+        if model is not None:
+            from_ns = (now + rates[0] // 10) * 10**9 // rates[0]
+            orders = [CoreChange("order", 0, model._replace(from_ns=from_ns))]
+        tick = TickInput(now, [sample(max(here + m, 0)) for m in ahead], orders)
+        assert grown.step(tick) == widest.step(tick)
+        idly = [TickInput(now + n) for n in range(1, idle)]
+        assert stepped(grown, idly) == stepped(widest, idly)
+        assert grown.counts() == widest.counts()
+        now += idle
+    assert first <= grown._arrays.calendars.shape[1] <= calendar_pages(rates[0])
+
+
+def test_a_delay_that_is_ordered_to_grow_loses_no_sample() -> None:
+    """From 1 ms to ten seconds: every sample that is sent comes into use when it is due."""
+    site = one_link(1000, 1000, 1_000_000)
+    order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
+    ticks = (TickInput(k, [sample(k - 1)] if k else [], [order] if k == 800 else []) for k in range(13_000))
+    used = [record.used[0] for record in stepped(site, ticks)]
+    assert used[1000:10_999] == [999] * 9999
+    assert used[10_999:] == list(range(1000, 3001))
+    assert site.counts()[0].lost == site.counts()[0].refused == 0
+
+
+def test_what_is_under_way_survives_the_widening() -> None:
+    """Also what a law's peer sends, and of every peer."""
+    scenario = load_scenario("paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"})
+    setups = [scenario.setup("m1")] * 2
+    small, large = Site(setups[0]), wide(Site(setups[1]), 1 << 15)
+    for k in range(400):
+        arrivals = [
+            sample(k - 1, peer)._replace(tau_x=(0.1 * k, 0.0), ch=(0.1 * k + peer, 1.0, 2.0))
+            for peer in (0, 1)
+        ]
+        if k == 50:
+            arrivals.append(sample(5000)._replace(tau_x=(9.0, 9.0), ch=(1.0, 2.0, 3.0)))
+        tick = TickInput(k, arrivals if k else [])
+        assert small.step(tick) == large.step(tick)
+    assert small._arrays.calendars.shape[1] == 8192
+
+
+# One limit.
+
+
+def many(count: int, rate_hz: int, delay_ms: float) -> str:
+    """The text of so many sites, each of which follows the one before it."""
+    names = [f"a{n}" for n in range(count)]
+    sites = "".join(f"[sites.{name}]\n" for name in names)
+    rows = "".join(f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names))
+    return f"name = 'x'\nrate_hz = {rate_hz}\n[link]\ndelay_ms = {delay_ms}\n{sites}{rows}"
+
+
+@pytest.mark.parametrize(("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)])
+def test_what_virtual_time_takes_a_recorder_takes(count: int, rate_hz: int) -> None:
+    scenario = parse_scenario(many(count, rate_hz, 100.0))
+    assert parse_embedded(scenario.text).names == scenario.names
+    assert taken(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
+
+
+def test_the_limit_has_the_same_words_wherever_a_scenario_comes_from() -> None:
+    text = many(12, 20_000, 9000.0)
+    problems = []
+    for read in (parse_scenario, parse_embedded):
+        with pytest.raises(
+            ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"
+        ) as caught:
+            read(text)
+        problems.append((caught.value.path, caught.value.problem))
+    assert problems[0] == problems[1]
+    assert problems[0][0] == "sites.a0"
+
+
+def test_a_change_that_would_need_more_than_the_limit_is_refused() -> None:
+    scenario = parse_scenario(many(12, 20_000, 1.0))
+    present = initial_link_tables(scenario)
+    change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
+    assert resolve_change(scenario, present, change, 10**9).link == "a1->a0"
+    with pytest.raises(ScenarioError, match="its links would take"):
+        resolve_change(scenario, present, {**change, "to": {"delay_ms": 9000.0}}, 10**9)
+
+
+def test_links_never_grow_beyond_the_limit_and_what_does_not_fit_is_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a site that is given less: stamps from further ahead are refused, all others come into use."""
+    free = one_link(1000, 1000, 1_000_000)
+    setup = load_scenario("paper").setup("m1")
+    assert most_pages(setup) == calendar_pages(1000) > needed_pages(setup)
+    monkeypatch.setattr(site_step, "most_pages", lambda _: 1024)
+    tight = one_link(1000, 1000, 1_000_000)
+    ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
+    for site in (free, tight):
+        used = [record.used[0] for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])]
+        assert used[-1] == 900
+    assert free.counts()[0].refused == 0
+    assert tight.counts()[0].refused == 2
+    assert tight._arrays.calendars.shape[1] == 1024
