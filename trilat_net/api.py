@@ -57,6 +57,8 @@ def simulate(
 ) -> SimulatedLog:
     """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
 
+    Of a run that diverged it warns; `log.diverged_s` says when.
+
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
     (100, 2)
@@ -70,7 +72,9 @@ def simulate(
     Raises:
         ScenarioError: the scenario or an override is not valid.
     """
-    return simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    log.warn_if_diverged()
+    return log
 
 
 def info(*files: str | Path) -> FileOverview:

@@ -15,7 +15,7 @@ from .law_channel import SentVector
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import tick_ns
-from .user_law import LawInput, PeerView, UserLaw, call_law, read_memory, restore_law
+from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_memory, restore_law
 from .vectors import Array, Row, RowArray
 
 
@@ -53,7 +53,7 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
     """Returns numbers by the names of the vectors that they are."""
     named, first = SimpleNamespace(), 0
     for vector in vectors:
-        setattr(named, vector.name, numbers[first : first + vector.length])
+        setattr(named, vector.name, LawVector(numbers[first : first + vector.length]))
         first += vector.length
     return named
 
@@ -119,7 +119,7 @@ class PlainLaw:
     def _read(self, k: int) -> LawInput:
         """Returns the input of tick k, after `update_law_view`."""
         setup = self._setup
-        columns = [column.tolist() for column in self._of_peers]
+        columns = list(map(LawVector.of, self._of_peers))
         received = () if self._received is None else self._received.tolist()
         sent, common, own = self._sent.tolist(), self._common, self._own
         return LawInput(
@@ -134,7 +134,7 @@ class PlainLaw:
                 _name_vectors(self._sends[True], sent[common + j * own :]) for j in range(len(columns[0]))
             ),
             to_all=_name_vectors(self._sends[False], sent),
-            **{name: view.tolist() for name, view in self._views.items()},
+            **{name: LawVector.of(view) for name, view in self._views.items()},
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:

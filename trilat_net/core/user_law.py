@@ -5,6 +5,7 @@ record of every tick, so a log resumes in the middle of a run.
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, Protocol
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import LawFailed
-from .vectors import Vector
+from .vectors import Array, Vector
 
 MAX_LAW_MEMORY = 1024
 """Most numbers of a law's memory, which is in the record of every tick."""
@@ -68,8 +69,54 @@ class PeerView(NamedTuple):
     tau_x: list[float]
 
 
+class LawVector(list[Any]):
+    """Numbers with arithmetic one by one: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`.
+
+    The other operand is a number or as many numbers; with an array the result is NumPy's, an array.
+    """
+
+    @classmethod
+    def of(cls, values: Array) -> "LawVector":
+        """Returns the numbers of an array; of a matrix its rows."""
+        return cls(values.tolist() if values.ndim == 1 else map(cls, values.tolist()))
+
+    def _each(self, operate: Callable[[Any, Any], Any], other: Any) -> Any:
+        if isinstance(other, Real):
+            return LawVector([operate(one, other) for one in self])
+        if isinstance(other, list | tuple):
+            return LawVector(map(operate, self, other)) if len(other) == len(self) else _refuse(self, other)
+        return NotImplemented
+
+    def __neg__(self) -> Any:
+        return LawVector(map(operator.neg, self))
+
+    def __add__(self, other: Any) -> Any:
+        return self._each(operator.add, other)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._each(operator.sub, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return (-self)._each(operator.add, other)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._each(operator.mul, other)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._each(operator.truediv, other)
+
+    __radd__ = __iadd__ = __add__
+    __rmul__ = __imul__ = __mul__
+
+
+def _refuse(one: Sequence[float], other: Sequence[float]) -> None:
+    raise ValueError(f"arithmetic of {len(one)} numbers with {len(other)}")
+
+
 class LawInput(NamedTuple):
     """The input of a law at a tick; a vector has one number per joint, or per coordinate that sites share.
+
+    In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken one by one.
 
     Attributes:
         k: the tick.
@@ -190,7 +237,9 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 
 def describe_failure(law: UserLaw, site: str, tick: int | None, error: BaseException) -> LawFailed:
     """Returns the failure of a law that raised."""
-    return _law_error(law, site, tick, _one_line(error))
+    problem = _one_line(error)
+    hint = "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
+    return _law_error(law, site, tick, problem + (hint if "LawVector" in problem else ""))
 
 
 def _flatten(value: Any) -> Iterator[float]:
@@ -213,11 +262,16 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
     return type(value)(_fill(one, numbers) for one in value)
 
 
+def list_remembered(law: Any) -> tuple[str, ...]:
+    """Returns the names of the attributes that a law remembers; none of one without memory."""
+    return tuple(getattr(law, "remembers", ()))
+
+
 def read_memory(law: Any) -> list[float]:
     """Returns the memory of a law: of the attributes that it remembers, or what it says itself."""
     if callable(getattr(law, "memory", None)):
         return [float(value) for value in law.memory()]
-    return [number for name in law.remembers for number in _flatten(getattr(law, name))]
+    return [number for name in list_remembered(law) for number in _flatten(getattr(law, name))]
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
@@ -226,7 +280,7 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
         law.recall(memory)
         return
     numbers = iter(memory)
-    for name in law.remembers:
+    for name in list_remembered(law):
         setattr(law, name, _fill(getattr(law, name), numbers))
 
 

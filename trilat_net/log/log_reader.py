@@ -14,7 +14,8 @@ longest delay of the link.
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
@@ -62,8 +63,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
-class Log(Result):
-    """A recorded session; `log["m1"]` is a site's part.
+class Log(Result, Mapping[str, SiteLog]):
+    """A recorded session, a mapping: `log["m1"]` is a site's part, `log.items()` has them by name.
 
     Args:
         contents: the contents of its file, or of its files together.
@@ -103,6 +104,7 @@ class Log(Result):
             records = sum(len(self[name]) for name in self.sites)
             missing = sum(map(self.missing, self.sites)) or "none"
             holds = f"{seconds:.3f} s, {records} records, {missing} missing"
+            holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
         except LogError:
             holds = "with records that cannot be read"
         kind = f"{self.driver} session {self.session['session']} of {', '.join(self.sites)}"
@@ -142,6 +144,15 @@ class Log(Result):
             UsageError: pandas is not installed.
         """
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
+
+    __eq__ = object.__eq__  # logs are not compared record by record
+    __hash__ = object.__hash__
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.sites)
+
+    def __len__(self) -> int:
+        return len(self.sites)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.sites)
@@ -190,6 +201,17 @@ class Log(Result):
     def driver(self) -> str:
         """Driver of the session: "live" or "virtual"."""
         return self.session["driver"]
+
+    @cached_property
+    def diverged_s(self) -> float | None:
+        """When the first site left its limits, s, which ended the run; None if none did."""
+        return min((at_s for part in self.values() if (at_s := part.diverged_s) is not None), default=None)
+
+    def warn_if_diverged(self) -> None:
+        """Warns the caller of the caller, in Python, of a run that diverged."""
+        if self.diverged_s is not None:
+            text = f"the run diverged at {self.diverged_s:.3f} s: a joint passed its qd_limit_rad_s, and it ended there"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
 
     @cached_property
     def complete(self) -> bool:

@@ -8,7 +8,9 @@ the package that contains it; building a site imports it, and only if that file 
 import ast
 import hashlib
 import importlib
+import inspect
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
@@ -171,11 +173,18 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
     `needs_theta = True`.
     """
     path = f"sites.{context.site}.control.law"
-    methods = ("torque",) if hasattr(kind, "remembers") else ("torque", "memory", "recall")
+    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(kind, "remembers")
+    methods = ("torque", "memory", "recall") if keeps else ("torque",)
     missing = [name for name in methods if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(
             f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}", path=path
+        )
+    if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
+        raise ScenarioError(
+            f"{code} writes self.{written[0]}: if torque needs that at the next tick, remembers = ({written[0]!r},) "
+            f"in the class, else remembers = (); see {find_page('own-controller.md')}",
+            path=path,
         )
     stated = getattr(kind, "sites", None)
     ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
@@ -194,6 +203,20 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
             "and leave known out, or choose a law that learns them",
             path=path,
         )
+
+
+def _find_written(kind: Any) -> list[str]:
+    """Returns what a class writes of itself after `__init__`; changes by calls, as of append, are not seen."""
+    methods = [one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)]
+    found: dict[str, None] = {}
+    for method in (one for one in methods if one.__name__ != "__init__"):
+        for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(method)))):
+            place: Any = node if isinstance(getattr(node, "ctx", None), ast.Store) else None
+            while isinstance(place, ast.Subscript) or isinstance(getattr(place, "value", None), ast.Attribute):
+                place = place.value
+            if isinstance(place, ast.Attribute) and getattr(place.value, "id", "") == "self":
+                found[place.attr] = None
+    return [*found]
 
 
 def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
