@@ -82,11 +82,6 @@ class _Child:
         return f"{self.name} ended with code {code}: {last}"
 
 
-def demo_session_name(scenario: Scenario) -> str:
-    """Returns the name of a demo's session, for `trilat set` and `trilat ping`."""
-    return f"{scenario.name}-demo"
-
-
 SessionAttendant = Callable[[str, Sequence[str]], AbstractContextManager[Callable[[], bool]]]
 """Given a session's name and the endpoints of its sites, a context that lasts as long as the session; what it
 yields returns true once the session is to end."""
@@ -95,14 +90,16 @@ yields returns true once the session is to end."""
 def run_demo(
     scenario: Scenario, folder: Path, display: SessionDisplay, attend: SessionAttendant | None = None
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder; its log is valid whenever the session began.
+    """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
+
+    Its log is valid whenever the session began.
 
     Raises:
         ScenarioError: an arm outside of the program lacks limits.
     """
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
-    session, clock = demo_session_name(scenario), SystemClock()
+    session, clock = scenario.name, SystemClock()
     with Interrupt() as interrupt, ExitStack() as reserved:
         layouts = {arm.counts: name for name, arm in scenario.arms.items()}
         chains = any(arm.chain is not None for arm in scenario.arms.values())

@@ -22,7 +22,7 @@ def demo_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
-    from sites.demo_session import demo_session_name, run_demo
+    from sites.demo_session import run_demo
     from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
@@ -31,7 +31,7 @@ def demo_command(
     results = make_results_folder(folder, chosen.name, force=force)
     with terminal.lines_aside(as_json):
         terminal.print_text(chosen.title or chosen.name)
-        members = f"{', '.join(chosen.names)} and a recorder, session {demo_session_name(chosen)}"
+        members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
         with SessionDisplay(chosen, terminal.out) as display:
             outcome = run_demo(chosen, results, display)

@@ -97,7 +97,7 @@ InsecureOption = Annotated[
 
 
 MOST_LETTERS = 80
-"""Of a session's name: that of a scenario has 64, and that of its demo some more."""
+"""Of a session's name; a scenario's has 64 at most."""
 
 
 def check_session_name(name: str) -> str:

@@ -47,6 +47,37 @@ class LawContext(NamedTuple):
     peers: tuple[str, ...] = ()
 
 
+def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
+    def compute(numbers: "LawVector", other: Any) -> Any:
+        if isinstance(other, Real):
+            return LawVector([operate(one, other) for one in numbers])
+        if not isinstance(other, list | tuple):
+            return NotImplemented  # an array's own arithmetic, and its array
+        if len(other) != len(numbers):
+            raise ValueError(f"arithmetic of {len(numbers)} numbers with {len(other)}")
+        return LawVector(map(operate, numbers, other))
+
+    return compute
+
+
+class LawVector(list[Any]):
+    """Numbers with arithmetic one by one: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
+
+    __add__ = __radd__ = __iadd__ = _by_number(operator.add)
+    __sub__ = _by_number(operator.sub)
+    __rsub__ = _by_number(lambda own, first: first - own)
+    __mul__ = __rmul__ = __imul__ = _by_number(operator.mul)
+    __truediv__ = _by_number(operator.truediv)
+
+    def __neg__(self) -> "LawVector":
+        return LawVector(map(operator.neg, self))
+
+    @classmethod
+    def of(cls, values: Array) -> "LawVector":
+        """Returns the numbers of an array; of a matrix its rows."""
+        return cls(values.tolist() if values.ndim == 1 else map(cls, values.tolist()))
+
+
 class PeerView(NamedTuple):
     """A peer as a law sees it at a tick: its sample in use, or its start pose at rest.
 
@@ -64,53 +95,9 @@ class PeerView(NamedTuple):
     tick: int
     age_s: float
     new: int
-    q: list[float]
-    qd: list[float]
-    tau_x: list[float]
-
-
-class LawVector(list[Any]):
-    """Numbers with arithmetic one by one: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`.
-
-    The other operand is a number or as many numbers; with an array the result is NumPy's, an array.
-    """
-
-    @classmethod
-    def of(cls, values: Array) -> "LawVector":
-        """Returns the numbers of an array; of a matrix its rows."""
-        return cls(values.tolist() if values.ndim == 1 else map(cls, values.tolist()))
-
-    def _each(self, operate: Callable[[Any, Any], Any], other: Any) -> Any:
-        if isinstance(other, Real):
-            return LawVector([operate(one, other) for one in self])
-        if isinstance(other, list | tuple):
-            return LawVector(map(operate, self, other)) if len(other) == len(self) else _refuse(self, other)
-        return NotImplemented
-
-    def __neg__(self) -> Any:
-        return LawVector(map(operator.neg, self))
-
-    def __add__(self, other: Any) -> Any:
-        return self._each(operator.add, other)
-
-    def __sub__(self, other: Any) -> Any:
-        return self._each(operator.sub, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return (-self)._each(operator.add, other)
-
-    def __mul__(self, other: Any) -> Any:
-        return self._each(operator.mul, other)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._each(operator.truediv, other)
-
-    __radd__ = __iadd__ = __add__
-    __rmul__ = __imul__ = __mul__
-
-
-def _refuse(one: Sequence[float], other: Sequence[float]) -> None:
-    raise ValueError(f"arithmetic of {len(one)} numbers with {len(other)}")
+    q: LawVector
+    qd: LawVector
+    tau_x: LawVector
 
 
 class LawInput(NamedTuple):
@@ -147,11 +134,11 @@ class LawInput(NamedTuple):
     k: int
     t_s: float
     h_s: float
-    q: list[float]
-    qd: list[float]
-    q_des: list[float]
-    qd_des: list[float]
-    felt: list[float]
+    q: LawVector
+    qd: LawVector
+    q_des: LawVector
+    qd_des: LawVector
+    felt: LawVector
     joints: int = 2
     coordinates: int = 2
     tau: Any = ()
@@ -159,13 +146,13 @@ class LawInput(NamedTuple):
     received: Sequence[Any] = ()
     sent: Sequence[Any] = ()
     to_all: Any = None
-    tau_x: Sequence[float] = ()
-    tau_before: Sequence[float] = ()
-    q_before: Sequence[float] = ()
-    gravity: Sequence[float] = ()
+    tau_x: LawVector = LawVector()
+    tau_before: LawVector = LawVector()
+    q_before: LawVector = LawVector()
+    gravity: LawVector = LawVector()
     theta_hat: Any = ()
-    inertia: Sequence[Sequence[float]] = ()
-    bias: Sequence[float] = ()
+    inertia: LawVector = LawVector()
+    bias: LawVector = LawVector()
 
 
 class UserLaw(Protocol):

@@ -27,7 +27,7 @@ import numpy as np
 
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
-from ..errors import LogError, ScenarioError, WireError
+from ..errors import LogError, ScenarioError, UnknownName, WireError
 from ..files import open_regular
 from ..net import topics
 from ..net.message_numbers import count_under_way
@@ -210,8 +210,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def warn_if_diverged(self) -> None:
         """Warns the caller of the caller, in Python, of a run that diverged."""
         if self.diverged_s is not None:
-            text = f"the run diverged at {self.diverged_s:.3f} s: a joint passed its qd_limit_rad_s, and it ended there"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
+            when = f"the run diverged at {self.diverged_s:.3f} s, and ends there"
+            warnings.warn(f"{when}: a joint passed its qd_limit_rad_s", RuntimeWarning, stacklevel=3)
 
     @cached_property
     def complete(self) -> bool:
@@ -362,7 +362,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
-            raise KeyError(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
+            raise UnknownName(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
@@ -439,7 +439,7 @@ class Log(Result, Mapping[str, SiteLog]):
                 sample that came in).
 
         Raises:
-            KeyError: there is no such part.
+            UnknownName: there is no such part.
             LogError: its messages cannot be read.
         """
         if name == EVENTS_TABLE and name not in self.sites:
@@ -455,7 +455,7 @@ class Log(Result, Mapping[str, SiteLog]):
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":
                 return build_arrivals_table(site, self.source, live=self.driver == "live")
-        raise KeyError(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
+        raise UnknownName(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
 
     def tables(self) -> Iterator[Table]:
         """Yields every table, one at a time: of each site, and the events."""
@@ -498,8 +498,10 @@ def open_log(
             if isinstance(one, str | Path):
                 with _reading(str(one)):
                     files.append((stack.enter_context(open_regular(Path(one))), str(one)))
-            else:
+            elif hasattr(one, "seek"):
                 files.append((one, "log"))
+            else:
+                raise LogError(f"a log is a path, or a file opened for reading, not {one!r:.80}")
         sizes = [_measure(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
             with _reading(name):

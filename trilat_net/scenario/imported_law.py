@@ -9,6 +9,7 @@ import ast
 import hashlib
 import importlib
 import inspect
+import re
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -182,8 +183,8 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
         )
     if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
         raise ScenarioError(
-            f"{code} writes self.{written[0]}: if torque needs that at the next tick, remembers = ({written[0]!r},) "
-            f"in the class, else remembers = (); see {find_page('own-controller.md')}",
+            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its class has "
+            f"remembers = ({written[0]!r},), else remembers = (); see {find_page('own-controller.md')}",
             path=path,
         )
     stated = getattr(kind, "sites", None)
@@ -206,17 +207,12 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
 
 
 def _find_written(kind: Any) -> list[str]:
-    """Returns what a class writes of itself after `__init__`; changes by calls, as of append, are not seen."""
+    """Returns what a class writes of itself after `__init__`, unless by calls, as of append."""
     methods = [one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)]
-    found: dict[str, None] = {}
-    for method in (one for one in methods if one.__name__ != "__init__"):
-        for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(method)))):
-            place: Any = node if isinstance(getattr(node, "ctx", None), ast.Store) else None
-            while isinstance(place, ast.Subscript) or isinstance(getattr(place, "value", None), ast.Attribute):
-                place = place.value
-            if isinstance(place, ast.Attribute) and getattr(place.value, "id", "") == "self":
-                found[place.attr] = None
-    return [*found]
+    sources = [textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"]
+    nodes = (node for text in sources for node in ast.walk(ast.parse(text)))
+    written = [ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)]
+    return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
 
 
 def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
@@ -303,12 +299,12 @@ def name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Returns a value of a scenario with every class in it by its name, see `name_law_class`."""
+    """Returns a value of a scenario as plain ones: classes by `name_law_class`, NumPy's as numbers."""
     if isinstance(value, type):
         return name_law_class(value)
     if isinstance(value, Mapping):
-        return {key: name_law_classes(one) for key, one in value.items()}
-    return value
+        return {str(key): name_law_classes(one) for key, one in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 @contextmanager

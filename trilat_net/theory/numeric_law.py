@@ -152,4 +152,5 @@ def _name_memory(law: Any, count: int) -> tuple[str, ...]:
     """Returns the names of what a law remembers."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
-    return tuple(f"{name}[{n + 1}]" for name in list_remembered(law) for n in range(np.size(getattr(law, name))))
+    sizes = {name: np.size(getattr(law, name)) for name in list_remembered(law)}
+    return tuple(f"{name}[{n + 1}]" for name, size in sizes.items() for n in range(size))
