@@ -118,10 +118,10 @@ def run_demo(
         attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints)
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
-                monitor = SessionMonitor(bus, session, scenario.names)
+                monitor = SessionMonitor(bus, session, scenario)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, recorder], result)):
                     monitor.poll()
-                    display.update(monitor.latest)
+                    display.update(monitor)
                     for text in monitor.take_news():
                         display.say(text)
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)

@@ -211,8 +211,10 @@ def compare(*logs: AnyLog) -> "LogComparison":
     return compare_logs([_open(log) for log in logs])
 
 
-def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -> "Conclusion":
-    """Writes the figures, the page and the summary of a log in a file; the command is `trilat report`.
+def report(
+    log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
+) -> "Conclusion":
+    """Writes the page and the summary of a log in a file; the command is `trilat report`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
@@ -222,6 +224,7 @@ def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -
         log: the log's path, or the log that was opened from it.
         out: the folder; by default the file's name without .mcap.
         force: whether the folder may hold something already.
+        png: whether every figure is written as a PNG file too.
 
     Raises:
         UsageError: the folder holds something, or the log is in no file.
@@ -233,7 +236,7 @@ def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -
     if not first.is_file():
         raise UsageError("a report is of a log in a file: save it first, as in log.save('run.mcap')")
     folder = first.with_suffix("") if out is None else Path(out)
-    return conclude(opened, make_results_folder(folder, "", force=force))
+    return conclude(opened, make_results_folder(folder, "", force=force), png=png)
 
 
 def linear(

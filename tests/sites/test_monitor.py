@@ -24,7 +24,7 @@ STATISTICS = LoopStats(SITE, 1, [1000, 1000]).take(SITE.step(TickInput(0)))
 @pytest.mark.parametrize("terminal", [False, True])
 def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     network = LocalNetwork()
-    watch = SessionMonitor(network.join(), "t", SCENARIO.names)
+    watch = SessionMonitor(network.join(), "t", SCENARIO)
     stranger = network.join()
 
     def say(member: str, channel: str, payload: bytes) -> None:
@@ -33,6 +33,7 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     for junk in (b"", b"\xc1", bytes(70_000)):
         say("m1", topics.LINK, junk)
         say("m1", topics.EVENT, junk)
+        say("m1", topics.STATE, junk)
     say("m1", topics.LINK, encode(msgspec.structs.replace(STATISTICS, mode="[/red]\x1b[7mX")))
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
     say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
@@ -41,7 +42,7 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
         watch.poll()
         assert list(watch.latest) == ["m1"]
         for _ in range(LINE_EVERY):
-            display.update(watch.latest)
+            display.update(watch)
         for sentence in watch.take_news():
             display.say(sentence)
     assert watch.take_news() == []

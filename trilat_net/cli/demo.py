@@ -19,6 +19,7 @@ def demo_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,
+    png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
@@ -43,6 +44,6 @@ def demo_command(
         raise typer.Exit(128 + outcome.interrupted)
     if not outcome.log.exists():
         raise typer.Exit(outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)

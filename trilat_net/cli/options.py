@@ -195,6 +195,7 @@ MinCoverageOption = Annotated[
 ]
 MIN_COVERAGE = 0.999
 """As in `log.integrity`, which takes long to import."""
+PngOption = Annotated[bool, typer.Option("--png", help="Write every figure as a PNG file too.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 

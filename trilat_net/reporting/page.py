@@ -68,8 +68,9 @@ def write_report(
     certificate: Certificate | None = None,
     verdicts: Iterable[CheckLine] = (),
     progress: Progress | None = None,
+    png: bool = False,
 ) -> list[Path]:
-    """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
+    """Writes report.html and summary.json, with `png` also a PNG per figure; returns their paths so.
 
     Figures are drawn before the verdicts are read, which may still be in the making. Without a certificate
     the page has no section of it, and without `twin`, the same experiment without operators, no motion due to
@@ -77,11 +78,13 @@ def write_report(
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
-    figures = write_report_figures(log, folder, twin, progress)
-    section = ""
+    figures = write_report_figures(log, folder, twin, progress) if png else []
+    section = verdict = ""
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
-        section = page_tables.render_certificate(certificate)
+        section, verdict = (
+            render(certificate) for render in (page_tables.render_certificate, page_tables.render_verdict)
+        )
         pictures = {}
         if certificate.balance is not None:
             pictures["certificate"] = "V and energies", draw_functional(log, certificate)
@@ -89,8 +92,9 @@ def write_report(
             drawn = draw_observed_energy(log, certificate.observed)
             pictures["observed_energy"] = "energies that the laws declare", drawn
         for name, (words, drawn) in pictures.items():
-            figures.append(folder / f"{name}.png")
-            style.write_figure(drawn, figures[-1], style.REPORT_DPI)
+            if png:
+                figures.append(folder / f"{name}.png")
+                style.write_figure(drawn, figures[-1], style.REPORT_DPI)
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
             data = base64.b64encode(stream.getvalue()).decode()
@@ -99,15 +103,23 @@ def write_report(
     lines = list(verdicts)
     facts["checks"] = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    write_whole(page, render_report(log, twin, lines, facts, section))
+    write_whole(page, render_report(log, twin, lines, facts, section, verdict))
     write_whole(numbers, _json(facts, indent=2) + "\n")
     return [page, numbers, *figures]
 
 
 def render_report(
-    log: Log, twin: Log | None, verdicts: Sequence[CheckLine], facts: JsonObject, certificate: str = ""
+    log: Log,
+    twin: Log | None,
+    verdicts: Sequence[CheckLine],
+    facts: JsonObject,
+    certificate: str = "",
+    verdict: str = "",
 ) -> str:
-    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML."""
+    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML.
+
+    The page begins with `verdict`, as HTML too.
+    """
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
     factor = charts.picture_scale(log, bounds)
@@ -119,7 +131,7 @@ def render_report(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
         about=page_tables.render_description(scenario),
-        verdicts=page_tables.render_alarms(log) + page_tables.render_check_lines(verdicts),
+        verdicts=verdict + page_tables.render_alarms(log) + page_tables.render_check_lines(verdicts),
         facts=page_tables.render_run_facts(log, facts),
         sites=page_tables.render_sites(log, facts),
         loops=page_tables.render_loops(log, facts),
