@@ -97,6 +97,7 @@ def conclude(
         RunFailed: the process that executes the log was ended.
     """
     # Matplotlib takes a second, and `verify` needs none of it
+    from .figures.registry import write_report_figures
     from .page import write_report
 
     lines: list[CheckLine] = []
@@ -113,13 +114,12 @@ def conclude(
                 raise RunFailed("the process that executes the log again was ended; try again") from None
             yield from lines
 
-        made = write_report(
-            log, folder, twin=twin, certificate=certificate, verdicts=verdicts(), progress=progress, png=png
-        )
+        figures = write_report_figures(log, folder, twin, progress) if png else []
+        made = write_report(log, folder, twin=twin, certificate=certificate, verdicts=verdicts())
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
     return Conclusion(
-        describe_certificate(certificate)[0], table, notes, lines, [*map(Path, log.sources), *made]
+        describe_certificate(certificate)[0], table, notes, lines, [*map(Path, log.sources), *made, *figures]
     )
 
 

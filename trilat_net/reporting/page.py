@@ -1,4 +1,4 @@
-"""Write the report of a log: `report.html`, `summary.json` and the figures.
+"""Write the report of a log: `report.html` and `summary.json`.
 
 Invariant: the page is one file with images, styles and scripts inside; it loads nothing from a network.
 """
@@ -19,12 +19,11 @@ from ..analysis.run_summary import summarise_run
 from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
 from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from . import charts, page_tables, style
+from . import charts, page_tables
 from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.loop_timing import explain_missing_loop_times
-from .figures.registry import explain_absent_operator, write_report_figures
+from .figures.registry import explain_absent_operator
 from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 
 _PAGE_DPI = 110
@@ -67,34 +66,27 @@ def write_report(
     twin: Log | None = None,
     certificate: Certificate | None = None,
     verdicts: Iterable[CheckLine] = (),
-    progress: Progress | None = None,
-    png: bool = False,
 ) -> list[Path]:
-    """Writes report.html and summary.json, with `png` also a PNG per figure; returns their paths so.
+    """Writes report.html and summary.json, and returns their paths.
 
-    Figures are drawn before the verdicts are read, which may still be in the making. Without a certificate
-    the page has no section of it, and without `twin`, the same experiment without operators, no motion due to
-    them. `progress` is called with the number of figures that are drawn, and of all.
+    Charts are made before the verdicts are read, which may still be in the making. Without a certificate the
+    page has no section of it, and without `twin`, the same experiment without operators, no motion due to
+    them.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
-    figures = write_report_figures(log, folder, twin, progress) if png else []
     section = verdict = ""
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
-        section, verdict = (
-            render(certificate) for render in (page_tables.render_certificate, page_tables.render_verdict)
-        )
-        pictures = {}
+        section = page_tables.render_certificate(certificate)
+        verdict = page_tables.render_verdict(certificate)
+        pictures = []
         if certificate.balance is not None:
-            pictures["certificate"] = "V and energies", draw_functional(log, certificate)
+            pictures.append(("V and energies", draw_functional(log, certificate)))
         if certificate.observed is not None and certificate.observed.curves:
             drawn = draw_observed_energy(log, certificate.observed)
-            pictures["observed_energy"] = "energies that the laws declare", drawn
-        for name, (words, drawn) in pictures.items():
-            if png:
-                figures.append(folder / f"{name}.png")
-                style.write_figure(drawn, figures[-1], style.REPORT_DPI)
+            pictures.append(("energies that the laws declare", drawn))
+        for words, drawn in pictures:
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
             data = base64.b64encode(stream.getvalue()).decode()
@@ -105,7 +97,7 @@ def write_report(
     page, numbers = folder / "report.html", folder / "summary.json"
     write_whole(page, render_report(log, twin, lines, facts, section, verdict))
     write_whole(numbers, _json(facts, indent=2) + "\n")
-    return [page, numbers, *figures]
+    return [page, numbers]
 
 
 def render_report(
