@@ -47,7 +47,7 @@ class Conclusion(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
-        yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], self.verdict.text)
+        yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
         for line in self.lines:
             mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
             yield MarkedText(mark, f"{line.label}: {line.text}")

@@ -36,7 +36,7 @@ def render_verdict(certificate: Certificate) -> str:
     """Returns the judgement of a run, as the first of its verdicts."""
     mark, text = describe_certificate(certificate)[0]
     kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
-    return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>{escape(text)}</li></ul>'
+    return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li></ul>'
 
 
 def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
