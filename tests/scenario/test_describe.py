@@ -72,3 +72,9 @@ def test_it_says_how_often_a_site_will_hold_and_it_holds_so_often() -> None:
     entered = int(np.count_nonzero((modes[1:] == "hold") & (modes[:-1] != "hold")))
     assert entered > 3
     assert f"will hold {10 * entered:.3g} times a minute" in line
+
+
+def test_of_a_site_that_never_holds_it_says_nothing() -> None:
+    glide = load_scenario("two_sites", {"on_stale.action": "glide", "duration_s": 2.0})
+    assert not [line for line in describe_scenario(glide) if "times a minute" in line]
+    assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))

@@ -164,7 +164,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
 @pytest.mark.parametrize(
     ("laws", "words"),
     [
-        (["p_dd"], ("--law", "no law 'p_dd'", "did you mean 'p_d'?")),
+        (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
         (["mine.laws:Law"], ("no module mine.laws",)),
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
@@ -260,8 +260,8 @@ def test_a_range_of_very_many_values_takes_no_room() -> None:
         ("a=1,2,1", ("has 1 twice",)),
         ("a=0,0x0", ("has 0x0 twice",)),
         ("a=1,1.0", ("has 1.0 twice",)),
-        ("seed=1:9:1", ("--seeds 1..20",)),
-        ("duration_s=1,2", ("--longest",)),
+        ("seed=1:9:1", ("seeds=1..20",)),
+        ("duration_s=1,2", ("longest_s",)),
     ],
 )
 def test_what_makes_no_axis_is_refused_with_what_would_be_right(text: str, words: tuple[str, ...]) -> None:
