@@ -103,16 +103,7 @@ class SessionDisplay:
 
     def _table(self, monitor: SessionMonitor) -> Table:
         table = Table(title=f"{self._scenario.name}, {self._scenario.duration_s:g} s", title_justify="left")
-        for column in (
-            "site",
-            "mode",
-            "time",
-            "|e|",
-            "torque",
-            "late now",
-            "overruns",
-            "age of each peer's sample",
-        ):
+        for column in ("site", "mode", "time", "|e|", "torque", "late", "overruns", "age of peers' samples"):
             table.add_column(column, justify="left" if column[:3] in ("sit", "mod", "age") else "right")
         for name in self._scenario.names:
             stats, motion = monitor.latest.get(name), monitor.motion.get(name, ("", ""))

@@ -236,9 +236,8 @@ def test_an_error_names_arguments_and_whole_commands() -> None:
 def test_numbers_of_numpy_are_numbers() -> None:
     keys = {"control.Kd": np.array([5.0, 5.0]), "control.Kp": np.float64(2.0), "seed": np.int64(3)}
     same = {"control.Kd": 5.0, "control.Kp": 2.0, "seed": 3, "duration_s": 0.5}
-    assert tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5)) == tn.load_scenario(
-        "two_sites", same
-    )
+    given = tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5))
+    assert given == tn.load_scenario("two_sites", same)
 
 
 def test_without_pandas_an_error_says_what_to_install(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

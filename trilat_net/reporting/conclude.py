@@ -73,13 +73,8 @@ class Conclusion(Result):
         """Returns plain values, with the keys of `trilat report --json`."""
         checks = [line._asdict() for line in self.lines]
         paths = [str(path) for path in self.paths]
-        return {
-            "passed": self.passed,
-            "verdict": self.verdict.text,
-            "notes": self.notes,
-            "checks": checks,
-            "paths": paths,
-        }
+        found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
+        return {**found, "checks": checks, "paths": paths}
 
 
 def conclude(
@@ -118,9 +113,8 @@ def conclude(
         made = write_report(log, folder, twin=twin, certificate=certificate, verdicts=verdicts())
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
-    return Conclusion(
-        describe_certificate(certificate)[0], table, notes, lines, [*map(Path, log.sources), *made, *figures]
-    )
+    paths = [*map(Path, log.sources), *made, *figures]
+    return Conclusion(describe_certificate(certificate)[0], table, notes, lines, paths)
 
 
 def _run_without_operators(log: Log) -> Log | None:
