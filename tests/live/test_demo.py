@@ -114,7 +114,7 @@ def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Sta
     assert log.complete
     assert verify(log).identical == 1000
     words = next(line for line in running.text().splitlines() if "drawn later: " in line)
-    assert f"the log is whole: {log.source}" in words
+    assert f"the log is kept: {log.source}" in words
     later = shlex.split(words.partition("drawn later: trilat ")[2])
     done = trilat(*later, cwd=stage.folder)
     assert (done.code, (stage.folder / "out" / "report.html").exists()) == (0, True), done

@@ -154,7 +154,7 @@ def conclude_files(
     except KeyboardInterrupt:
         files = shlex.join(map(str, paths))
         later = f"trilat report {files} -o {shlex.quote(str(folder))} --force"
-        print_note(f"the log is whole: {files}; its report can be drawn later: {later}")
+        print_note(f"the log is kept: {files}; its report can be drawn later: {later}")
         raise
     print_result(conclusion, as_json=as_json)
     return log, conclusion
