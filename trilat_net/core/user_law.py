@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import LawFailed
-from .vectors import Array, Vector
+from .vectors import Vector
 
 MAX_LAW_MEMORY = 1024
 """Most numbers of a law's memory, which is in the record of every tick."""
@@ -71,11 +71,6 @@ class LawVector(list[Any]):
 
     def __neg__(self) -> "LawVector":
         return LawVector(map(operator.neg, self))
-
-    @classmethod
-    def of(cls, values: Array) -> "LawVector":
-        """Returns the numbers of an array; of a matrix its rows."""
-        return cls(values.tolist() if values.ndim == 1 else map(cls, values.tolist()))
 
 
 class PeerView(NamedTuple):
