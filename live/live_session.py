@@ -9,7 +9,7 @@ import socket
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 
 from sites.demo_session import SessionAttendant
@@ -82,10 +82,12 @@ def serve_page(
     bus: Bus, clock: Clock, session: str, options: PageOptions, say: Callable[[str], None], *, ends: bool
 ) -> Iterator[PageServer]:
     """Serves a page inside the block, and opens a browser at it."""
-    with PageServer(bus, clock, session, host=options.host, port=options.port, ends=ends) as page:
+    host, port = options.host, options.port
+    with PageServer(bus, clock, session, host=host, port=port, ends=ends, say=say) as page:
         say(f"the page: {page.address}")
-        if options.opens and _has_browser():
-            webbrowser.open(page.address)
+        with suppress(OSError, webbrowser.Error):
+            if options.opens and _has_browser():
+                webbrowser.open(page.address)
         yield page
         for reason, count in sorted(page.refused.items()):
             say(f"the page refused {count} messages or requests: {reason}")

@@ -1,13 +1,14 @@
 """What a page may ask for: its messages, checked, and how they reach the sites.
 
-Invariant: a message is one of the types below with finite numbers in range, or it is counted and dropped.
-What a site takes in is for the site to decide. Of a link or a row only the newest order waits, however often
-it is changed, and one question to a site is open at a time.
+Invariant: a message is one of the types below with finite numbers in range and names of the session, and
+comes no oftener than its kind may, or it is counted and dropped. What a site takes in is for the site to
+decide. Of a link or a row only the newest order waits, however often it is changed, and one question to a
+site is open at a time, besides that to stop.
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -47,6 +48,17 @@ class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
     want: bool
 
 
+class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
+    """A page that holds an arm lets another one take part, or not."""
+
+    page: Annotated[int, Meta(ge=0, lt=2**53)]
+    yes: bool
+
+
+class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
+    """Every arm is to stop, while the session goes on."""
+
+
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
     """New values of a link, as `trilat set` takes them."""
 
@@ -84,7 +96,35 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
 
 
 Order = SetLink | SetShares
-_DECODER = msgspec.json.Decoder(Seen | TakePart | SetLink | SetShares | MoveHand | MarkMoment | EndSession)
+_DECODER = msgspec.json.Decoder(
+    Seen | TakePart | AnswerPage | StopArms | SetLink | SetShares | MoveHand | MarkMoment | EndSession
+)
+_RATES: dict[type[PageMessage], tuple[float, int]] = {
+    PageMessage: (240.0, 480),
+    MoveHand: (200.0, 400),
+    MarkMoment: (2.0, 10),
+    TakePart: (1.0, 5),
+    AnswerPage: (1.0, 5),
+    StopArms: (5.0, 10),
+}
+"""Messages of a kind, and of all, that a page may send on average, 1/s, and at once."""
+
+
+class MessageLimits:
+    """What a page may still send: of each kind with a rate, and of all, a bucket that fills at that rate."""
+
+    def __init__(self) -> None:
+        self._buckets = {kind: (float(burst), 0) for kind, (_, burst) in _RATES.items()}
+
+    def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
+        """True if a message of a kind may come now; one more has come then."""
+        if kind not in _RATES:
+            return True
+        rate, burst = _RATES[kind]
+        left, filled_ns = self._buckets[kind]
+        left = min(left + (now_ns - filled_ns) * 1e-9 * rate, burst) if filled_ns else left
+        self._buckets[kind] = left - (left >= 1.0), now_ns
+        return left >= 1.0
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
@@ -163,23 +203,33 @@ class OrderDesk:
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
         self._bus, self._clock, self._session = bus, clock, session
         self._waiting: dict[tuple[str, str], ChangeRequest] = {}
-        self._open: dict[str, tuple[Inbox, int]] = {}
+        self._open: dict[tuple[str, str], tuple[Inbox, int]] = {}
         self.replies: list[tuple[str, bool, str]] = []
         self.refused: Counter[str] = Counter()
 
-    def order(self, order: Order) -> None:
-        """Takes an order; it replaces the one for the same link or row that waits."""
+    def order(self, order: Order, sites: Collection[str], links: Collection[str]) -> None:
+        """Takes an order, if the session has the site or the link; it replaces one that waits for that."""
+        known = order.link in links if isinstance(order, SetLink) else order.site in sites
+        if not known:
+            self.refused["no such link" if isinstance(order, SetLink) else "no such site"] += 1
+            return
         if isinstance(order, SetLink):
             site, request = order.link.partition("->")[2], _link_request(order)
         else:
             site = order.site
             shares: dict[str, Any] = dict(order.to)
             request = ChangeRequest(dominance=site, to=shares, ramp_s=LEAST_RAMP_S)
-        if not site or "/" in site or "*" in site:
-            self.refused["no such site"] += 1
-            return
         if len(self._waiting) < MOST_WAITING:
             self._waiting[site, request.link] = request
+
+    def stop(self, sites: Iterable[str]) -> None:
+        """Orders sites to stop, at once, whatever they have been asked before."""
+        for site in sites:
+            self._ask(site, topics.STOP, ChangeRequest(order="stop"))
+
+    def _ask(self, site: str, channel: str, request: ChangeRequest) -> None:
+        inbox = self._bus.ask(topics.key(self._session, site, channel), encode(request))
+        self._open[site, channel] = inbox, self._clock.monotonic_ns()
 
     def mark(self, site: str, text: str) -> None:
         """Asks a site to mark this moment in the log."""
@@ -189,29 +239,28 @@ class OrderDesk:
     def poll(self) -> None:
         """Asks the sites, one question each at a time, and reads their answers."""
         now_ns = self._clock.monotonic_ns()
-        for site, (inbox, asked_ns) in list(self._open.items()):
+        for (site, channel), (inbox, asked_ns) in list(self._open.items()):
             if (answer := inbox.poll()) is not None:
-                del self._open[site]
+                del self._open[site, channel]
                 try:
                     reply = decode(answer[1], ChangeReply)
                     self.replies.append((site, reply.accepted, reply.text))
                 except WireError as error:
                     self.refused[error.reason] += 1
             elif now_ns - asked_ns > REPLY_TIMEOUT_NS:
-                del self._open[site]
+                del self._open[site, channel]
                 self.replies.append((site, False, f"{site} does not answer"))
         for (site, what), request in list(self._waiting.items()):
-            if site not in self._open:
+            if (site, topics.SET) not in self._open:
                 del self._waiting[site, what]
-                inbox = self._bus.ask(topics.key(self._session, site, topics.SET), encode(request))
-                self._open[site] = inbox, now_ns
+                self._ask(site, topics.SET, request)
 
 
 def _link_request(order: SetLink) -> ChangeRequest:
     """Returns the request of a link: constant delay, or one that jitters; or a preset."""
     to: dict[str, Any] = dict(order.to)
     if "preset" not in to and "delay_ms" in to:
-        jitters = to.get("deviation_ms", 0.0) > 0.0 and to["delay_ms"] > 0.0
+        jitters = all(str(to.get(key, 0.0)) not in ("0.0", "-0.0") for key in ("deviation_ms", "delay_ms"))
         to["model"] = "gamma" if jitters else "constant"
         if not jitters:
             to.pop("deviation_ms", None)

@@ -8,6 +8,7 @@ in the session's messages.
 
 import asyncio
 import hmac
+import logging
 import secrets
 import threading
 from collections import Counter, deque
@@ -21,7 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.http11 import Request, Response
 
 from trilat_net.errors import UsageError, WireError
@@ -30,8 +31,10 @@ from trilat_net.net.clock import Clock
 
 from .page_orders import (
     MAX_MESSAGE_BYTES,
+    AnswerPage,
     EndSession,
     MarkMoment,
+    MessageLimits,
     MoveHand,
     OrderDesk,
     PageHands,
@@ -39,6 +42,7 @@ from .page_orders import (
     Seen,
     SetLink,
     SetShares,
+    StopArms,
     TakePart,
     read_page_message,
 )
@@ -48,17 +52,23 @@ from .session_view import SessionView
 FRAMES_PER_S = 30
 FRAMES_AHEAD = 2
 """Frames that a page may have got and not drawn yet: one is on its way while it draws the other."""
-MESSAGES_PER_S = 240
-"""Messages that a page may send on average; one that sends many more is closed."""
-BURST = 480
 MOST_EXCESS = 1_000
+"""A page that sends so many more messages than it may is closed."""
 MOST_PAGES = 16
+ANSWER_NS = 10_000_000_000
+"""A page that holds an arm may say for so long whether another one takes part."""
+RESTART_S = 1.0
 WAITING_FRAMES = 10
 """Frames between two looks at who is there, before a session begins."""
 POINTS_PER_FRAME = 240
 """Points of the plots that one frame brings at most; a page that was away longer has a gap."""
-_TOO_LARGE, _POLICY_VIOLATION = 1009, 1008
+_POLICY_VIOLATION = 1008
+_BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
 """Codes with which a socket is closed, RFC 6455."""
+_SILENT = logging.getLogger("trilat.page")
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
+"""For the library of sockets: what strangers send is counted, and prints no tracebacks."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 _KINDS = {
@@ -86,38 +96,54 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
     return files
 
 
+_NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+class Visitor(ServerConnection):
+    """One connection: what is no request of a page is counted, and answered with 400 if it is not HTTP."""
+
+    refused: Counter[str]
+    _heard = _counted = False
+
+    def data_received(self, data: bytes) -> None:
+        """Takes in what has come."""
+        self._heard = True  # browsers open connections ahead, and close some of them unused
+        super().data_received(data)
+
+    def send_data(self) -> None:
+        """Sends what is to be sent."""
+        problem = self.protocol.handshake_exc
+        if problem is not None and self._heard and not self._counted:
+            self._counted = True
+            self.refused["malformed request"] += 1
+            if self.request is None and isinstance(problem, InvalidMessage):
+                self.transport.write(_NO_HTTP)
+        super().send_data()
+
+
 class Page:
     """One connected page.
 
     Attributes:
         hands: what it holds.
         takes_part: true if its orders count.
+        asks: the pages that it has asked whether it may take part, and when, ns.
         wake: set when there is a frame that it has not got.
+        excess: how many messages it has sent that were too many.
     """
 
-    def __init__(self, connection: ServerConnection, hands: PageHands, *, takes_part: bool) -> None:
-        self.connection, self.hands, self.takes_part = connection, hands, takes_part
+    def __init__(
+        self, connection: ServerConnection, number: int, hands: PageHands, *, takes_part: bool
+    ) -> None:
+        self.connection, self.number = connection, number
+        self.hands, self.takes_part = hands, takes_part
+        self.asks: tuple[set[Page], int] | None = None
         self.wake = asyncio.Event()
         self.drawn = self.sent = 0
         self.notified = 0
         self.unseen: deque[int] = deque()
         self.points = self.energies = self.events = 0
-        self._allowed, self._filled_ns, self._excess = float(BURST), 0, 0
-
-    def allows(self, now_ns: int) -> bool:
-        """True if a message may come now; a bucket that fills at MESSAGES_PER_S."""
-        self._allowed += (now_ns - self._filled_ns) * 1e-9 * MESSAGES_PER_S if self._filled_ns else 0.0
-        self._allowed, self._filled_ns = min(self._allowed, BURST), now_ns
-        if self._allowed < 1.0:
-            self._excess += 1
-            return False
-        self._allowed -= 1.0
-        return True
-
-    @property
-    def floods(self) -> bool:
-        """True if it has sent so much more than it may that it must go."""
-        return self._excess > MOST_EXCESS
+        self.limits, self.excess = MessageLimits(), 0
 
 
 class PageServer:
@@ -130,6 +156,7 @@ class PageServer:
         host: address to listen at; another than this machine's needs the token.
         port: 0: any.
         ends: true if pages may end the session.
+        say: tells the people at the terminal what went wrong.
 
     Attributes:
         address: where a browser finds the page, token included.
@@ -146,8 +173,10 @@ class PageServer:
         host: str = "127.0.0.1",
         port: int = 0,
         ends: bool = False,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._bus, self._clock, self._host, self._port, self._ends = bus, clock, host, port, ends
+        self._say = say
         self._met = 0
         self.view = SessionView(bus, clock, session)
         self._frames = SessionFrames(self.view)
@@ -163,10 +192,10 @@ class PageServer:
         self.address = ""
         self._ready = threading.Event()
         self._problem: OSError | None = None
-        self._failure: BaseException | None = None
+        self._ending = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()), name="page", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def __enter__(self) -> "PageServer":
         self._thread.start()
@@ -176,63 +205,89 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ending.set()
         if self._loop is not None and self._stop is not None:
             with suppress(RuntimeError):  # its loop has ended already
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
-        if self._failure is not None:
-            raise self._failure
+
+    def _run(self) -> None:
+        """Serves pages until the end, and again after whatever ended it."""
+        while not self._ending.is_set() and self._problem is None:
+            try:
+                asyncio.run(self._serve())
+            except Exception as error:
+                if not self._ready.is_set():
+                    self._problem = error if isinstance(error, OSError) else OSError(0, str(error))
+                else:
+                    self._count_failure("server", error)
+                    self._ending.wait(RESTART_S)
+            self._ready.set()
+
+    def _count_failure(self, of: str, error: Exception) -> None:
+        """Counts a failure, and says it the first time: no failure of the page is one of the session."""
+        reason = f"{of} failed: {type(error).__name__}"
+        self.refused[reason] += 1
+        with suppress(OSError, ValueError):  # no terminal any more
+            if self.refused[reason] == 1:
+                self._say(f"the page goes on, though its {reason}: {error}")
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        try:
-            server = await serve(
-                *(self._attend, self._host, self._port),
-                process_request=self._answer,
-                max_size=MAX_MESSAGE_BYTES,
-                max_queue=32,
-                compression=None,
-                ping_interval=5,
-                ping_timeout=10,
-                close_timeout=1,
-            )
-        except OSError as error:
-            self._problem = error
-            self._ready.set()
-            return
-        async with server:
+        server = await serve(
+            *(self._attend, self._host, self._port),
+            process_request=self._answer,
+            create_connection=type("Counted", (Visitor,), {"refused": self.refused}),
+            max_size=MAX_MESSAGE_BYTES,
+            max_queue=32,
+            compression=None,
+            ping_interval=5,
+            ping_timeout=30,  # a busy machine is no dead page
+            open_timeout=3,
+            close_timeout=1,
+            logger=_SILENT,
+        )
+        async with server, asyncio.TaskGroup() as tasks:
+            self._pages.clear()
             self._port = server.sockets[0].getsockname()[1]
             shown = f"[{self._host}]" if ":" in self._host else self._host
             self.address = f"http://{shown}:{self._port}/" + (f"?token={self._token}" if self._token else "")
             self._ready.set()
-            tasks = [asyncio.create_task(self._tick()), asyncio.create_task(self._stop.wait())]
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in tasks:
-                task.cancel()
-            self._failure = next((task.exception() for task in done), None)
+            ticking = tasks.create_task(self._tick())
+            await self._stop.wait()
+            ticking.cancel()
 
     async def _tick(self) -> None:
-        """Takes in the session's messages and makes a frame, thirty times a second."""
+        """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
         while True:
             begun_ns = self._clock.monotonic_ns()
-            self.view.poll()
-            self._desk.poll()
-            frame = self._frames.make()
-            self._frame = frame or self._frame
-            self._n += 1
-            for site, accepted, text in self._desk.replies:
-                self._notices.append({"n": self._n, "site": site, "ok": accepted, "text": text})
-            self._desk.replies.clear()
-            del self._notices[:-20]
+            for step in (self._desk.poll, self.view.poll, self._settle_asked, self._make_frame):
+                try:
+                    step()
+                except Exception as error:
+                    self._count_failure(step.__qualname__, error)
             for page in self._pages:
                 page.wake.set()
             spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
 
+    def _make_frame(self) -> None:
+        self._n += 1
+        for site, accepted, text in self._desk.replies:
+            self._notices.append({"n": self._n, "site": site, "ok": accepted, "text": text})
+        self._desk.replies.clear()
+        del self._notices[:-20]
+        self._frame = self._frames.make() or self._frame
+
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers a request for a file; None lets a socket open."""
-        target = urlsplit(request.path)
-        if (problem := self._problem_of(request, target.query)) is not None:
+        try:
+            target = urlsplit(request.path)
+            problem = self._problem_of(request, target.query)
+        except (ValueError, LookupError):  # no address; two hosts
+            self.refused["malformed request"] += 1
+            return connection.respond(HTTPStatus.BAD_REQUEST, "malformed request\n")
+        if problem is not None:
             self.refused[problem] += 1
             return connection.respond(HTTPStatus.FORBIDDEN, problem + "\n")
         if target.path == "/socket":
@@ -276,55 +331,97 @@ class PageServer:
         """Serves one page until it goes."""
         self._met += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
-        page = Page(connection, hands, takes_part=not any(other.takes_part for other in self._pages))
+        alone = not any(other.takes_part for other in self._pages)
+        page = Page(connection, self._met, hands, takes_part=alone)
         self._pages.add(page)
         sending = asyncio.create_task(self._send(page))
         try:
             async for text in connection:
                 self._take(page, text)
-                if page.floods:  # what else it has sent is not even read
+                if page.excess > MOST_EXCESS:  # what else it has sent is not even read
                     await connection.close(_POLICY_VIOLATION, "too many messages")
                     break
         except ConnectionClosed as closed:
-            self.refused["too large"] += closed.sent is not None and closed.sent.code == _TOO_LARGE
+            if closed.sent is not None and closed.sent.code in _BROKEN:
+                self.refused[_BROKEN[closed.sent.code]] += 1
         finally:
             page.hands.release()
             sending.cancel()
             self._pages.discard(page)
 
     def _take(self, page: Page, text: str | bytes) -> None:
-        """Takes a message of a page, unless it sends more than it may."""
-        if not page.allows(self._clock.monotonic_ns()):
+        """Takes a message of a page, unless it sends more than it may; its failure is its own."""
+        now_ns = self._clock.monotonic_ns()
+        if not page.limits.allows(PageMessage, now_ns):
+            page.excess += 1
             self.refused["too many"] += 1
             return
         try:
             message = read_page_message(text)
+            lets_go = isinstance(message, MoveHand) and not message.grip
+            if lets_go or page.limits.allows(type(message), now_ns):
+                self._obey(page, message)
+            else:
+                self.refused[f"too many: {type(message).__struct_config__.tag}"] += 1
         except WireError as error:
             self.refused[error.reason] += 1
-            return
-        self._obey(page, message)
+        except Exception as error:
+            self._count_failure("message", error)
 
     def _obey(self, page: Page, message: PageMessage) -> None:
+        view = self.view
         if isinstance(message, Seen):
             page.drawn = min(message.n, page.sent)
             while page.unseen and page.unseen[0] <= page.drawn:
                 page.unseen.popleft()
             page.wake.set()
+        elif isinstance(message, StopArms):  # of whoever sees the page
+            self._desk.stop(view.sites)
         elif isinstance(message, TakePart):
-            page.takes_part = message.want
-            if not message.want:
-                page.hands.release()
+            self._ask_to_take_part(page, message.want)
+        elif isinstance(message, AnswerPage):
+            self._let_take_part(page, message)
         elif not page.takes_part:
             self.refused["does not take part"] += 1
         elif isinstance(message, SetLink | SetShares):
-            self._desk.order(message)
+            self._desk.order(message, view.sites, view.links)
         elif isinstance(message, MarkMoment):
-            if self.view.scenario is not None:
-                self._desk.mark(self.view.scenario.names[0], message.text)
+            if view.scenario is not None:
+                self._desk.mark(view.scenario.names[0], message.text)
         elif isinstance(message, MoveHand):
             self._move_hand(page, message)
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
+
+    def _ask_to_take_part(self, page: Page, want: bool) -> None:
+        """Lets a page take part, or no longer; while others hold an arm they are asked first."""
+        if not want:
+            page.takes_part, page.asks = False, None
+            page.hands.release()
+        elif not page.takes_part and page.asks is None:
+            holders = {other for other in self._pages - {page} if self._list_held(other)}
+            page.asks = (holders, self._clock.monotonic_ns()) if holders else None
+            page.takes_part = not holders
+
+    def _let_take_part(self, page: Page, answer: AnswerPage) -> None:
+        for other in self._pages:
+            if other.number == answer.page and other.asks is not None and page in other.asks[0]:
+                other.takes_part, other.asks = answer.yes, None
+                return
+        self.refused["was not asked"] += 1
+
+    def _settle_asked(self) -> None:
+        """Lets pages take part that nobody has answered, if whom they asked has gone or holds no arm."""
+        now_ns = self._clock.monotonic_ns()
+        for page in self._pages:
+            here = page.asks[0] & self._pages if page.asks is not None else set()
+            if page.asks is not None and (not here or now_ns - page.asks[1] > ANSWER_NS):
+                page.takes_part, page.asks = not any(map(self._list_held, here)), None
+
+    def _list_held(self, page: Page) -> list[str]:
+        """Returns the sites whose newest record names a page as holding the arm."""
+        sites = (self._frame or {}).get("sites", {})
+        return [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
 
     def _move_hand(self, page: Page, order: MoveHand) -> None:
         site = self.view.sites.get(order.site)
@@ -348,12 +445,16 @@ class PageServer:
                     continue
                 page.notified, page.sent = page.sent, self._n
                 page.unseen.append(page.sent)
-                if not greeted or not begins:
-                    greeted = begins
-                    about = {**self._frames.describe(), "n": self._n, "ends": self._ends}
-                    await page.connection.send(encode({"hello": about}), text=True)
+                try:
+                    payload = encode(self._frame_for(page) if greeted and begins else self._greet())
+                except Exception as error:
+                    self._count_failure("frame", error)
                     continue
-                await page.connection.send(encode(self._frame_for(page)), text=True)
+                greeted = begins
+                await page.connection.send(payload, text=True)
+
+    def _greet(self) -> dict[str, Any]:
+        return {"hello": {**self._frames.describe(), "n": self._n, "ends": self._ends}}
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
         """Returns the newest frame with what is new to a page."""
@@ -362,8 +463,6 @@ class PageServer:
         most = 100_000 if first else POINTS_PER_FRAME
         points = frames.points.since(page.points, most)
         energies = frames.energies.since(page.energies, most)
-        sites = (self._frame or {}).get("sites", {})
-        held = [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
         events = [show_event(event) for event in view.events.since(page.events, 100)]
         page.points, page.energies, page.events = (
             frames.points.count,
@@ -379,6 +478,8 @@ class PageServer:
             "notices": [one for one in self._notices if one["n"] > page.notified],
             "pages": len(self._pages),
             "takes_part": page.takes_part,
-            "holds": held,
+            "asks": page.asks is not None,
+            "asked": [one.number for one in self._pages if one.asks is not None and page in one.asks[0]],
+            "holds": self._list_held(page),
             "refused": sum(self.refused.values()),
         }

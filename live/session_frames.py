@@ -72,6 +72,7 @@ class ArmFrames:
             "task": self._model.shares_pose,
             "unit": "m" if self._model.shares_pose else "rad",
             "hand": self._describe_hand(),
+            "stops": self._spec.on_stale.action == "glide",
             "law": type(self._spec.control).__struct_config__.tag,
         }
 

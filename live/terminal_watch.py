@@ -1,10 +1,14 @@
 """`trilat watch`: a session in a terminal, a line for each site.
 
-A terminal shows a table that is refreshed; other outputs get the same lines every two seconds.
+A terminal shows a table that is refreshed; other outputs get the same lines every two seconds. Where standard
+input is a terminal, a key stops every arm.
 """
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+import os
+import select
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 
 import numpy as np
 from rich.box import HEAVY
@@ -22,11 +26,13 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.process import Interrupt
 
+from .page_orders import OrderDesk
 from .session_view import SessionView, SiteView
 
 POLL_NS = 20_000_000
 TABLE_NS, LINES_NS = NS_PER_S // 4, 2 * NS_PER_S
 """Between two updates of a table, and of lines."""
+STOP_KEYS = frozenset(" sS")
 HEADS = ("site", "time", "mode", "angles", "|e|", "torque", "age of each peer's sample", "held", "late")
 
 
@@ -100,12 +106,20 @@ def watch_session(
     Raises:
         SessionError: no site answers in time.
     """
-    watch = SessionWatch(bus, clock, session)
+    watch, desk = SessionWatch(bus, clock, session), OrderDesk(bus, clock, session)
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
     begun_ns = shown_ns = clock.monotonic_ns()
-    with live or nullcontext():
+    with _read_keys() as read_keys, live or nullcontext():
+        if read_keys is not None:
+            console.print("S or space: stop every arm", highlight=False)
         while not (interrupt.requested() or watch.view.ended):
             watch.update()
+            if read_keys is not None and STOP_KEYS.intersection(read_keys()):
+                console.print("stopping every arm" if watch.view.running else "the session has not begun")
+                desk.stop(watch.view.sites)
+            desk.poll()
+            while desk.replies:
+                console.print(desk.replies.pop(0)[2], highlight=False, markup=False, soft_wrap=True)
             now_ns = clock.monotonic_ns()
             if not watch.view.met and now_ns - begun_ns > timeout_s * NS_PER_S:
                 raise SessionError(f"no site of session {session!r} answered within {timeout_s:g} s")
@@ -113,6 +127,35 @@ def watch_session(
                 shown_ns = now_ns
                 _show(watch, console, live)
             clock.sleep_until(now_ns + POLL_NS)
+
+
+@contextmanager
+def _read_keys() -> Iterator[Callable[[], str] | None]:
+    """Yields what returns the keys pressed since it was asked last; None without a terminal of ours."""
+    try:
+        import termios
+        import tty
+
+        keyboard = sys.stdin.fileno()
+        if os.tcgetpgrp(keyboard) != os.getpgrp():  # its keys go to another program
+            raise OSError
+        before = termios.tcgetattr(keyboard)
+    except (ImportError, OSError, ValueError, AttributeError):  # no terminal, or a system without them
+        yield None
+        return
+
+    def read() -> str:
+        with suppress(OSError):  # it has hung up
+            if select.select([keyboard], [], [], 0.0)[0]:
+                return os.read(keyboard, 64).decode(errors="replace")
+        return ""
+
+    tty.setcbreak(keyboard)
+    try:
+        yield read
+    finally:
+        with suppress(termios.error):
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
 
 
 def _show(watch: SessionWatch, console: Console, live: Live | None) -> None:

@@ -44,8 +44,8 @@ class RunningSession:
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
         replies = self._act(lambda bus, clock: order_sites(bus, clock, self.name, sites, order))
-        if refused := [f"{reply.member}: {reply.text}" for reply in replies if not reply.accepted]:
-            raise RunFailed("; ".join(refused))
+        if refused := [reply.text for reply in replies if not reply.accepted]:
+            raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
         return [reply.text for reply in replies]
 
     def stop(self, *sites: str) -> list[str]:

@@ -25,11 +25,14 @@ from trilat_net.errors import LawFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
+from trilat_net.net.known_sites import make_site_known
 from trilat_net.net.membership import Epoch, EventPublisher, LateSites, describe_member
 from trilat_net.net.messages import Event
 from trilat_net.net.pinging import Pinger, describe_clocks
+from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
+from trilat_net.net.wire import encode
 from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_law import ImportedLaw
@@ -187,8 +190,10 @@ class RunningSite:
         """Runs every tick, or until the run ends."""
         parts = self._parts
         self._publish_setup()
-        with parts.watchdog or nullcontext():
-            ticks = parts.scenario.ticks(parts.name)
+        order, name = encode(ChangeRequest(order="stop")), parts.name
+        here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
+        with make_site_known(*here, order), parts.watchdog or nullcontext():
+            ticks = parts.scenario.ticks(name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
             output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)

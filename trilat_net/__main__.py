@@ -1,6 +1,25 @@
-"""Entry point of `python -m trilat_net`, the same as `trilat`."""
+"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands."""
 
-from .cli import main
+import os
+import sys
+from contextlib import suppress
+
+
+def main() -> None:
+    """Runs `trilat`."""
+    if sys.argv[1:2] == ["stop"]:
+        with suppress(AttributeError, OSError):  # before the other programs of a busy machine, if it may
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        from .net.known_sites import stop_at_once
+
+        left = stop_at_once(sys.argv[2:])
+        if isinstance(left, int):
+            sys.exit(left)
+        sys.argv[2:] = left
+    from .cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -115,7 +115,6 @@ export class Hands {
     if (event.target.matches("input, select, textarea, button")) return;
     const { key } = event;
     if (down && /^[1-9]$/.test(key) && this.arms.cards[key - 1]) this.arms.cards[key - 1].card.focus();
-    else if (key === "Escape" && down) this.letGo();
     else if (key === " " && this.chosen) {
       event.preventDefault();
       if (down && !event.repeat) {

@@ -46,6 +46,9 @@ function begin(hello) {
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
     return;
   }
+  const able = Object.values(hello.sites).filter((site) => site.stops).length;
+  $("stop").disabled = !able;
+  $("stop").title = able ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
   if (parts !== null) return;
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
@@ -69,8 +72,14 @@ function take(frame) {
       control.disabled = !frame.takes_part;
     }
     $("part").setAttribute("aria-pressed", frame.takes_part);
-    $("part").textContent = frame.takes_part ? "taking part" : "take part";
   }
+  if (page.asks && !frame.asks && !frame.takes_part) notice("nobody who holds an arm let this page take part");
+  page.asks = frame.asks;
+  const part = frame.takes_part ? "taking part" : frame.asks ? "asking ..." : "take part";
+  if ($("part").textContent !== part) $("part").textContent = part;
+  page.asked = frame.asked;
+  $("ask").hidden = !frame.asked.length;
+  if (frame.asked.length) $("ask").firstElementChild.textContent = `page ${frame.asked[0]} asks to take part.`;
   const silent = parts.names.filter((name) => frame.sites[name].silent);
   const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
   const stopped = alarms(frame);
@@ -184,11 +193,22 @@ function connect() {
 }
 
 $("part").addEventListener("click", () => send({ do: "control", want: !page.takesPart }));
+for (const answer of ["yes", "no"]) {
+  $(`ask-${answer}`).addEventListener("click", () => send({ do: "answer", page: page.asked[0], yes: answer === "yes" }));
+}
+function stop() { // of whoever sees the page, whether it takes part or not
+  parts?.hands.letGo();
+  if ($("stop").disabled) return;
+  if (send({ do: "stop" })) notice("stopping every arm", 3000);
+  else notice(`not connected: nothing is stopped by this page; trilat stop --session ${page.hello?.session}`, 1e9);
+}
+$("stop").addEventListener("click", stop);
 $("end").addEventListener("click", () => { if (confirm("End the session for everybody?")) send({ do: "end" }); });
 const mark = () => { send({ do: "mark", text: $("mark-text").value.trim() || "mark" }); $("mark-text").value = ""; };
 $("mark").addEventListener("click", mark);
 $("mark-text").addEventListener("keydown", (event) => { if (event.key === "Enter") mark(); });
 addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && !event.repeat) stop();
   if (!event.target.matches("input, select, textarea") && event.key.toLowerCase() === "m" && !event.ctrlKey && !event.metaKey) mark();
 });
 connect();

@@ -11,6 +11,9 @@ from typing import NamedTuple
 from trilat_net.net.requests import ChangeRequest
 
 SITES = ("m1", "m2", "s")
+LATCHES = ("stop", "enable", "reset")
+STORM_S, STORM_ORDERS = 0.6, 150
+"""A storm is no longer, and has so many orders then."""
 MEMBERS = (*SITES, "recorder")
 MOST_FAULTS = 4
 
@@ -34,7 +37,31 @@ class Timetable(NamedTuple):
 
 
 WHOLE = Timetable(5.0, (0.5, 1.6), 1.8, 0.2)
-SHORT = Timetable(1.1, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop"))
+SHORT = Timetable(1.1, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop", "storm"))
+
+
+class ArmSettings(NamedTuple):
+    """What the arms of a session are given; the defaults are those of the matrix.
+
+    Attributes:
+        tau_rate_limit_nm_s: limit of a torque's rate; None: there is none.
+        learnt: which share of the true parameters the estimates begin with.
+        qd_limit_rad_s: limit of the speeds; one that the arms' own motion passes is a fault.
+    """
+
+    tau_rate_limit_nm_s: float | None = 300.0
+    learnt: float = 0.0
+    qd_limit_rad_s: float = 10.0
+
+
+def draw_settings(seed: int) -> ArmSettings:
+    """What the arms of a seed are given; of two in three, what the matrix says."""
+    rng = Random(f"settings {seed}")
+    if rng.random() < 2.0 / 3.0:
+        return ArmSettings()
+    rate_nm_s = rng.choice([100.0, 100.0 * 10.0 ** rng.random(), None])
+    speed_rad_s = rng.choice([10.0, 10.0, round(rng.uniform(0.8, 1.5), 2)])
+    return ArmSettings(rate_nm_s, round(rng.random(), 3), speed_rad_s)
 
 
 class Fault(NamedTuple):
@@ -97,7 +124,8 @@ KINDS = {
     "stranger": Kind(1.0, _a_site),  # in the name of a site, of another start
     "wall clock": Kind(1.0, _a_site, (-3600.0, 3600.0)),  # s
     "order": Kind(1.5, _a_site, (0.0, 1.0)),  # somebody changes dominance, or a link
-    "stop": Kind(1.0, _a_site),  # by an operator
+    "stop": Kind(1.5, _a_site),  # by an operator
+    "storm": Kind(1.5, _nobody, (0.0, 1.0)),  # of orders to everybody
     "full disk": Kind(0.5, _nobody, (1e5, 2e6)),  # bytes
 }
 
@@ -127,6 +155,21 @@ def order_of(fault: Fault) -> tuple[str, ChangeRequest]:
         return site, ChangeRequest(link=f"{first}->{site}", to=to)
     shares = {first: share, second: round(1.0 - share, 3)}
     return site, ChangeRequest(dominance=site, to=shares, ramp_s=0.5)
+
+
+def storm_of(fault: Fault) -> list[tuple[float, str, ChangeRequest]]:
+    """What somebody asks of the sites in a storm of orders, and when, s after it begins."""
+    rng = Random(f"storm {fault.size}")
+    lasts_s = min(fault.for_s, STORM_S)
+    orders = []
+    for _ in range(max(2, round(STORM_ORDERS * lasts_s / STORM_S))):
+        site = _a_site(rng)
+        if rng.random() < 0.8:
+            asked: tuple[str, ChangeRequest] = (*site, ChangeRequest(order=rng.choice(LATCHES)))
+        else:
+            asked = order_of(Fault("order", 0.0, 0.0, site, rng.random()))
+        orders.append((rng.uniform(0.0, lasts_s), *asked))
+    return sorted(orders, key=lambda order: order[0])
 
 
 def describe(faults: Sequence[Fault]) -> str:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
 from random import Random
@@ -26,13 +26,14 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
 
-from .fault_schedule import MEMBERS, SITES, WHOLE, Fault, Timetable, order_of
+from .fault_schedule import MEMBERS, SITES, WHOLE, ArmSettings, Fault, Timetable, order_of, storm_of
 from .faulty_network import FaultyNetwork
 
 NEVER_NS = 2_000 * 10**9
 """Of a start whose time is known once the session begins."""
 LINK_S, RECONNECT_S, LOOKS_AGAIN_S = 0.03, 0.1, 0.25
 """Delay of the links; a connection that has ended is made again no sooner; an operator comes twice."""
+DEFAULT_ARMS = ArmSettings()
 KEYS: dict[str, Any] = {
     "rate_hz": 1000,
     "link": {"delay_ms": 1e3 * LINK_S},
@@ -41,8 +42,6 @@ KEYS: dict[str, Any] = {
     "on_stale.align_speed_rad_s": 2.0,
     "limits": {
         "tau_limit_nm": 80.0,
-        "tau_rate_limit_nm_s": 300.0,
-        "qd_limit_rad_s": 10.0,
         "qd_des_limit_rad_s": 5.0,
         "q_min_rad": -6.0,
         "q_max_rad": 6.0,
@@ -50,9 +49,15 @@ KEYS: dict[str, Any] = {
 }
 
 
-def make_scenario(timetable: Timetable = WHOLE) -> Scenario:
+@cache
+def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS) -> Scenario:
     """The paper's arms and law without hands, which wait, align, hold and come back."""
-    return load_scenario("free", {"duration_s": timetable.length_s, **KEYS})
+    keys: dict[str, Any] = {"limits.qd_limit_rad_s": arms.qd_limit_rad_s}
+    if arms.tau_rate_limit_nm_s is not None:
+        keys["limits.tau_rate_limit_nm_s"] = arms.tau_rate_limit_nm_s
+    if arms.learnt:
+        keys["control.theta_hat0"] = (arms.learnt * load_scenario("free").arms["s"].theta).tolist()
+    return load_scenario("free", {"duration_s": timetable.length_s, **KEYS, **keys})
 
 
 @dataclass
@@ -238,6 +243,11 @@ class FaultSession(Session):
         (site,) = fault.of
         self._ask(site, ChangeRequest(order="stop"))
 
+    def _storm(self, fault: Fault) -> None:
+        for after_s, site, asked in storm_of(fault):
+            at_ns = self._at(fault.at_s + after_s)
+            self.relay.happens(at_ns, lambda site=site, asked=asked: self._ask(site, asked))
+
     def _let_go(self) -> None:
         """What was latched is let go, as an operator does who looks, and looks again."""
         for site in SITES:
@@ -292,10 +302,14 @@ def _file_on(disk: SmallDisk, path: Path, **_: Any) -> LogFile:
 
 
 def run_faults(
-    faults: Sequence[Fault], folder: Path, seed: int = 0, timetable: Timetable = WHOLE
+    faults: Sequence[Fault],
+    folder: Path,
+    seed: int = 0,
+    timetable: Timetable = WHOLE,
+    arms: ArmSettings = DEFAULT_ARMS,
 ) -> FaultSession:
     """A session with these faults, run to its end."""
-    scenario = make_scenario(timetable)
+    scenario = make_scenario(timetable, arms)
     session = FaultSession(scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable)
     session.prepare()
     session.play()

@@ -12,9 +12,10 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from .fault_schedule import WHOLE, Fault, Timetable, describe, draw_faults
-from .fault_session import FaultSession, run_faults
-from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, find_rises, largest_steps
+from .fault_schedule import WHOLE, ArmSettings, Fault, Timetable, describe, draw_faults, draw_settings
+from .fault_session import DEFAULT_ARMS, FaultSession, run_faults
+from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, largest_steps
+from .rest_invariants import find_rises
 
 TORQUE, AGAIN = "I6 torque", "I11 again"
 
@@ -24,6 +25,7 @@ class Judged(NamedTuple):
 
     Attributes:
         faults: what went wrong.
+        arms: what its arms were given.
         violations: by invariant, in words; empty if all held.
         visited: how often what happened: modes that were entered, events, what was dropped, how sites ended.
         holds: ticks from the last sample that came into use to each hold.
@@ -32,6 +34,7 @@ class Judged(NamedTuple):
     """
 
     faults: Sequence[Fault]
+    arms: ArmSettings
     violations: dict[str, list[str]]
     visited: Counter[str]
     holds: list[int]
@@ -40,12 +43,13 @@ class Judged(NamedTuple):
 
     def __str__(self) -> str:
         found = [f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]]
-        return "\n".join([describe(self.faults), *found])
+        return "\n".join([f"  {self.arms}", describe(self.faults), *found])
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
     """Judges the faults of a seed; `again` runs them twice and compares."""
-    return judge_faults(draw_faults(seed, timetable), seed, again=again, timetable=timetable)
+    faults, arms = draw_faults(seed, timetable), draw_settings(seed)
+    return judge_faults(faults, seed, again=again, timetable=timetable, arms=arms)
 
 
 def time_seed(seed: int) -> tuple[Judged, float]:
@@ -56,24 +60,30 @@ def time_seed(seed: int) -> tuple[Judged, float]:
 
 
 def judge_faults(
-    faults: Sequence[Fault], seed: int = 0, *, again: bool = False, timetable: Timetable = WHOLE
+    faults: Sequence[Fault],
+    seed: int = 0,
+    *,
+    again: bool = False,
+    timetable: Timetable = WHOLE,
+    arms: ArmSettings = DEFAULT_ARMS,
 ) -> Judged:
     """Judges some faults; chance in the network comes from the seed."""
     undisturbed_nm = find_undisturbed_step(timetable)
     with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
-            session = run_faults(faults, Path(folder), seed, timetable)
+            session = run_faults(faults, Path(folder), seed, timetable, arms)
             found = {name: list(check(session)) for name, check in INVARIANTS.items()}
             found[TORQUE] = list(check_torque(session, undisturbed_nm))
             digest = digest_session(session)
         if again:
             with tempfile.TemporaryDirectory() as folder:
-                if digest_session(run_faults(faults, Path(folder), seed, timetable)) != digest:
+                if digest_session(run_faults(faults, Path(folder), seed, timetable, arms)) != digest:
                     found[AGAIN] = ["the same seed publishes or records other bytes"]
         violations = {name: texts for name, texts in found.items() if texts}
         rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
         return Judged(
             faults,
+            arms,
             violations,
             count_visited(session),
             list(find_holds(session)),

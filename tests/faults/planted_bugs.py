@@ -10,7 +10,7 @@ from unittest import mock
 from sites.peer_monitor import PeerMonitor
 from sites.site_loop import PeerInbox
 from sites.site_process import RunningSite
-from trilat_net.core.site_setup import SiteSetup, StaleAction
+from trilat_net.core.site_setup import RestGains, SiteSetup, StaleAction
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, TickRecord
 from trilat_net.log.log_writer import LogParts
@@ -75,6 +75,36 @@ def learns_the_wrong_way() -> Iterator[None]:
         return setup._replace(gains=gains._replace(Gamma=tuple(-gain for gain in gains.Gamma)))
 
     with _with_setups(wrong):
+        yield
+
+
+def _with_rest(change: Callable[[RestGains], RestGains]) -> AbstractContextManager[Any]:
+    """Arms come to rest in another way than follows from what is stated of them."""
+    return _with_setups(lambda setup: setup._replace(rest=change(setup.rest)))
+
+
+@contextmanager
+def feeds_what_moves() -> Iterator[None]:
+    """Of an arm that comes to rest the brake pushes."""
+    with _with_rest(lambda rest: rest._replace(damping=tuple(-0.1 * B for B in rest.damping))):
+        yield
+
+
+def _with_slower_rest(share: float) -> AbstractContextManager[Any]:
+    return _with_rest(lambda rest: rest._replace(deceleration=tuple(share * a for a in rest.deceleration)))
+
+
+@contextmanager
+def creeps_on() -> Iterator[None]:
+    """An arm comes to rest a hundred times as slowly as it is said to."""
+    with _with_slower_rest(0.01):
+        yield
+
+
+@contextmanager
+def goes_too_far() -> Iterator[None]:
+    """An arm comes to rest over ten times the way that it is said to take."""
+    with _with_slower_rest(0.1):
         yield
 
 
@@ -159,5 +189,8 @@ PLANTED: Sequence[tuple[Callable[[], AbstractContextManager[None]], str]] = (
     (begins_at_zero, "I9 starts"),
     (loses_records, "I10 log"),
     (depends_on_chance, AGAIN),
+    (feeds_what_moves, "I12 energy"),
+    (creeps_on, "I13 rest"),
+    (goes_too_far, "I14 travel"),
 )
 """Bugs, and the invariant that each must break."""

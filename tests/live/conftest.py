@@ -17,8 +17,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def laws_of_tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def processes_find_the_laws_of_tests_and_no_sessions_but_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setitem(PLAIN, "PYTHONPATH", str(Path(__file__).parents[2]))
+    monkeypatch.setitem(PLAIN, "XDG_STATE_HOME", str(tmp_path / "state"))
 
 
 @pytest.fixture

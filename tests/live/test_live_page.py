@@ -225,7 +225,7 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
     address = page_address(running)
     with browser_page(address) as first:
         shows(first, "trilat.frame && trilat.takesPart")
-        second = first.context.new_page()
+        second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)
         shows(second, "trilat.frame && trilat.frame.pages === 2")
         assert not second.evaluate("trilat.takesPart")

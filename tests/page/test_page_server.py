@@ -1,10 +1,12 @@
 """Whom the page's server refuses: foreign pages, strangers without the token, floods, nonsense."""
 
+import contextlib
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
-from socket import create_server
+from socket import SHUT_WR, create_connection, create_server
 from urllib.parse import urlsplit
 
 import pytest
@@ -21,6 +23,7 @@ from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
+from trilat_net.net.zenoh_bus import ZenohBus
 
 
 @pytest.fixture
@@ -50,6 +53,15 @@ def get(server: PageServer, path: str, **headers: str) -> tuple[int, str, bytes]
 
 def hears(client: ClientConnection) -> dict[str, object]:
     return json.loads(client.recv(timeout=5))  # type: ignore[no-any-return]
+
+
+def raw(server: PageServer, request: bytes) -> bytes:
+    """The answer to bytes; what is no whole request ends with them."""
+    with create_connection((urlsplit(server.address).hostname, urlsplit(server.address).port), 5) as there:
+        there.sendall(request)
+        if b"\r\n\r\n" not in request:
+            there.shutdown(SHUT_WR)
+        return b"".join(iter(lambda: there.recv(65_536), b""))
 
 
 def flood(client: ClientConnection, count: int) -> None:
@@ -130,7 +142,9 @@ def test_another_address_than_loopback_demands_insecure_and_a_token(network: Loc
         ('{"do":"seen","n":-1}', "malformed"),
         ("[" * 2000, "malformed"),
         ('{"do":"shares","site":"*","to":{"m1":1.0}}', "no such site"),
-        ('{"do":"link","link":"m1->s/x","to":{"delay_ms":1}}', "no such site"),
+        ('{"do":"link","link":"m1->s/x","to":{"delay_ms":1}}', "no such link"),
+        ('{"do":"link","link":"s","to":{"delay_ms":1}}', "no such link"),
+        ('{"do":"shares","site":"s","to":{"m1":1.0}}', "no such site"),
     ],
 )
 def test_nonsense_is_counted_and_dropped(server: PageServer, text: str, reason: str) -> None:
@@ -162,6 +176,7 @@ def test_orders_count_of_a_page_that_takes_part_and_a_second_one_asks_first(
 ) -> None:
     site: LocalBus = network.join()
     questions = site.questions("trilat/s1/s/set")
+    server.view.links = {"m1->s": {}}
     order = '{"do":"link","link":"m1->s","to":{"delay_ms":300,"deviation_ms":0,"loss":0}}'
     with socket(server) as first, socket(server) as second:
         hears(first), hears(second)
@@ -212,3 +227,112 @@ def test_the_hands_of_a_page_are_its_own_and_let_go_with_it(network: LocalNetwor
     assert hands[0].holds("m1", sent[0].boot)
     assert not hands[1].holds("m1", sent[0].boot)
     assert sent[0].boot != sent[1].boot
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"GET //[ HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: [\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nOrigin: a\r\nOrigin: b\r\n\r\n",
+        b"GET /\xff HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1\r\n\r\nx",
+        b"\x16\x03\x01\x00\xa5\x01\x00\x00\xa1",
+        b"GET / HT",
+    ],
+)
+def test_what_is_no_request_gets_400_and_is_counted(
+    server: PageServer, request_: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert raw(server, request_).startswith(b"HTTP/1.1 400 ")
+    assert server.refused == {"malformed request": 1}
+    assert raw(server, b"") == b""  # a connection that is opened ahead is not counted
+    assert get(server, "/")[0] == 200
+    assert server.refused.total() == 1
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> None:
+    with socket(server) as page:
+        page.socket.sendall(b"\xff" * 64)
+        until(lambda: server.refused["broken frames"] == 1)
+    assert raw(server, b"GET /socket HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 426 ")
+    assert server.refused["malformed request"] == 1
+
+
+def test_marks_hands_and_control_have_rates_of_their_own_and_letting_go_has_none(server: PageServer) -> None:
+    with socket(server) as page:
+        for _ in range(50):
+            page.send('{"do":"mark","text":"a"}')
+            page.send('{"do":"control","want":true}')
+        until(lambda: server.refused["too many: mark"] > 35)
+        assert server.refused["too many: control"] > 35
+        assert "hello" in hears(page)
+    with socket(server) as page:
+        for _ in range(450):
+            page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
+        until(lambda: server.refused["nobody can hold it"] + server.refused["too many: hand"] == 450)
+        refused = server.refused["nobody can hold it"]
+        page.send('{"do":"hand","site":"m1","grip":false}')
+        until(lambda: server.refused["nobody can hold it"] == refused + 1)
+
+
+def test_any_page_stops_every_arm_past_what_waits_for_an_answer(
+    network: LocalNetwork, server: PageServer
+) -> None:
+    site: LocalBus = network.join()
+    changes, stops = site.questions("trilat/s1/s/set"), site.questions("trilat/s1/s/stop")
+    server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
+    with socket(server) as first, socket(server) as second:
+        hears(first), hears(second)
+        first.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')
+        until(changes.poll)  # nobody answers
+        second.send('{"do":"stop"}')
+        query = until(stops.poll)
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop")
+        second.send('{"do":"shares","site":"s","to":{"m1":1.0}}')
+        until(lambda: server.refused["does not take part"] == 1)
+
+
+def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture[str]) -> None:
+    """Names that Zenoh takes for expressions: no session has them, and the bus refuses them."""
+    said: list[str] = []
+    with closing(ZenohBus()) as bus, PageServer(bus, SystemClock(), "s1", say=said.append) as server:
+        server.view.sites, server.view.links = {"a#b": None}, {"m1->a#b": {}}  # type: ignore[dict-item]
+        with socket(server) as page:
+            for _ in range(3):
+                page.send('{"do":"stop"}')
+            until(lambda: server.refused["message failed: ZError"] == 3)
+            for _ in range(3):
+                page.send('{"do":"link","link":"m1->a#b","to":{"delay_ms":1.0}}')
+                page.send('{"do":"shares","site":"a#b","to":{"m1":1.0}}')
+            until(lambda: server.refused["OrderDesk.poll failed: ZError"] > 1)
+            page.send("nonsense")
+            until(lambda: server.refused["malformed"] == 1)
+            assert "hello" in hears(page)
+    assert sum("message failed: ZError" in text for text in said) == 1
+    assert sum("OrderDesk.poll failed: ZError" in text for text in said) == 1
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_loop_that_ends_is_begun_again_at_the_same_address(network: LocalNetwork) -> None:
+    said: list[str] = []
+    with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server:
+        address, loop = server.address, server._loop
+        assert loop is not None
+        with socket(server) as page:
+            hears(page)
+            loop.call_soon_threadsafe(loop.stop)
+            until(lambda: said and server._loop is not loop)
+        until(lambda: reached(server))
+        assert server.address == address
+        with socket(server) as page:
+            assert "hello" in hears(page)
+    assert server.refused["server failed: RuntimeError"] == 1
+
+
+def reached(server: PageServer) -> bool:
+    with contextlib.suppress(OSError):
+        return get(server, "/")[0] == 200
+    return False

@@ -78,3 +78,16 @@ def test_of_a_site_that_never_holds_it_says_nothing() -> None:
     glide = load_scenario("two_sites", {"on_stale.action": "glide", "duration_s": 2.0})
     assert not [line for line in describe_scenario(glide) if "times a minute" in line]
     assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))
+
+
+def test_an_arm_that_takes_long_to_stop_says_so() -> None:
+    """T = qd_limit / a of the slowest joint, and the way T qd_limit / 2."""
+    scenario = load_scenario("free", {"on_stale.action": "glide"})
+    stop_s = 100.0 / min(scenario.setup("s").rest.deceleration)
+    (line,) = (line for line in describe_scenario(scenario) if "to stop from" in line)
+    assert line == (
+        f"arms of m1, m2, s take {stop_s:.3g} s and {50.0 * stop_s:.3g} rad to stop from "
+        "limits.qd_limit_rad_s = 100"
+    )
+    slow = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 10.0})
+    assert not [line for line in describe_scenario(slow) if "to stop from" in line]

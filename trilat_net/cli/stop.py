@@ -1,55 +1,37 @@
 """`trilat stop`, `enable`, `reset`: stops arms while their session goes on, and lets them follow again."""
 
-from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ..errors import RunFailed, UsageError
+from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from . import options
 
 if TYPE_CHECKING:
-    from ..net.bus import Bus
-    from ..net.clock import Clock
-    from ..net.connection import Connection
-    from ..net.requests import OrderName
+    from sites.running_session import RunningSession
 
 SessionOption = Annotated[str, typer.Option("--session", metavar="ID", help="The session.")]
 SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
 
 
-def _with_session(session: str, connection: "Connection", act: "Callable[[Bus, Clock, str], None]") -> None:
-    """Connects to a session and acts on it."""
-    from ..net.clock import SystemClock
-    from ..net.discovery import REPLY_TIMEOUT_S, connect_to_session
-    from ..scenario import embedded_names_reader
+def _find(
+    session: str,
+    connect: list[str] | None,
+    router: list[str] | None,
+    zenoh_config: Path | None,
+    keys: Path | None,
+) -> "RunningSession":
+    from sites.running_session import RunningSession
 
-    name, clock = options.check_session_name(session), SystemClock()
-    reader = embedded_names_reader(name)
-    with connect_to_session(
-        connection, clock, name, reader, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
-    ) as bus:
-        assert bus is not None  # nothing stops it
-        act(bus, clock, name)
+    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
+    return RunningSession(options.check_session_name(session), connection)
 
 
-def _order(session: str, connection: "Connection", sites: list[str] | None, order: "OrderName") -> None:
-    """Gives sites an order and prints their answers.
-
-    Raises:
-        RunFailed: a site refused it.
-    """
-    from sites.session_stop import order_sites
-
-    def act(bus: "Bus", clock: "Clock", name: str) -> None:
-        replies = order_sites(bus, clock, name, sites or (), order)
-        for reply in replies:
-            terminal.print_text(reply.text)
-        if refused := [reply.member for reply in replies if not reply.accepted]:
-            raise RunFailed(f"{', '.join(refused)} did not {order}")
-
-    _with_session(session, connection, act)
+def _print_answers(answers: list[str]) -> None:
+    for text in answers:
+        terminal.print_text(text)
 
 
 def stop_command(
@@ -67,21 +49,13 @@ def stop_command(
     """Stops arms at once while the session goes on: their torque blends into damping and gravity in 100 ms.
 
     They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
-    Without endpoints it asks the first site, at its loopback port, for the others.
+    Without endpoints it asks sites on this machine at once where their files say that they are, else the
+    first site, at its loopback port, for the others.
     """
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
-    if not end:
-        _order(session, connection, sites, "stop")
-        return
-    if sites:
+    if end and sites:
         raise UsageError("--end ends the whole session: name no site")
-    from sites.session_stop import stop_session
-
-    def act(bus: "Bus", clock: "Clock", name: str) -> None:
-        for text in stop_session(bus, clock, name):
-            terminal.print_text(text)
-
-    _with_session(session, connection, act)
+    running = _find(session, connect, router, zenoh_config, keys)
+    _print_answers(running.end() if end else running.stop(*(sites or ())))
 
 
 def enable_command(
@@ -93,8 +67,7 @@ def enable_command(
     keys: options.KeysOption = None,
 ) -> None:
     """Lets stopped arms follow again: they wait for their peers and align with them."""
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
-    _order(session, connection, sites, "enable")
+    _print_answers(_find(session, connect, router, zenoh_config, keys).enable(*(sites or ())))
 
 
 def reset_command(
@@ -106,5 +79,4 @@ def reset_command(
     keys: options.KeysOption = None,
 ) -> None:
     """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
-    connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
-    _order(session, connection, sites, "reset")
+    _print_answers(_find(session, connect, router, zenoh_config, keys).reset(*sites))

@@ -43,7 +43,7 @@ class Mode(IntEnum):
     the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN. Under
     the rule `glide` a site is WAITING for its peers before it goes to them, see `session_life`. DIVERGED,
     past a limit, is final. Under `glide` a limit leads to FAULT and an order to STOPPED in its place: the
-    torque goes over to damping and gravity, and only another order leads back to WAITING.
+    arm comes to rest, as in HOLD, and only another order leads back to WAITING.
     """
 
     RUN = 1

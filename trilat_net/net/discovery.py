@@ -14,6 +14,7 @@ from . import topics
 from .bus import Bus
 from .clock import Clock
 from .connection import Connection, default_endpoint, default_endpoints, open_bus
+from .known_sites import find_known_places
 from .membership import MemberQuery, liveliness_token
 from .messages import Info
 from .requests import ChangeReply, ChangeRequest
@@ -62,10 +63,10 @@ def connect_to_session(
 ) -> Iterator[Bus | None]:
     """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
 
-    Without endpoints to connect to (`connect` is None) it asks the session's first site, on this machine, for
-    the others; if `names` returns none, that site's endpoint remains. It waits for the first site, or for a
-    router, for `timeout_s`, or for as long as it takes. A recorder is announced by its boot meanwhile: then
-    the session waits for it.
+    Without endpoints to connect to (`connect` is None) it takes those of sites that are known to run on this
+    machine, if all do. Else it asks the session's first site, on this machine, for the others; if `names`
+    returns none, that site's endpoint remains. It waits for the first site, or for a router, for `timeout_s`,
+    or for as long as it takes. A recorder is announced by its boot meanwhile: then the session waits for it.
 
     Raises:
         SessionError: no site or no router answers in time.
@@ -77,6 +78,8 @@ def connect_to_session(
             bus = open_bus(there, clock, stopped, timeout_s, say)
             return None if bus is None else stack.enter_context(closing(bus))
 
+        if connection.connect is None and recorder_boot is None:
+            connection = replace(connection, connect=find_known_places(session, connection))
         if connection.connect is None:
             first = default_endpoint(session, 0)
             visitor = connect(replace(connection, listen=(), connect=[first]))

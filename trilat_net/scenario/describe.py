@@ -100,6 +100,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
         *_describe_silences(scenario),
+        *_describe_stops(scenario),
         *(f"assumed: {text}" for text in scenario.assumed),
         *(
             f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
@@ -177,7 +178,23 @@ def _describe_silences(scenario: Scenario) -> list[str]:
     return lines
 
 
+def _describe_stops(scenario: Scenario) -> list[str]:
+    """Returns how long arms take to stop that the rule `glide` lets run so fast that it is long."""
+    lines: dict[str, list[str]] = {}
+    for name, spec in scenario.sites.items():
+        setup = scenario.setup(name)
+        qd = np.broadcast_to(setup.qd_limit_rad_s, len(spec.q0_rad))
+        stop_s = float(setup.rest.stop_s(qd))
+        if spec.on_stale.action == "glide" and stop_s > LONG_STOP_S:
+            way_rad = 0.5 * stop_s * float(np.max(qd))
+            text = f"take {stop_s:.3g} s and {way_rad:.3g} rad to stop from limits.qd_limit_rad_s"
+            lines.setdefault(f"{text} = {np.max(qd):g}", []).append(name)
+    return [f"arms of {', '.join(names)} {text}" for text, names in lines.items()]
+
+
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
+LONG_STOP_S = 1.5
+"""An arm that may take longer to stop is named."""
 _MOST = 80
 """Most letters of a value."""
 

@@ -1,0 +1,51 @@
+"""A page without a browser: its socket, which takes every frame and says so."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+from websockets.sync.client import ClientConnection, connect
+
+from trilat_net.net.clock import SystemClock
+
+PATIENCE_S = 60.0
+
+
+@contextmanager
+def page_client(address: str) -> Iterator["PageClient"]:
+    """A page at an address."""
+    with connect(f"ws://{urlsplit(address).netloc}/socket", max_size=None) as socket:
+        yield PageClient(socket)
+
+
+class PageClient:
+    """A page of a session's server, as `main.js` behaves.
+
+    Attributes:
+        frame: the newest.
+    """
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket = socket
+        self.frame: dict[str, Any] = {}
+        self.hello: dict[str, Any] = {}
+
+    def send(self, **message: Any) -> None:
+        """Sends a message."""
+        self.socket.send(json.dumps(message))
+
+    def take(self) -> dict[str, Any]:
+        """Takes the next frame, or greeting, and returns the newest frame."""
+        message = json.loads(self.socket.recv(PATIENCE_S))
+        self.hello, self.frame = (message["hello"], {}) if "hello" in message else (self.hello, message)
+        self.send(do="seen", n=self.hello["n"] if "hello" in message else message["n"])
+        return self.frame
+
+    def shows(self, mode: str) -> None:
+        """Returns once every site is in a mode."""
+        clock = SystemClock()
+        give_up_ns = clock.monotonic_ns() + int(PATIENCE_S * 1e9)
+        while {site["mode"] for site in self.take().get("sites", {}).values()} != {mode}:
+            assert clock.monotonic_ns() < give_up_ns, (mode, self.frame.get("sites"))

@@ -1,0 +1,141 @@
+"""Arms of a session that runs are stopped by command, from its page and by a key of `trilat watch`."""
+
+import fcntl
+import os
+import pty
+import re
+import signal
+import subprocess
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from tests.cli.running import COMMAND, PLAIN
+from tests.net.waiting import until
+from trilat_net.log.log_reader import open_log
+from trilat_net.scenario import list_shipped, load_scenario
+from trilat_net.scenario.operators import find_live_hand
+
+from .browsers import browser_page, needs_browser, page_address, shows, take_hold
+from .page_client import PageClient, page_client
+from .processes import Process, Stage, executed_again
+
+HELD = [
+    name
+    for name in list_shipped()
+    if any(find_live_hand(site.hands) is not None for site in load_scenario(name).sites.values())
+]
+"""Shipped scenarios whose arms people hold."""
+
+
+@contextmanager
+def watching(stage: Stage, session: str) -> Iterator[int]:
+    """`trilat watch` with a terminal, whose keys are pressed at the other end, once it shows the session."""
+    keys, terminal = pty.openpty()
+    printed, words = stage.folder / "watch.printed", [*COMMAND, "watch", "--session", session]
+    with printed.open("wb") as sink:
+        owns = {"stdin": terminal, "start_new_session": True, "preexec_fn": own_terminal}
+        watch = subprocess.Popen(words, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
+    try:
+        until(lambda: "m1" in printed.read_text(encoding="utf-8") or watch.poll() is not None, 60.0)
+        yield keys
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(30.0) == 128 + signal.SIGINT
+        assert "S or space: stop every arm" in printed.read_text(encoding="utf-8")
+    finally:
+        watch.kill()
+        watch.wait()
+        os.close(keys)
+        os.close(terminal)
+
+
+def own_terminal() -> None:
+    """Makes standard input the terminal of the process, as a shell's is."""
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+def live(stage: Stage, scenario: str, *options: str) -> Process:
+    """A session with a page."""
+    return stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options)
+
+
+def run(stage: Stage, *words: str) -> Process:
+    """A command that ends with 0."""
+    done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
+    assert done.code() == 0, done
+    return done
+
+
+def enabled(stage: Stage, page: PageClient) -> None:
+    page.shows("stopped")
+    run(stage, "enable", "--session", page.hello["session"])
+    page.shows("run")
+
+
+@pytest.mark.parametrize("scenario", HELD)
+def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again(
+    scenario: str, stage: Stage
+) -> None:
+    running = live(stage, scenario)
+    with page_client(page_address(running)) as page:
+        page.shows("run")
+        session = page.hello["session"]
+        stop = run(stage, "stop", "--session", session).text()
+        assert stop.startswith(f"stopping every arm of session {session} ...\n")
+        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(page.frame["sites"])
+        enabled(stage, page)
+        page.send(do="stop")
+        enabled(stage, page)
+        with watching(stage, session) as keys:
+            os.write(keys, b"s")
+            enabled(stage, page)
+        page.send(do="end")
+        running.prints("checking the log")  # as `demo` does
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    executed_again(open_log(stage.folder / "out" / "run.mcap"))
+
+
+@needs_browser
+@pytest.mark.long
+def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
+    running = live(stage, "play", "--set", "rate_hz=250")
+    modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
+    with browser_page(page_address(running), gl=False) as page:
+        shows(page, "trilat.frame && " + modes("run"))
+        for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
+            stop()
+            shows(page, modes("stopped"))
+            if "TRILAT_PICTURES" in os.environ:
+                page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stop.png")
+            run(stage, "enable", "--session", page.evaluate("trilat.hello.session"))
+            shows(page, modes("run"))
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
+
+
+@needs_browser
+@pytest.mark.long
+def test_whoever_holds_an_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
+    running = live(stage, "play", "--set", "rate_hz=250")
+    address = page_address(running)
+    with browser_page(address, gl=False) as first:
+        shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
+        second = first.context.browser.new_page()  # type: ignore[union-attr]
+        second.goto(address)
+        shows(second, "trilat.frame && trilat.frame.pages === 2")
+        first.bring_to_front()
+        take_hold(first, 0, 20.0, 5.0)
+        shows(first, "trilat.frame.holds.includes('m1')")
+        for answer in ("no", "yes"):
+            second.evaluate("document.getElementById('part').click()")
+            shows(first, "trilat.frame.asked.length === 1 && !document.getElementById('ask').hidden")
+            assert not second.evaluate("trilat.takesPart")
+            first.evaluate(f"document.getElementById('ask-{answer}').click()")
+            shows(second, "!trilat.frame.asks")
+            shows(second, f"trilat.takesPart === {str(answer == 'yes').lower()}")
+        first.mouse.up()
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")

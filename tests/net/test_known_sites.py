@@ -1,0 +1,123 @@
+"""The files of the sites that run on this machine: hints, for whoever must stop them at once."""
+
+import os
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.connection import Connection
+from trilat_net.net.known_sites import (
+    find_known_places,
+    find_known_sites,
+    make_site_known,
+    stop_at_once,
+)
+
+HERE = Connection(("tcp/127.0.0.1:1",), ("tcp/127.0.0.1:2",))
+SITES = ("m", "s")
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "trilat-net" / "running"
+
+
+def test_a_site_is_known_while_it_runs_and_to_its_user_alone(state: Path) -> None:
+    assert find_known_sites("t") == []
+    with make_site_known("t", "s", SITES, 7, HERE, b"order"):
+        (one,) = find_known_sites("t")
+        assert (one.site, tuple(one.sites), one.stop, one.keyed) == ("s", SITES, b"order", False)
+        assert one.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+        assert find_known_sites("another") == []
+        (file,) = state.iterdir()
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        assert stat.S_IMODE(state.stat().st_mode) == 0o700
+    assert list(state.iterdir()) == []
+
+
+def test_one_whose_process_or_machine_is_gone_counts_for_nothing(state: Path) -> None:
+    with make_site_known("t", "s", SITES, 7, HERE, b"order"):
+        (one,) = find_known_sites("t")
+    gone = subprocess.Popen([sys.executable, "-S", "-c", ""])
+    gone.wait()
+    for n, stale in enumerate(
+        (
+            msgspec.structs.replace(one, pid=gone.pid),
+            msgspec.structs.replace(one, machine=f"not {SystemClock().identity()}"),
+        )
+    ):
+        (state / f"{n}.json").write_bytes(msgspec.json.encode(stale))
+    assert find_known_sites("t") == []
+    assert list(state.iterdir()) == []
+
+
+@given(st.binary())
+def test_what_is_no_file_of_a_site_is_passed_over(data: bytes) -> None:
+    folder = Path(os.environ["XDG_STATE_HOME"]) / "trilat-net" / "running"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "x.json").write_bytes(data)
+    assert find_known_sites("t") == []
+
+
+def test_a_site_runs_where_no_file_can_be_written(state: Path) -> None:
+    state.parent.write_text("no folder")
+    with make_site_known("t", "s", SITES, 7, HERE, b"order"):
+        assert find_known_sites("t") == []
+
+
+def test_places_are_known_where_all_sites_are_and_as_the_member_reaches_them() -> None:
+    with make_site_known("t", "m", SITES, 6, HERE, b"order"):
+        assert find_known_places("t", Connection(connect=None)) is None
+        with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
+            assert find_known_places("t", Connection(connect=None)) == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+            assert find_known_places("t", Connection(connect=None, keyed=True)) is None
+            assert find_known_places("t", Connection(connect=None, mode="client")) is None
+
+
+def test_a_site_with_settings_of_its_user_is_for_nobody_else() -> None:
+    with make_site_known("t", "s", SITES, 7, replace(HERE, own={"x": 1}), b"order"):
+        assert find_known_sites("t") == []
+
+
+@pytest.mark.parametrize("words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]])
+def test_what_is_no_stop_of_arms_goes_the_long_way_silently(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert stop_at_once(words) == words
+    assert capsys.readouterr().out == ""
+
+
+@given(st.lists(st.text()))
+def test_any_words_go_the_long_way_as_they_are(words: list[str]) -> None:
+    assert stop_at_once(words) == words
+
+
+def test_it_says_at_once_that_it_tries(capsys: pytest.CaptureFixture[str]) -> None:
+    assert stop_at_once(["--session=t", "m", "s"]) == ["--session=t", "m", "s"]
+    assert capsys.readouterr().out == "stopping m, s of session t ...\n"
+    assert stop_at_once(["--session", "t", "--connect", "tcp/127.0.0.1:1"])
+    assert capsys.readouterr().out == "stopping every arm of session t ...\n"
+
+
+def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> None:
+    with make_site_known("t", "s", SITES, 7, replace(HERE, keyed=True, own={"x": 1}), b"order"):
+        assert stop_at_once(["--session", "t"]) == 2
+    assert "have keys: add --keys DIR" in capsys.readouterr().err
+
+
+def test_a_stop_imports_nothing_that_it_does_not_need() -> None:
+    code = (
+        "import sys; from trilat_net.net.known_sites import stop_at_once; stop_at_once(['--session', 't']); "
+        "print(*{'numba', 'numpy', 'scipy', 'typer', 'rich', 'cryptography', 'mcap'} & {*sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "stopping every arm of session t ...\n\n"
