@@ -160,7 +160,7 @@ def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
             time.sleep(0.1)
         x, y = page.evaluate(_TIP)
         page.evaluate(_STAMP)
-        with trilat_net.hand("play-demo", "m1", source="onlooker") as onlooker:
+        with trilat_net.hand("play", "m1", source="onlooker") as onlooker:
             watch = TargetWatch(onlooker)
             watch.start()
             page.mouse.move(x, y)

@@ -1,7 +1,7 @@
 """A gamepad as a hand: its left stick moves the end effector, its first button lets go.
 
     trilat demo play --duration 60
-    python examples/gamepad_hand.py play-demo m1
+    python examples/gamepad_hand.py play m1
 
 Linux alone; it needs python-evdev (`pip install evdev`) and a gamepad that this user may read.
 """
@@ -56,7 +56,7 @@ class Stick:
 def main() -> None:
     """Moves an arm until the session ends or Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play-demo")
+    parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the gamepad holds")
     parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
     options = parser.parse_args()

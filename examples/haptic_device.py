@@ -5,7 +5,7 @@ each millisecond the loop reads where the device is, tells the hand, and lets th
 the hand feels. It rests where both are equal: the scenario's stiffness, felt. Two terminals:
 
     trilat demo play --duration 60
-    python examples/haptic_device.py play-demo m1
+    python examples/haptic_device.py play m1
 
 For a device of your own give `Device` its driver: `position_m` reads its encoders, `render` sets its motors.
 """
@@ -39,7 +39,7 @@ class Device:
 def main() -> None:
     """Renders an arm on the device for some seconds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play-demo")
+    parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the device holds")
     parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
     parser.add_argument("--seconds", type=float, default=10.0)

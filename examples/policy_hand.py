@@ -6,7 +6,7 @@ matrix, changed by ramps of a second. The example prints the largest step of eve
 tick, while somebody leads and while the lead changes. Two terminals:
 
     trilat demo play --duration 60
-    python examples/policy_hand.py play-demo
+    python examples/policy_hand.py play
 """
 
 import argparse
@@ -69,7 +69,7 @@ class References:
 def main() -> None:
     """Leads the slave, hands over, and takes back."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", help="its name, as in play-demo")
+    parser.add_argument("session", help="its name, as in play")
     parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
     parser.add_argument("--alone", action="store_true", help="leave m1 to a real person")
     parser.add_argument("--seconds", type=float, default=15.0, help="in all; the lead changes at each third")

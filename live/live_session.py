@@ -5,6 +5,7 @@ runs on if it fails. A browser is opened only where there is one.
 """
 
 import os
+import socket
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
@@ -45,16 +46,21 @@ class PageOptions:
     opens: bool = True
 
     def check(self) -> None:
-        """Refuses to serve others without being told that it is not safe.
+        """Refuses an address that is taken, and to serve others without being told that it is not safe.
 
         Raises:
-            UsageError: it would.
+            UsageError: with the reason.
         """
         if self.host not in LOOPBACK and not self.insecure:
             raise UsageError(
                 f"--host {self.host}: whoever reads the network reads the page's token and could take part; "
                 "say --insecure if that network is yours, or leave out --host and use an SSH tunnel"
             )
+        try:
+            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+            socket.create_server((self.host, self.port), family=family).close()
+        except OSError as error:
+            raise UsageError(f"{self.host}:{self.port}: cannot listen: {error.strerror}") from None
 
 
 def attend_with_page(options: PageOptions, clock: Clock, say: Callable[[str], None]) -> SessionAttendant:

@@ -84,11 +84,6 @@ class _Child:
         return f"{self.name} ended with code {code}: {last}"
 
 
-def demo_session_name(scenario: Scenario) -> str:
-    """Returns the name of a demo's session, for `trilat set` and `trilat ping`."""
-    return f"{scenario.name}-demo"
-
-
 SessionAttendant = Callable[[str, Sequence[str]], AbstractContextManager[Callable[[], bool]]]
 """Given a session's name and the endpoints of its sites, a context that lasts as long as the session; what it
 yields returns true once the session is to end."""
@@ -97,14 +92,16 @@ yields returns true once the session is to end."""
 def run_demo(
     scenario: Scenario, folder: Path, display: SessionDisplay, attend: SessionAttendant | None = None
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder; its log is valid whenever the session began.
+    """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
+
+    Its log is valid whenever the session began.
 
     Raises:
         ScenarioError: an arm outside of the program lacks limits.
     """
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
-    session, clock = demo_session_name(scenario), SystemClock()
+    session, clock = scenario.name, SystemClock()
     with Interrupt() as interrupt, ExitStack() as reserved:
         layouts = {arm.counts: name for name, arm in scenario.arms.items()}
         chains = any(arm.chain is not None for arm in scenario.arms.values())
@@ -123,10 +120,10 @@ def run_demo(
         attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints)
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
-                monitor = SessionMonitor(bus, session, scenario.names)
+                monitor = SessionMonitor(bus, session, scenario)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, recorder], result)):
                     monitor.poll()
-                    display.update(monitor.latest)
+                    display.update(monitor)
                     for text in monitor.take_news():
                         display.say(text)
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)

@@ -25,6 +25,7 @@ def run(
     duration_s: float | None = None,
     seed: int | None = None,
     out: str | Path | None = None,
+    force: bool = False,
     quiet: bool = True,
 ) -> Log:
     """Runs a scenario live, a process per site and a recorder over Zenoh, and returns its log.
@@ -41,6 +42,7 @@ def run(
         duration_s: the duration of the run, s; by default the scenario's.
         seed: the seed; by default the scenario's.
         out: folder of the log; by default the next free runs/NAME-N.
+        force: whether it may hold something already.
         quiet: whether nothing is printed while it runs.
 
     Raises:
@@ -48,11 +50,13 @@ def run(
         RunFailed: a process failed, or the run was interrupted; it says what the log holds.
     """
     chosen = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
-    folder = make_results_folder(None if out is None else Path(out), chosen.name, force=False)
+    folder = make_results_folder(None if out is None else Path(out), chosen.name, force=force)
     with SessionDisplay(chosen, Console(quiet=quiet)) as display:
         result = run_demo(chosen, folder, display)
     problems = ["interrupted"] if result.interrupted else result.problems
     if problems:
         kept = f"; {result.log} holds what there was" if result.log.exists() else ""
         raise RunFailed("; ".join(problems) + kept)
-    return open_log(result.log)
+    log = open_log(result.log)
+    log.warn_if_diverged()
+    return log

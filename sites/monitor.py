@@ -4,17 +4,22 @@ A terminal shows a table; other outputs get a line every two seconds.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 
+import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
 from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import WireError
+from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.membership import read_events, read_messages
-from trilat_net.net.messages import LinkStats
+from trilat_net.net.messages import LinkStats, State
+from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario
 
 LOUD_EVENTS = frozenset(
@@ -24,14 +29,16 @@ LOUD_EVENTS = frozenset(
 
 
 class SessionMonitor:
-    """The latest statistics of every site of a session, and event texts for the user, not yet taken."""
+    """The latest of every site of a session: statistics, error and torque; event texts, not yet taken."""
 
-    def __init__(self, bus: Bus, session: str, sites: Sequence[str]) -> None:
+    def __init__(self, bus: Bus, session: str, scenario: Scenario) -> None:
         self.latest: dict[str, LinkStats] = {}
+        self.motion: dict[str, tuple[str, str]] = {}
         self.news: list[str] = []
-        self._sites = sites
+        self._scenario, self._sites = scenario, scenario.names
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
+        self._states = {name: bus.inbox(topics.key(session, name, topics.STATE), 1) for name in self._sites}
 
     def poll(self) -> None:
         """Takes the messages that have arrived."""
@@ -41,6 +48,19 @@ class SessionMonitor:
         for event in read_events(self._events):
             if event.kind in LOUD_EVENTS:
                 self.news.append(event.text)
+        for name, states in self._states.items():
+            if (message := states.poll()) is not None:
+                with suppress(WireError):
+                    self.motion[name] = self._describe_motion(name, message[1])
+
+    def _describe_motion(self, site: str, block: bytes) -> tuple[str, str]:
+        """Returns the error and the largest torque of the last record of a block."""
+        *_, last = split_states(block)
+        record = decode(last, State, layout=self._scenario.layout(site))
+        own, desired = (np.array([v]) for v in (record.x or record.q, record.q_des))
+        e = find_task_errors(own, desired, self._scenario.arms[site].axes) if record.x else own - desired
+        error = f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}"
+        return error, f"{max(map(abs, record.tau)):.2f} N m"
 
     def take_news(self) -> Sequence[str]:
         """Returns the event texts since the last call."""
@@ -67,40 +87,41 @@ class SessionDisplay:
         if self._live:
             self._live.stop()
 
-    def update(self, latest: dict[str, LinkStats]) -> None:
-        """Shows the latest statistics of every site."""
+    def update(self, monitor: SessionMonitor) -> None:
+        """Shows the latest of every site."""
         self._updates += 1
         if self._live:
             self._live.start()  # not before: what ends at a signal until then could not restore the terminal
-            self._live.update(self._table(latest), refresh=True)
-        elif latest and self._updates % LINE_EVERY == 0:
-            self._console.print(self._line(latest), highlight=False, markup=False, soft_wrap=True)
+            self._live.update(self._table(monitor), refresh=True)
+        elif monitor.latest and self._updates % LINE_EVERY == 0:
+            self._console.print(self._line(monitor), highlight=False, markup=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Prints a line above the table."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def _table(self, latest: dict[str, LinkStats]) -> Table:
+    def _table(self, monitor: SessionMonitor) -> Table:
         table = Table(title=f"{self._scenario.name}, {self._scenario.duration_s:g} s", title_justify="left")
-        for column in ("site", "mode", "time", "tick", "late now", "overruns", "age of each peer's sample"):
+        for column in ("site", "mode", "time", "|e|", "torque", "late", "overruns", "age of peers' samples"):
             table.add_column(column, justify="left" if column[:3] in ("sit", "mod", "age") else "right")
         for name in self._scenario.names:
-            stats = latest.get(name)
+            stats, motion = monitor.latest.get(name), monitor.motion.get(name, ("", ""))
             if stats is None:
-                table.add_row(name, "braked", "", "", "", "", "")
+                table.add_row(name, "braked", *[""] * 6)
                 continue
             ages = "  ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
             time, late = f"{stats.t_ns / NS_PER_S:.1f} s", f"{stats.late_max_us} us"
-            table.add_row(
-                name, escape(stats.mode), time, f"{stats.tick}", late, f"{stats.overruns}", escape(ages)
-            )
+            table.add_row(name, escape(stats.mode), time, *motion, late, f"{stats.overruns}", escape(ages))
         return table
 
-    def _line(self, latest: dict[str, LinkStats]) -> str:
+    def _line(self, monitor: SessionMonitor) -> str:
         parts = []
-        for name, stats in sorted(latest.items(), key=lambda item: self._scenario.names.index(item[0])):
+        for name in filter(monitor.latest.__contains__, self._scenario.names):
+            stats, (error, torque) = monitor.latest[name], monitor.motion.get(name, ("", ""))
             ages = ", ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
-            parts.append(f"{name} {stats.mode} tick {stats.tick} late {stats.late_max_us} us (age {ages})")
+            motion = f"|e| {error}, torque {torque}, " if error else ""
+            time = f"{name} {stats.mode} {stats.t_ns / NS_PER_S:.1f} s: "
+            parts.append(f"{time}{motion}late {stats.late_max_us} us (age {ages})")
         return "; ".join(parts)
 
 

@@ -104,7 +104,7 @@ def session(
 ) -> RunningSession:
     """Returns a running session, to stop, change and measure it; as `trilat stop`, `set`, `ping`.
 
-    >>> paper = tn.session("paper-demo")  # doctest: +SKIP
+    >>> paper = tn.session("paper")  # doctest: +SKIP
     >>> paper.set_link("m1->s", delay_ms=350)  # doctest: +SKIP
     >>> paper.stop("s"), paper.enable("s"), paper.ping()  # doctest: +SKIP
 

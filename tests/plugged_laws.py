@@ -132,3 +132,50 @@ class BeyondEnd(Refused):
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
             now.tau[i] = self.work[now.k]
+
+
+class Arithmetic:
+    """P+d without memory, of whole vectors."""
+
+    def __init__(self, _facts: LawContext) -> None:
+        self.K, self.d = 20.0, 5.0
+
+    def torque(self, now: LawInput) -> Any:
+        pulls = [peer.alpha * (now.q - peer.q) for peer in now.peers]
+        return now.gravity - self.K * sum(pulls, 0.0 * now.q) - self.d * now.qd
+
+
+@compiled
+class ByNumbers(Arithmetic):
+    """The same, number by number."""
+
+    def torque(self, now: LawInput) -> Any:
+        for i in range(now.joints):
+            pull = 0.0 * now.q[i]
+            for j in range(len(now.peers)):
+                pull += now.peers[j].alpha * (now.q[i] - now.peers[j].q[i])
+            now.tau[i] = now.gravity[i] - self.K * pull - self.d * now.qd[i]
+
+
+class Sums(Arithmetic):
+    """Has memory, and does not say so."""
+
+    def torque(self, now: LawInput) -> Any:
+        self.sums = now.q
+        return -now.q
+
+
+class SumsEach(Arithmetic):
+    def torque(self, now: LawInput) -> Any:
+        self.sums[0] += now.q[0]
+        return -now.q
+
+
+class Squares(Arithmetic):
+    def torque(self, now: LawInput) -> Any:
+        return -(now.qd**2)
+
+
+class Mismatched(Arithmetic):
+    def torque(self, now: LawInput) -> Any:
+        return now.q - [0.0, 0.0, 0.0]

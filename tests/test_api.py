@@ -3,7 +3,8 @@
 import doctest
 import inspect
 import json
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Mapping
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from tests.cli.running import trilat
 from tests.golden.surface import all_options
 from tests.json_outline import PAGE, build_page, is_documented
 from tests.laws import Adaptive
-from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.errors import ScenarioError, TrilatError, UsageError
 from trilat_net.results import Result
 
 FUNCTIONS = [name for name in tn.__all__ if name != "__version__"]
@@ -166,6 +167,76 @@ def test_a_scenario_is_a_name_a_text_its_tables_or_itself(tmp_path: Path) -> Non
     for source in (named, text, tmp_path / "mine.toml"):
         assert tn.load_scenario(source) == named
     assert tn.load_scenario("two_sites", {"control.Kd": 5}, seed=3).seed == 3
+
+
+def test_a_log_is_a_mapping_of_its_sites(file: Path) -> None:
+    log = tn.open_log(file)
+    assert isinstance(log, Mapping)
+    assert (list(log), len(log), "m" in log, "x" in log) == (["m", "s"], 2, True, False)
+    assert {name: part.q.shape for name, part in log.items()} == dict.fromkeys("ms", (200, 2))
+    assert log.get("x") is None
+    assert {log: 1}[log] == 1
+    assert log != tn.open_log(file)
+
+
+def test_a_run_that_diverged_says_so() -> None:
+    keys = {"limits.qd_limit_rad_s": 0.5}
+    with pytest.warns(RuntimeWarning, match=r"the run diverged at .* s, and ends there") as caught:
+        log = tn.simulate("two_sites", keys, duration_s=5)
+    assert caught[0].filename == __file__
+    assert log.diverged_s == min(part.t_s[-1] for part in log.values() if part.mode[-1] == "diverged")
+    assert f"DIVERGED at {log.diverged_s:.3f} s" in repr(log)
+    still = tn.simulate("two_sites", duration_s=0.1)
+    assert still.diverged_s is None
+    assert "DIVERGED" not in repr(still)
+
+
+WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+    "scenario": (lambda _: tn.simulate(42), "42: no scenario of that name"),
+    "set": (lambda _: tn.simulate("two_sites", 5), "an override reads KEY=VALUE, as in control.Kd=5, not 5"),
+    "set[]": (lambda _: tn.simulate("two_sites", [5]), "an override reads KEY=VALUE"),
+    "set key": (lambda _: tn.simulate("two_sites", {5: 5}), "5: unknown key"),
+    "set value": (lambda _: tn.simulate("two_sites", {"control.Kd": None}), "control.Kd: expected"),
+    "log": (lambda _: tn.open_log("nothing.mcap"), "^nothing.mcap: cannot be read"),
+    "log is none": (lambda _: tn.verify(None), "a log is a path, or a file opened for reading, not None"),
+    "site": (lambda file: tn.open_log(file)["x"], "^no site 'x' in .*; it has m, s$"),
+    "table": (lambda file: tn.open_log(file).table("m", "x"), "^no table 'x' of m"),
+    "save": (lambda file: tn.simulate("two_sites", duration_s=0.1).save(file), "replace it with force=True$"),
+    "report": (lambda file: tn.report(file, file.parent), "choose another folder, or use force=True$"),
+    "run": (lambda file: tn.run("two_sites", out=file.parent), "choose another folder, or use force=True$"),
+    "sweep out": (lambda file: tn.sweep("free", "control.Kd=1,2", out=file.parent), "another folder$"),
+    "export": (lambda file: tn.export(file, "npz", file), "replace it with force=True$"),
+    "sweep seeds": (lambda _: tn.sweep("free", "control.Kd=1,2", seeds="1..3"), "^seeds is how many"),
+    "sweep over": (lambda _: tn.sweep("free", 5), "^over reads KEY=VALUES"),
+    "sweep law": (lambda _: tn.sweep("free", laws="pd"), "^laws: there is no law 'pd'"),
+    "margin": (lambda _: tn.margin("free", "x"), "^along reads KEY=FROM:TO"),
+    "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent is from 50"),
+    "rerun": (lambda file: tn.rerun(file), r"replace=NAME \(of m, s\), or closed_loop=True for all"),
+    "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 in wide, not x"),
+    "linear": (lambda _: tn.linear("two_sites", pose=["x"]), "a pose is of angles in rad"),
+    "bench": (lambda _: tn.bench(seeds=0), "^seeds is how many, 1 to 1000, not 0"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_errors_in_python_are_of_one_type_and_name_arguments(what: str, file: Path) -> None:
+    call, told = WRONG[what]
+    with pytest.raises(TrilatError, match=told) as caught:
+        call(file)
+    assert "--" not in str(caught.value)
+
+
+def test_an_error_names_arguments_and_whole_commands() -> None:
+    error = UsageError("x: trilat log recover x --force; or take -o, --seeds 5, --keys DIR or --force")
+    assert str(error) == "x: trilat log recover x --force; or take out, seeds=5, keys=DIR or force=True"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    keys = {"control.Kd": np.array([5.0, 5.0]), "control.Kp": np.float64(2.0), "seed": np.int64(3)}
+    same = {"control.Kd": 5.0, "control.Kp": 2.0, "seed": 3, "duration_s": 0.5}
+    given = tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5))
+    assert given == tn.load_scenario("two_sites", same)
 
 
 def test_a_law_is_given_as_its_class() -> None:

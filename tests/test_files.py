@@ -29,7 +29,7 @@ def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) ->
     make(tmp_path / "out", "1", folder=folder)
     there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
     assert everything(tmp_path) == there
-    with pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"):
+    with pytest.raises(UsageError, match="exists; choose another name, or replace it with force=True"):
         make(tmp_path / "out", "2", folder=folder)
     assert everything(tmp_path) == there
     make(tmp_path / "out", "3", folder=folder, force=True)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 AnyScenario = str | Path | Mapping[str, Any] | Scenario
 AnyLog = str | Path | Log
 Overrides = Mapping[str, Any] | Sequence[str]
+Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _open(log: AnyLog) -> Log:
@@ -44,8 +45,9 @@ def _texts(overrides: Overrides, duration_s: float | None) -> list[str]:
     """Returns overrides as the command line takes them."""
     from .studies.trials.trial import list_assignments
 
-    texts = list_assignments(overrides) if isinstance(overrides, Mapping) else overrides
-    return [*texts, *([] if duration_s is None else [f"duration_s={float(duration_s)!r}"])]
+    listed = overrides if isinstance(overrides, list | tuple) else [overrides]
+    texts = list_assignments(overrides) if isinstance(overrides, Mapping) else listed
+    return [*texts, *([] if duration_s is None else [f"duration_s={duration_s}"])]
 
 
 def simulate(
@@ -56,6 +58,8 @@ def simulate(
     seed: int | None = None,
 ) -> SimulatedLog:
     """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
+
+    Of a run that diverged it warns; `log.diverged_s` says when.
 
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
@@ -70,7 +74,9 @@ def simulate(
     Raises:
         ScenarioError: the scenario or an override is not valid.
     """
-    return simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    log.warn_if_diverged()
+    return log
 
 
 def info(*files: str | Path) -> FileOverview:
@@ -205,8 +211,10 @@ def compare(*logs: AnyLog) -> "LogComparison":
     return compare_logs([_open(log) for log in logs])
 
 
-def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -> "Conclusion":
-    """Writes the figures, the page and the summary of a log in a file; the command is `trilat report`.
+def report(
+    log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
+) -> "Conclusion":
+    """Writes the page and the summary of a log in a file; the command is `trilat report`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
@@ -216,6 +224,7 @@ def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -
         log: the log's path, or the log that was opened from it.
         out: the folder; by default the file's name without .mcap.
         force: whether the folder may hold something already.
+        png: whether every figure is written as a PNG file too.
 
     Raises:
         UsageError: the folder holds something, or the log is in no file.
@@ -227,7 +236,7 @@ def report(log: AnyLog, out: str | Path | None = None, *, force: bool = False) -
     if not first.is_file():
         raise UsageError("a report is of a log in a file: save it first, as in log.save('run.mcap')")
     folder = first.with_suffix("") if out is None else Path(out)
-    return conclude(opened, make_results_folder(folder, "", force=force))
+    return conclude(opened, make_results_folder(folder, "", force=force), png=png)
 
 
 def linear(
@@ -258,13 +267,16 @@ def linear(
     """
     from .theory.linear_analysis import analyse_linearly
 
-    fixed = None if pose is None else tuple(map(float, pose))
+    try:
+        fixed = None if pose is None else tuple(map(float, pose))
+    except (TypeError, ValueError):
+        raise UsageError(f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}") from None
     return analyse_linearly(load_scenario(scenario, set), pose=fixed, roots=roots, over=over, ports=ports)
 
 
 def sweep(
     scenario: AnyScenario,
-    over: Sequence[str] = (),
+    over: Axes = (),
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     seeds: int | Sequence[int] = 1,
@@ -277,13 +289,14 @@ def sweep(
 ) -> "SweepResults":
     """Runs a scenario over a grid of its keys and classifies stability; the command is `trilat sweep`.
 
-    >>> found = tn.sweep("p_d_margin", ["control.d=0.3,3"], duration_s=2, out="grid", jobs=1)
+    >>> found = tn.sweep("p_d_margin", {"control.d": [0.3, 3.0]}, duration_s=2, out="grid", jobs=1)
     >>> len(found.rows)
     2
 
     Args:
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        over: the axes, as in `["link.delay_ms=0:1600:50"]`.
+        over: the axes, as in `{"link.delay_ms": range(0, 1601, 50)}`: lists or arrays of values by key; or
+            as texts, `["link.delay_ms=0:1600:50"]`.
         set: what is to be changed everywhere, as in `{"control.Kd": 5}`.
         seeds: how many, or which.
         laws: names of laws, or classes, to sweep besides.
@@ -310,7 +323,7 @@ def sweep(
 def margin(
     scenario: AnyScenario,
     along: str,
-    over: Sequence[str] = (),
+    over: Axes = (),
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     tolerance: float = 0.005,
@@ -329,7 +342,7 @@ def margin(
     Args:
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         along: the key and its range, as in "control.d=0.2:3".
-        over: axes at every point of which it is searched, as in `["link.delay_ms=100,200"]`.
+        over: axes at every point of which it is searched, as in `{"link.delay_ms": [100, 200]}`, as `sweep`.
         set: what is to be changed everywhere.
         tolerance: how wide an edge may be, relative to its value.
         seeds: how many, or which.
@@ -349,9 +362,10 @@ def margin(
         parse_search_range,
         search_margins,
     )
+    from .studies.sweep.sweep_plan import list_axes
 
     within = parse_search_range(along, tolerance)
-    axes = [*over, format_range_axis(within)]
+    axes = [*list_axes(over), format_range_axis(within)]
     plan = plan_sweep(scenario, _texts(set, duration_s), over=axes, seeds=seeds, laws=laws)
     return SweepMargins(plan, within, search_margins(plan, within, jobs, on=on))
 

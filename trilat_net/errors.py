@@ -1,16 +1,47 @@
 """Errors, by who has to act: the author of a scenario, the caller, a peer, a file, the program.
 
 Invariant: an error carries its data and one sentence that names the problem, its place and the remedy. The
-command line prints that sentence and nothing else; `exit_code` is the code that a command ends with.
+command line prints that sentence and nothing else; `exit_code` is the code that a command ends with. Options
+that it names are those of a command in a command, and arguments in Python.
 """
 
+import re
 from functools import partial
+from typing import ClassVar
+
+_OPTION = re.compile(r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?")
+_SWITCHES = ("--force", "--insecure", "--full", "--closed-loop")
+_ARGUMENTS = {"-o": "out", "--resume": "the same out", "--duration": "duration_s", "--longest": "longest_s"}
+_ARGUMENTS |= {"--law": "laws", "--margin": "along", "--gravity": "gravity_percent"}
+"""Arguments in Python that are not called as their options."""
+
+
+def _name_argument(found: re.Match[str]) -> str:
+    """Returns an option as an argument; a whole command stays."""
+    command, option, value = found.groups()
+    if command:
+        return str(command)
+    name = _ARGUMENTS.get(option) or option.lstrip("-").replace("-", "_")
+    value = " True" if option in _SWITCHES else value
+    return f"{name}={value.strip()}" if value else name
 
 
 class TrilatError(Exception):
     """Base of all errors that a user can act on; a command ends with `exit_code`."""
 
     exit_code = 1
+    in_command: ClassVar[bool] = False
+    """True in a process that runs a command."""
+
+    def __str__(self) -> str:
+        text = Exception.__str__(self)  # a KeyError's would be quoted
+        return text if TrilatError.in_command else _OPTION.sub(_name_argument, text)
+
+
+class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
+    """A name that a mapping of results does not have, as of a site that a log lacks."""
+
+    exit_code = 2
 
 
 class ScenarioError(TrilatError):

@@ -72,11 +72,11 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
-def make_results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
+def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for results: the given one, or the next free `runs/NAME-N`.
 
     Raises:
-        UsageError: it holds something (and `force` is not set), or it cannot be made.
+        UsageError: it holds something (and `force` is not set; None: cannot be set), or it cannot be made.
     """
     if folder is None:
         return _make_next_folder(name)
@@ -85,7 +85,8 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool) -> Path:
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
     if occupied:
-        raise UsageError(f"{folder}: holds something; choose another folder, or use --force")
+        forced = "" if force is None else ", or use --force"
+        raise UsageError(f"{folder}: holds something; choose another folder{forced}")
     return make_folder(folder)
 
 

@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any
 
+from .errors import TrilatError
+
 _PARENT_POLL_S = 0.5
 """How often a worker looks whether its parent is still there."""
 
@@ -179,7 +181,8 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
     warnings.filterwarnings("ignore", "A worker was restarted")  # each keeps the laws that it compiled
-    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=(os.getpid(),))
+    facts = (os.getpid(), TrilatError.in_command)
+    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=facts)
     try:
         with hold_sigint():
             pool.submit(os.getpid)  # starts all processes, which inherit it
@@ -211,7 +214,8 @@ def hold_sigint() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def _prepare_worker(parent: int) -> None:
+def _prepare_worker(parent: int, in_command: bool) -> None:
+    TrilatError.in_command = in_command
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
 

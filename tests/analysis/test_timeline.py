@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 
 from trilat_net.analysis.timeline import (
     FOLLOWING_MODES,
-    diverged_at_s,
     find_mode_intervals,
     list_changes,
     list_stated_models,
@@ -31,7 +30,7 @@ def test_spans_are_the_ticks_at_which_a_site_did_not_follow(modes):
     assert found == away
     for before, after in zip(find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False):
         assert (before.mode, before.to_s) != (after.mode, after.from_s)  # one span, not two in a row
-    assert (diverged_at_s(part) is None) == (modes[-1:] != ["diverged"])
+    assert (part.diverged_s is None) == (modes[-1:] != ["diverged"])
 
 
 def test_what_is_stated_of_a_link_changes_with_it():

@@ -112,18 +112,20 @@ def test_a_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) ->
     trilat(*sim, *JITTER, cwd=tmp_path).succeeds()
     before = (tmp_path / "run.mcap").read_bytes()
     text = trilat("report", "run.mcap", cwd=tmp_path).succeeds()
+    assert text.splitlines()[0].split()[1] == "stability:"
+    assert text.splitlines()[-1] == "open first: run/report.html"
     assert "400/400 records identical" in text
     assert "certificate: " in text
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html")
     assert 'src="http' not in page  # it works offline
     assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-    written = {f"run/{path.name}" for path in (tmp_path / "run").iterdir()}
-    assert (
-        {"run/report.html", "run/summary.json", "run/certificate.png"}
-        <= written
-        == {line.strip() for line in text.splitlines() if line.startswith("  run/")}
-    )
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.html", "summary.json"}
+    assert "  run/summary.json" in text.splitlines()
+    drawn = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
+    pictures = {f"  drawn/{path.name}" for path in (tmp_path / "drawn").glob("*.png")}
+    assert "  drawn/certificate.png" in pictures
+    assert pictures <= set(drawn.splitlines())
     links = [line for line in text.splitlines() if line.startswith("link ")]
     assert [line.partition(": stated uniform 50 +- 23.1 ms; effective ")[0] for line in links] == [
         "link s->m",

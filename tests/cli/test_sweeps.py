@@ -1,6 +1,7 @@
 """`trilat sweep` with `--map`, `--margin`, `--confirm`: what it prints, what it leaves, what it refuses."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,7 @@ def test_a_sweep_says_what_it_does_what_came_of_it_and_what_is_next(folder: Path
     (verdicts,) = (line for line in lines if line.startswith("12 runs of 12 cells: "))
     assert sum(int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")) == 12
     assert "times real time per process" in text
+    assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1  # without lines of progress
     assert "results: runs/sweep-trio-001/results.parquet" in lines
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again

@@ -1,15 +1,19 @@
 """Laws plugged into a tick: what they see and send; the compiled form gives the bits of the plain one."""
 
 import math
+import operator
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from trilat_net import compiled
+import trilat_net
 from trilat_net.core.law_channel import LawChannel, SentVector, join_received
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, TickInput, TickRecord
+from trilat_net.core.user_law import LawVector
 from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
@@ -111,7 +115,7 @@ REFUSED = {
     "CallsMethod": "it calls its method double: use a function with @trilat_net.compiled",
     "ReadsText": "self.name is a str: a number, or a list of numbers of fixed length, is taken",
     "ReadsNothing": "self.gain is no attribute of it",
-    "MakesList": r"it makes an array or a list \(line \d+\): make it in __init__, and write into it here",
+    "MakesList": r"it makes an array or a list \(line \d+\): arithmetic goes number by number, as in now",
     "Returns": "torque returns something: compiled, it writes now.tau instead",
     "RemembersText": "name, which it remembers, is neither a number nor a list of numbers",
 }
@@ -124,9 +128,49 @@ def test_what_numba_does_not_take_is_refused_with_its_reason(law: str) -> None:
     assert caught.value.path == "sites.s.control.law"
 
 
-def test_a_compiled_class_says_what_it_remembers() -> None:
-    with pytest.raises(TypeError, match="Law lacks remembers"):
-        compiled(type("Law", (), {}))
+def test_a_law_without_memory_says_nothing_of_it_and_its_vectors_have_arithmetic() -> None:
+    whole, parts = (
+        trilat_net.simulate("two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.2)
+        for law in ("Arithmetic", "ByNumbers")
+    )
+    for site in whole:
+        assert np.array_equal(whole[site].q, parts[site].q)
+        assert np.array_equal(whole[site].tau, parts[site].tau)
+    assert trilat_net.verify(whole, resume_every=20).passed
+
+
+@pytest.mark.parametrize("law", ["Sums", "SumsEach"])
+def test_a_law_with_memory_says_so(law: str) -> None:
+    with pytest.raises(ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"):
+        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
+
+
+NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3)
+
+
+@given(NUMBERS, NUMBERS, st.floats(0.1, 10.0))
+def test_arithmetic_of_vectors_is_that_of_arrays(a: list[float], b: list[float], x: float) -> None:
+    for operate in (operator.add, operator.sub, operator.mul):
+        expected = operate(np.array(a), np.array(b))
+        for one, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
+            if LawVector in (type(one), type(other)) and (type(one), operate) != (list, operator.mul):
+                assert operate(one, other) == expected.tolist()
+        assert np.array_equal(operate(LawVector(a), np.array(b)), expected)
+        assert np.array_equal(operate(np.array(a), LawVector(b)), expected)
+        assert operate(LawVector(a), x) == operate(np.array(a), x).tolist()
+        assert operate(x, LawVector(a)) == operate(x, np.array(a)).tolist()
+    assert LawVector(a) / x == (np.array(a) / x).tolist()
+    assert -LawVector(a) == [-one for one in a]
+    total = LawVector(a)
+    total += b
+    total *= 2
+    assert total == (2 * (np.array(a) + np.array(b))).tolist()
+
+
+def test_arithmetic_that_vectors_lack_says_what_has_it() -> None:
+    for law, fact in (("Squares", "as in numpy.asarray"), ("Mismatched", "arithmetic of 2 numbers with 3")):
+        with pytest.raises(LawFailed, match=fact):
+            trilat_net.simulate("two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.1)
 
 
 FAILING = {

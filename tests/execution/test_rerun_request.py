@@ -92,7 +92,10 @@ def test_every_site_is_a_closed_loop() -> None:
 
 @pytest.mark.parametrize(
     ("replace", "closed_loop", "facts"),
-    [([], False, ["--replace", "m1, m2, s", "--closed-loop"]), (["s"], True, ["--replace", "--closed-loop"])],
+    [
+        ([], False, ["replace", "m1, m2, s", "closed_loop=True"]),
+        (["s"], True, ["replace", "closed_loop=True"]),
+    ],
 )
 def test_it_must_be_said_which_sites_once(replace: list[str], closed_loop: bool, facts: list[str]) -> None:
     with pytest.raises(UsageError) as caught:
@@ -105,12 +108,12 @@ def test_it_must_be_said_which_sites_once(replace: list[str], closed_loop: bool,
     [
         (["control.Kdd=5"], ["control.Kdd", "did you mean 'Kd'"]),
         (["sites.q.control.Kd=5"], ["sites.q", "m1, m2, s"]),
-        (["rate_hz=500"], ["rate_hz", "--closed-loop"]),
-        (["sites.s.rate_hz=500"], ["sites.s.rate_hz", "--closed-loop"]),
-        (["sites.m1.rate_hz=500"], ["sites.m1.rate_hz", "--closed-loop"]),
-        (["sites.m1.control.Kd=5"], ["sites.m1.control.Kd", "--replace m1", "only s"]),
-        (["links.s->m1.delay_ms=5"], ["links.s->m1", "receiver", "--replace m1"]),
-        (["dominance.m2.s=1"], ["dominance.m2", "--replace m2"]),
+        (["rate_hz=500"], ["rate_hz", "closed_loop=True"]),
+        (["sites.s.rate_hz=500"], ["sites.s.rate_hz", "closed_loop=True"]),
+        (["sites.m1.rate_hz=500"], ["sites.m1.rate_hz", "closed_loop=True"]),
+        (["sites.m1.control.Kd=5"], ["sites.m1.control.Kd", "replace m1", "only s"]),
+        (["links.s->m1.delay_ms=5"], ["links.s->m1", "receiver", "replace m1"]),
+        (["dominance.m2.s=1"], ["dominance.m2", "replace m2"]),
         (["duration_s=30"], ["duration_s", "0.12 s", "not known"]),
         (["name=other"], ["name", "nothing that is executed"]),
         (["expect.stable=true"], ["expect.stable", "nothing that is executed"]),

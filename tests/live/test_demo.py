@@ -1,11 +1,14 @@
 """The demo ends in order whatever happens: it says what, its children are gone, its log is valid."""
 
 import os
+import shlex
 import signal
 from pathlib import Path
 
 import pytest
 
+import trilat_net
+from tests.cli.running import trilat
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
@@ -86,6 +89,19 @@ def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
+def test_a_demo_bears_the_name_of_its_scenario_and_shows_errors_and_torques(stage: Stage) -> None:
+    """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
+    running = stage.start("demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out"))
+    recording(stage)
+    with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
+        hand.move(*hand.pose)
+    running.prints("|e| ")
+    running.signal(signal.SIGINT)
+    assert running.code() == 130
+    assert "session play; Ctrl-C ends it" in running.text()
+    assert " N m, late " in running.text()
+
+
 @pytest.mark.long
 def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Stage) -> None:
     running = demo(stage, duration="0.5")
@@ -97,3 +113,8 @@ def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Sta
     log = open_log(stage.folder / "out" / "run.mcap")
     assert log.complete
     assert verify(log).identical == 1000
+    words = next(line for line in running.text().splitlines() if "drawn later: " in line)
+    assert f"the log is kept: {log.source}" in words
+    later = shlex.split(words.partition("drawn later: trilat ")[2])
+    done = trilat(*later, cwd=stage.folder)
+    assert (done.code, (stage.folder / "out" / "report.html").exists()) == (0, True), done

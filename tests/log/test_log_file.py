@@ -104,7 +104,7 @@ def test_what_exists_is_replaced_only_when_asked_and_only_when_the_new_one_is_wh
     path = tmp_path / "run.mcap"
     path.write_bytes(b"precious")
     with (
-        pytest.raises(UsageError, match="exists; choose another name, or replace it with --force"),
+        pytest.raises(UsageError, match="exists; choose another name, or replace it with force=True"),
         LogFile(path),
     ):
         pass

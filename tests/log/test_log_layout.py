@@ -41,7 +41,7 @@ def test_an_expression_matches_what_it_includes_for_zenoh(expression: str, key: 
 def test_what_is_no_expression_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is a key expression like"):
         parse_channel_filter([text], [])
-    with pytest.raises(UsageError, match="--exclude is"):
+    with pytest.raises(UsageError, match="exclude is"):
         parse_channel_filter([], [text])
 
 

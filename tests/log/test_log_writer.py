@@ -155,7 +155,7 @@ def test_to_continue_is_to_write_the_next_part(
 def test_a_name_that_is_taken_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
-    with pytest.raises(UsageError, match=f"{there}.* exists.*--force"):
+    with pytest.raises(UsageError, match=f"{there}.* exists.*force=True"):
         LogParts(place, begin)
     assert (tmp_path / there).read_bytes() == b"precious"
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
@@ -182,7 +182,7 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
 def test_a_part_that_cannot_be_meant_is_refused(number: float) -> None:
-    with pytest.raises(UsageError, match="--split-size is a number of MiB"):
+    with pytest.raises(UsageError, match="split_size is a number of MiB"):
         parse_split("--split-size", "MiB", number, 1 << 20)
 
 

@@ -73,11 +73,11 @@ def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> 
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ({"listen": [A], "own": file(listen={"endpoints": [B]})}, "listen/endpoints: given by --listen too"),
-        ({"routers": [A], "listen": [B]}, "--router: a client of a router listens nowhere"),
-        ({"routers": [A], "connect": [B]}, "--router: a client connects to a router only"),
-        ({"routers": [A], "own": file(listen={"endpoints": [B]})}, "--router: a client .* listens nowhere"),
-        ({"routers": [A], "own": file(mode="peer")}, "mine.json5: mode: peer contradicts --router"),
+        ({"listen": [A], "own": file(listen={"endpoints": [B]})}, "listen/endpoints: given by listen too"),
+        ({"routers": [A], "listen": [B]}, "router: a client of a router listens nowhere"),
+        ({"routers": [A], "connect": [B]}, "router: a client connects to a router only"),
+        ({"routers": [A], "own": file(listen={"endpoints": [B]})}, "router: a client .* listens nowhere"),
+        ({"routers": [A], "own": file(mode="peer")}, "mine.json5: mode: peer contradicts router"),
         ({"own": file(mode="client")}, "mine.json5: mode: client: there is no router to connect to"),
         (
             {"own": file(mode="client"), "listen": [A]},
@@ -85,7 +85,7 @@ def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> 
         ),
         ({"own": file(mode="router")}, "mine.json5: mode: router is for `trilat router`"),
         *(
-            ({"routers": [endpoint]}, "--router: an endpoint is like tcp/192.0.2.1:7447, not")
+            ({"routers": [endpoint]}, "router: an endpoint is like tcp/192.0.2.1:7447, not")
             for endpoint in ("", "nonsense", "tcp/", "tcp/host", "carrier-pigeon/1:2", "192.0.2.1:7447")
         ),
     ],

@@ -350,7 +350,7 @@ def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> N
     connection = Connection([listen])
     assert secure_connection(connection, None, insecure=True) == connection
     if open_:
-        with pytest.raises(UsageError, match="--insecure"):
+        with pytest.raises(UsageError, match="insecure=True"):
             secure_connection(connection, None, insecure=False)
     else:
         assert secure_connection(connection, None, insecure=False) == connection
@@ -360,7 +360,7 @@ def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
     own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
     safe = Connection(["tls/192.0.2.1:7447"], own=own)
     assert secure_connection(safe, None, insecure=False) == safe
-    with pytest.raises(UsageError, match="--insecure"):
+    with pytest.raises(UsageError, match="insecure=True"):
         secure_connection(Connection(["tcp/192.0.2.1:7447"], own=own), None, insecure=False)
 
 

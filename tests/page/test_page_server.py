@@ -5,7 +5,8 @@ import json
 from collections.abc import Iterator
 from contextlib import closing
 from http.client import HTTPConnection
-from socket import SHUT_WR, create_connection
+from pathlib import Path
+from socket import SHUT_WR, create_connection, create_server
 from urllib.parse import urlsplit
 
 import pytest
@@ -15,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from live.live_session import PageOptions
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
 from live.page_server import MOST_EXCESS, PageServer
+from tests.cli.running import trilat
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
 from trilat_net.net.bus import LocalBus, LocalNetwork
@@ -106,8 +108,17 @@ def test_a_name_of_somebody_elses_that_leads_here_is_refused(server: PageServer)
     assert server.refused["foreign host"] == 1
 
 
+def test_a_port_in_use_is_found_before_a_folder_is_made(tmp_path: Path) -> None:
+    with create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        done = trilat("live", "two_sites", "--port", str(port), "--no-browser", cwd=tmp_path)
+    done.refuses(f"127.0.0.1:{port}: cannot listen: Address already in use")
+    assert not list(tmp_path.iterdir())
+    PageOptions(port=port).check()
+
+
 def test_another_address_than_loopback_demands_insecure_and_a_token(network: LocalNetwork) -> None:
-    with pytest.raises(UsageError, match="--insecure"):
+    with pytest.raises(UsageError, match="insecure=True"):
         PageOptions(host="0.0.0.0").check()
     PageOptions(host="0.0.0.0", insecure=True).check()
     with PageServer(network.join(), SystemClock(), "s1", host="0.0.0.0") as server:

@@ -13,7 +13,7 @@ from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_summary import summarise_run
 from trilat_net.execution.log_checks import CheckLine
-from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures
+from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures, write_report_figures
 from trilat_net.reporting.page import render_report, write_report
 
 VERDICTS = [CheckLine("records", "all <b>there</b>", True), CheckLine("executed again", "differs", False)]
@@ -49,20 +49,23 @@ def column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
-def test_a_report_is_a_page_numbers_and_pictures(tmp_path):
+def test_a_report_is_a_page_and_numbers_and_pictures_that_are_asked_for(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
     paths = write_report(log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS)
-    assert [path.name for path in paths[:2]] == ["report.html", "summary.json"]
-    wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {"certificate"}
-    assert {path.stem for path in paths[2:]} == wanted | {"hands_moved"}
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths[2:])
+    assert [path.name for path in paths] == ["report.html", "summary.json"]
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
+    pictures = write_report_figures(log, tmp_path, log)
+    wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {"certificate"}
+    assert {path.stem for path in pictures} == wanted | {"hands_moved"}
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     facts = json.loads(paths[1].read_text())
     assert facts["checks"] == [verdict._asdict() for verdict in VERDICTS]
     assert facts["certificate"]["verdict"] == "rose"
     html, data = read(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000
+    body = html[html.index("</h1>") :]
+    assert 0 < body.index("stability: ") < body.index("records: all") < body.index("<p>")
     assert "<p>outside the theorem (delays): V rose by" in html
     assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
@@ -160,7 +163,9 @@ def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     some = logs.timed(logs.simulated("paper"))
     log = logs.rewritten(some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live")
     paths = write_report(log, tmp_path, twin=logs.twin("paper"), verdicts=VERDICTS)
-    assert {"report.html", "summary.json", "positions.png", "arms.png"} <= {path.name for path in paths}
+    assert [path.name for path in paths] == ["report.html", "summary.json"]
+    pictures = write_report_figures(log, tmp_path, logs.twin("paper"))
+    assert {"positions.png", "arms.png"} <= {path.name for path in pictures}
     assert "the file was not finished" in paths[0].read_text(encoding="utf-8")
 
 

@@ -101,7 +101,7 @@ def test_a_window_needs_a_display(files: dict[str, Path], monkeypatch: pytest.Mo
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
-    with pytest.raises(UsageError, match=r"no display here; .* --web"):
+    with pytest.raises(UsageError, match=r"no display here; .* web"):
         shown([files["live"]], ViewerOptions())
     monkeypatch.setenv("DISPLAY", ":0")
     rerun, _ = shown([files["live"]], ViewerOptions())

@@ -74,6 +74,12 @@ def test_it_says_how_often_a_site_will_hold_and_it_holds_so_often() -> None:
     assert f"will hold {10 * entered:.3g} times a minute" in line
 
 
+def test_of_a_site_that_never_holds_it_says_nothing() -> None:
+    glide = load_scenario("two_sites", {"on_stale.action": "glide", "duration_s": 2.0})
+    assert not [line for line in describe_scenario(glide) if "times a minute" in line]
+    assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))
+
+
 def test_an_arm_that_takes_long_to_stop_says_so() -> None:
     """T = qd_limit / a of the slowest joint, and the way T qd_limit / 2."""
     scenario = load_scenario("free", {"on_stale.action": "glide"})

@@ -3,8 +3,10 @@
 import io
 
 import msgspec
+import numpy as np
 import pytest
 
+import trilat_net
 from sites.monitor import LINE_EVERY, SessionDisplay, SessionMonitor
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
@@ -23,8 +25,9 @@ STATISTICS = LoopStats(SITE, 1, [1000, 1000]).take(SITE.step(TickInput(0)))
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
+    moved = trilat_net.simulate(SCENARIO, duration_s=0.01)["m1"]
     network = LocalNetwork()
-    watch = SessionMonitor(network.join(), "t", SCENARIO.names)
+    watch = SessionMonitor(network.join(), "t", SCENARIO)
     stranger = network.join()
 
     def say(member: str, channel: str, payload: bytes) -> None:
@@ -33,7 +36,9 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     for junk in (b"", b"\xc1", bytes(70_000)):
         say("m1", topics.LINK, junk)
         say("m1", topics.EVENT, junk)
+        say("m1", topics.STATE, junk)
     say("m1", topics.LINK, encode(msgspec.structs.replace(STATISTICS, mode="[/red]\x1b[7mX")))
+    say("m1", topics.STATE, b"".join(moved.payloads))
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
     say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
     out = io.StringIO()
@@ -41,11 +46,14 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
         watch.poll()
         assert list(watch.latest) == ["m1"]
         for _ in range(LINE_EVERY):
-            display.update(watch.latest)
+            display.update(watch)
         for sentence in watch.take_news():
             display.say(sentence)
     assert watch.take_news() == []
     assert "[/red] s is gone [x]" in out.getvalue()
     assert "m1" in out.getvalue()
+    assert "|e|" in out.getvalue()
+    assert f"{np.linalg.norm(moved.e[-1]):.4f} rad" in out.getvalue()
+    assert f"{np.abs(moved.tau[-1]).max():.2f} N m" in out.getvalue()
     assert "[/red]<U+001B>[7mX" in out.getvalue()
     assert "nobody" not in out.getvalue()

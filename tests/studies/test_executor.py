@@ -110,5 +110,5 @@ def test_an_item_that_ends_every_worker_is_named_or_gets_its_own_result() -> Non
 
 def test_jobs_belong_to_this_machine() -> None:
     assert count_workers(3) == 3
-    with pytest.raises(UsageError, match="--jobs"):
+    with pytest.raises(UsageError, match="jobs"):
         count_workers(3, "tcp://127.0.0.1:1")

@@ -84,5 +84,5 @@ def test_several_rates_are_told() -> None:
 
 @pytest.mark.parametrize("roots", [0, -1, 61])
 def test_a_number_of_roots_that_is_none_is_refused(roots: int) -> None:
-    with pytest.raises(UsageError, match="--roots is a number of roots, 1 to 60"):
+    with pytest.raises(UsageError, match="roots is a number of roots, 1 to 60"):
         analyse_linear_loop("free", roots=roots)

@@ -27,7 +27,6 @@ from ..scenario import Scenario
 from .arm_rows import build_arm_rows
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelope, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
-from .timeline import first_divergence_s
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
@@ -221,7 +220,7 @@ def trace_log(log: Log) -> RunTrace:
             for part in parts
         ],
         [part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
-        first_divergence_s(log),
+        log.diverged_s,
         max((float(t_s[rows].max(initial=0.0)) for t_s, rows in pushed), default=0.0),
         max((tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)), default=0.0),
     )

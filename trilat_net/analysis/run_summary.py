@@ -12,7 +12,7 @@ from . import health
 from .json_values import JsonObject, finite_or_none
 from .link_summary import LinkSummary, ValueStatistics, summarise_links
 from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_of_all_s, settling_time_s
-from .timeline import diverged_at_s, find_mode_intervals, list_changes
+from .timeline import find_mode_intervals, list_changes
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
@@ -65,7 +65,7 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
         "expected_ticks": expected,
         "made_ticks": made,
         "missing": max(0, (expected if made is None else made) - len(part)),
-        "diverged_at_s": diverged_at_s(part),
+        "diverged_at_s": part.diverged_s,
         "modes": [span._asdict() for span in find_mode_intervals(part)],
         "q_end_rad": part.q[-1].tolist() if len(part) else None,
         "max_error_rad": _largest(part.e),

@@ -141,14 +141,3 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
             if alarm is not None:
                 found.append(RaisedAlarm(site, alarm.word, alarm.reason, from_s, to_s))
     return sorted(found, key=lambda one: one.from_s)
-
-
-def diverged_at_s(part: SiteLog) -> float | None:
-    """Returns when a site left its limits, s; None if it never did."""
-    return float(part.t_s[-1]) if len(part) and part.mode[-1] == "diverged" else None
-
-
-def first_divergence_s(log: Log) -> float | None:
-    """Returns when the first site left its limits, s; None if none did."""
-    found = [at_s for site in log.sites if (at_s := diverged_at_s(log[site])) is not None]
-    return min(found, default=None)

@@ -111,15 +111,15 @@ def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any
 
 _SINGLE = {
     "demo": (demo.demo_command, "paper --duration 10 --set control.Kd=5"),
-    "live": (live.live_command, "play", "--session paper-demo"),
+    "live": (live.live_command, "play", "--session paper"),
     "site": (site.site_command, "m1 --scenario paper"),
     "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
     "ping": (ping.ping_command, "--session paper"),
-    "watch": (watch.watch_command, "--session paper-demo"),
-    "stop": (stop.stop_command, "--session paper-demo s", "--session paper-demo --end"),
-    "enable": (stop.enable_command, "--session paper-demo s"),
-    "reset": (stop.reset_command, "--session paper-demo s"),
-    "doctor": (doctor.doctor_command, "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper-demo"),
+    "watch": (watch.watch_command, "--session paper"),
+    "stop": (stop.stop_command, "--session paper s", "--session paper --end"),
+    "enable": (stop.enable_command, "--session paper s"),
+    "reset": (stop.reset_command, "--session paper s"),
+    "doctor": (doctor.doctor_command, "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper"),
     "router": (router.router_command, "--keys keys/router"),
     "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
     "verify": (verify.verify_command, "run.mcap"),
@@ -216,6 +216,7 @@ def _is_short_of_memory(error: Exception) -> bool:
 
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
+    TrilatError.in_command = True
     try:
         app()
     except TrilatError as error:
@@ -241,4 +242,5 @@ def main() -> None:
         print_error(_TOO_LITTLE)
         sys.exit(1)
     finally:
+        TrilatError.in_command = False
         gc.freeze()  # at exit, Python need not traverse every record

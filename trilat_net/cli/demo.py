@@ -19,10 +19,11 @@ def demo_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,
+    png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
-    from sites.demo_session import demo_session_name, run_demo
+    from sites.demo_session import run_demo
     from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
@@ -31,7 +32,7 @@ def demo_command(
     results = make_results_folder(folder, chosen.name, force=force)
     with terminal.lines_aside(as_json):
         terminal.print_text(chosen.title or chosen.name)
-        members = f"{', '.join(chosen.names)} and a recorder, session {demo_session_name(chosen)}"
+        members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
         with SessionDisplay(chosen, terminal.out) as display:
             outcome = run_demo(chosen, results, display)
@@ -43,6 +44,6 @@ def demo_command(
         raise typer.Exit(128 + outcome.interrupted)
     if not outcome.log.exists():
         raise typer.Exit(outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)

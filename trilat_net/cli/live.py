@@ -42,6 +42,7 @@ def live_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,
+    png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live, with a page on which to watch it and take hold of the arms.
@@ -56,7 +57,7 @@ def live_command(
     page = PageOptions(host, port, insecure, browser)
     page.check()
     if session is not None:
-        alone = {"--duration", "--out", "--seed", "--set", "--force", "--json", "scenario"}
+        alone = {"--duration", "--out", "--seed", "--set", "--force", "--png", "--json", "scenario"}
         if extra := alone & set(options.given_options(context)):
             raise UsageError(
                 f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
@@ -67,7 +68,7 @@ def live_command(
         raise typer.Exit(code)
     if connect or router or zenoh_config or keys:
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
-    _run_session(page, scenario, folder, duration, seed, overrides, force=force, as_json=as_json)
+    _run_session(page, scenario, folder, duration, seed, overrides, force=force, png=png, as_json=as_json)
 
 
 def _run_session(
@@ -79,6 +80,7 @@ def _run_session(
     overrides: list[str] | None,
     *,
     force: bool,
+    png: bool,
     as_json: bool,
 ) -> None:
     from live.live_session import LONGEST_S, PageOptions, attend_with_page
@@ -100,6 +102,6 @@ def _run_session(
         terminal.print_error(problem)
     if not outcome.log.exists():
         raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)

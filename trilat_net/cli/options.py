@@ -97,7 +97,7 @@ InsecureOption = Annotated[
 
 
 MOST_LETTERS = 80
-"""Of a session's name: that of a scenario has 64, and that of its demo some more."""
+"""Of a session's name; a scenario's has 64 at most."""
 
 
 def check_session_name(name: str) -> str:
@@ -195,6 +195,7 @@ MinCoverageOption = Annotated[
 ]
 MIN_COVERAGE = 0.999
 """As in `log.integrity`, which takes long to import."""
+PngOption = Annotated[bool, typer.Option("--png", help="Write every figure as a PNG file too.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 

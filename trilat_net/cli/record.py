@@ -74,6 +74,7 @@ def record_command(
     ] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
+    png: options.PngOption = False,
 ) -> None:
     """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
 
@@ -110,7 +111,7 @@ def record_command(
     if concluded:
         refuse_existing(page, force=force)
     clock = make_system_clock(clock_offset, clock_drift)
-    then = (lambda: _conclude(list(find_parts(path).values()))) if concluded else lambda: None
+    then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
     code = record_session(
         options.check_session_name(session), place, connection, join_timeout, clock, terminal.print_line, then
     )
@@ -129,8 +130,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     return output
 
 
-def _conclude(parts: list[Path]) -> None:
-    log, conclusion = terminal.conclude_files(parts, parts[0].parent)
+def _conclude(parts: list[Path], *, png: bool) -> None:
+    log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
     if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):

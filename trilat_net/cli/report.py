@@ -16,9 +16,10 @@ def report_command(
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     force: options.ForceOption = False,
+    png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Writes the figures, the page and the summary of a log."""
+    """Writes the page and the summary of a log, with --png its figures as well."""
     from ..files import make_results_folder
     from ..reporting.conclude import conclude
 
@@ -26,7 +27,7 @@ def report_command(
     terminal.warn_user_laws(log, needed=False)
     results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
     with terminal.progress_bar("drawing") as progress:
-        conclusion = conclude(log, results, progress, min_coverage=min_coverage)
+        conclusion = conclude(log, results, progress, min_coverage=min_coverage, png=png)
     terminal.print_result(conclusion, as_json=as_json)
     if not conclusion.passed:
         raise typer.Exit(1)

@@ -77,7 +77,7 @@ def _search_margins(
     from ..files import make_results_folder
     from ..studies.sweep.margin_search import SweepMargins, search_margins
 
-    chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=False)
+    chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=None)
     with terminal.progress_bar("searching") as progress:
         found = SweepMargins(asked, within, search_margins(asked, within, jobs, progress, on))
     paths = found.write(chosen)

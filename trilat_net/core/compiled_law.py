@@ -26,7 +26,7 @@ from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
-from .user_law import LawInput, LawResults, check_results, describe_failure, law_name
+from .user_law import LawInput, LawResults, check_results, describe_failure, law_name, list_remembered
 from .vectors import Array, Row, RowArray
 
 _CHECKED: Any = {"_nrt": False, "boundscheck": True}
@@ -38,18 +38,16 @@ def compiled(law: T) -> T:
 
     >>> @tn.compiled
     ... class Damper:
-    ...     remembers = ()
     ...     def __init__(self, facts):
     ...         pass
     ...     def torque(self, now):
-    ...         return -now.qd
+    ...         for i in range(now.joints):
+    ...             now.tau[i] = -now.qd[i]
 
-    The class needs `remembers`. What Numba does not take is refused when a site is built.
+    A class with memory needs `remembers`. What Numba does not take is refused when a site is built.
     """
     if not isinstance(law, type):
         return cast(T, numba.njit(**_CHECKED)(law))
-    if not hasattr(law, "remembers"):
-        raise TypeError(f"{law.__name__} lacks remembers: the names of the attributes that are its memory")
     law.is_compiled = True  # type: ignore[attr-defined]
     return cast(T, law)
 
@@ -185,7 +183,7 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     named = {one.argval for one in code if one.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")}
     named |= vars(law).keys()  # which functions that `torque` calls may name
     found = {}
-    for name in dict.fromkeys([*law.remembers, *sorted(filter(lambda one: hasattr(law, one), named))]):
+    for name in dict.fromkeys([*list_remembered(law), *sorted(filter(lambda one: hasattr(law, one), named))]):
         value = getattr(law, name)
         try:
             numbers = np.asarray(value)
@@ -193,7 +191,7 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
             continue
         if numbers.dtype.kind not in "fiub" or not numbers.size:
             continue
-        changes = name in law.remembers or name in written or isinstance(value, list)
+        changes = name in list_remembered(law) or name in written or isinstance(value, list)
         found[name] = numbers.astype(np.float64 if changes or numbers.dtype.kind == "f" else np.int64)
     return found
 
@@ -205,7 +203,8 @@ def _explain(error: Exception, law: Any) -> str:
     lines = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
     where = f" (line {lines[-1]})" if lines else ""
     if "NRT required" in text or "returning of array" in text:
-        return f"it makes an array or a list{where}: make it in __init__, and write into it here"
+        how = "arithmetic goes number by number, as in now.tau[i] = -now.qd[i]; a list is made in __init__"
+        return f"it makes an array or a list{where}: {how}, and written into here"
     found = re.search(r"Unknown attribute '(\w+)' of type Record", text)
     if name := error.args[0] if isinstance(error, KeyError) else found and found[1]:
         if hasattr(law, name) and callable(getattr(law, name)):
@@ -244,7 +243,7 @@ class CompiledLaw:
         path = f"sites.{setup.name}.control.law"
         numbers = _read_numbers(law)
         received = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
-        if missing := [name for name in law.remembers if name not in numbers]:
+        if missing := [name for name in list_remembered(law) if name not in numbers]:
             problem = f"{missing[0]}, which it remembers, is neither a number nor a list of numbers"
             raise ScenarioError(f"{law_name(law)}: {problem}", path=path)
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
@@ -271,7 +270,7 @@ class CompiledLaw:
         self.row: Array = whole.view(np.float64)
         self._law, self._name, self._arrays, self._sent = law, setup.name, arrays, sent
         self._stage = law_stage
-        self._remembered = sum(numbers[name].size for name in law.remembers)
+        self._remembered = sum(numbers[name].size for name in list_remembered(law))
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:

@@ -6,6 +6,7 @@ in force until it writes it anew.
 
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from .law_channel import SentVector
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .ticks import tick_ns
-from .user_law import LawInput, PeerView, UserLaw, call_law, read_memory, restore_law
+from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_memory, restore_law
 from .vectors import Array, Row, RowArray
 
 
@@ -45,7 +46,7 @@ def update_law_view(k: int, t_ns: int, site: RowArray, links: RowArray, chain: R
 
 _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
 _PER_COORDINATE = ("q_des", "qd_des", "felt")
-_IN_ROW = {"gravity": "G", "inertia": "M"}
+_IN_ROW = {"gravity": "G"}
 """Where names of a law's input differ from those of the site's row."""
 
 
@@ -53,7 +54,7 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
     """Returns numbers by the names of the vectors that they are."""
     named, first = SimpleNamespace(), 0
     for vector in vectors:
-        setattr(named, vector.name, numbers[first : first + vector.length])
+        setattr(named, vector.name, LawVector(numbers[first : first + vector.length]))
         first += vector.length
     return named
 
@@ -75,11 +76,8 @@ class PlainLaw:
         n, m = layout.joints, layout.shared
         views = {name: site[_IN_ROW.get(name, name)][:n] for name in _PER_JOINT}
         views |= {name: site[name][:m] for name in _PER_COORDINATE}
-        self._views = {
-            **views,
-            "theta_hat": site["theta_hat"][: layout.parameters],
-            "inertia": site["M"][:n, :n],
-        }
+        self._views = {**views, "theta_hat": site["theta_hat"][: layout.parameters]}
+        self._inertia = site["M"][:n, :n]
         self._limit = site["tau_limit"][:n]
         columns = [arrays.links[name] for name in PeerView._fields]
         self._of_peers = [column if column.ndim == 1 else column[:, :m] for column in columns]
@@ -119,7 +117,8 @@ class PlainLaw:
     def _read(self, k: int) -> LawInput:
         """Returns the input of tick k, after `update_law_view`."""
         setup = self._setup
-        columns = [column.tolist() for column in self._of_peers]
+        columns: list[Any] = [column.tolist() for column in self._of_peers]
+        columns[4:] = [map(LawVector, rows) for rows in columns[4:]]  # q, qd, tau_x
         received = () if self._received is None else self._received.tolist()
         sent, common, own = self._sent.tolist(), self._common, self._own
         return LawInput(
@@ -134,7 +133,8 @@ class PlainLaw:
                 _name_vectors(self._sends[True], sent[common + j * own :]) for j in range(len(columns[0]))
             ),
             to_all=_name_vectors(self._sends[False], sent),
-            **{name: view.tolist() for name, view in self._views.items()},
+            inertia=LawVector(map(LawVector, self._inertia.tolist())),
+            **{name: LawVector(view.tolist()) for name, view in self._views.items()},
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:

@@ -5,6 +5,7 @@ record of every tick, so a log resumes in the middle of a run.
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, Protocol
@@ -46,6 +47,32 @@ class LawContext(NamedTuple):
     peers: tuple[str, ...] = ()
 
 
+def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
+    def compute(numbers: "LawVector", other: Any) -> Any:
+        if isinstance(other, Real):
+            return LawVector([operate(one, other) for one in numbers])
+        if not isinstance(other, list | tuple):
+            return NotImplemented  # an array's own arithmetic, and its array
+        if len(other) != len(numbers):
+            raise ValueError(f"arithmetic of {len(numbers)} numbers with {len(other)}")
+        return LawVector(map(operate, numbers, other))
+
+    return compute
+
+
+class LawVector(list[Any]):
+    """Numbers with arithmetic one by one: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
+
+    __add__ = __radd__ = __iadd__ = _by_number(operator.add)
+    __sub__ = _by_number(operator.sub)
+    __rsub__ = _by_number(lambda own, first: first - own)
+    __mul__ = __rmul__ = __imul__ = _by_number(operator.mul)
+    __truediv__ = _by_number(operator.truediv)
+
+    def __neg__(self) -> "LawVector":
+        return LawVector(map(operator.neg, self))
+
+
 class PeerView(NamedTuple):
     """A peer as a law sees it at a tick: its sample in use, or its start pose at rest.
 
@@ -63,13 +90,15 @@ class PeerView(NamedTuple):
     tick: int
     age_s: float
     new: int
-    q: list[float]
-    qd: list[float]
-    tau_x: list[float]
+    q: LawVector
+    qd: LawVector
+    tau_x: LawVector
 
 
 class LawInput(NamedTuple):
     """The input of a law at a tick; a vector has one number per joint, or per coordinate that sites share.
+
+    In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken one by one.
 
     Attributes:
         k: the tick.
@@ -100,11 +129,11 @@ class LawInput(NamedTuple):
     k: int
     t_s: float
     h_s: float
-    q: list[float]
-    qd: list[float]
-    q_des: list[float]
-    qd_des: list[float]
-    felt: list[float]
+    q: LawVector
+    qd: LawVector
+    q_des: LawVector
+    qd_des: LawVector
+    felt: LawVector
     joints: int = 2
     coordinates: int = 2
     tau: Any = ()
@@ -112,13 +141,13 @@ class LawInput(NamedTuple):
     received: Sequence[Any] = ()
     sent: Sequence[Any] = ()
     to_all: Any = None
-    tau_x: Sequence[float] = ()
-    tau_before: Sequence[float] = ()
-    q_before: Sequence[float] = ()
-    gravity: Sequence[float] = ()
+    tau_x: LawVector = LawVector()
+    tau_before: LawVector = LawVector()
+    q_before: LawVector = LawVector()
+    gravity: LawVector = LawVector()
     theta_hat: Any = ()
-    inertia: Sequence[Sequence[float]] = ()
-    bias: Sequence[float] = ()
+    inertia: LawVector = LawVector()
+    bias: LawVector = LawVector()
 
 
 class UserLaw(Protocol):
@@ -190,7 +219,9 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
 
 def describe_failure(law: UserLaw, site: str, tick: int | None, error: BaseException) -> LawFailed:
     """Returns the failure of a law that raised."""
-    return _law_error(law, site, tick, _one_line(error))
+    problem = _one_line(error)
+    hint = "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
+    return _law_error(law, site, tick, problem + (hint if "LawVector" in problem else ""))
 
 
 def _flatten(value: Any) -> Iterator[float]:
@@ -213,11 +244,16 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
     return type(value)(_fill(one, numbers) for one in value)
 
 
+def list_remembered(law: Any) -> tuple[str, ...]:
+    """Returns the names of the attributes that a law remembers; none of one without memory."""
+    return tuple(getattr(law, "remembers", ()))
+
+
 def read_memory(law: Any) -> list[float]:
     """Returns the memory of a law: of the attributes that it remembers, or what it says itself."""
     if callable(getattr(law, "memory", None)):
         return [float(value) for value in law.memory()]
-    return [number for name in law.remembers for number in _flatten(getattr(law, name))]
+    return [number for name in list_remembered(law) for number in _flatten(getattr(law, name))]
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
@@ -226,7 +262,7 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
         law.recall(memory)
         return
     numbers = iter(memory)
-    for name in law.remembers:
+    for name in list_remembered(law):
         setattr(law, name, _fill(getattr(law, name), numbers))
 
 

@@ -14,7 +14,8 @@ longest delay of the link.
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
@@ -26,7 +27,7 @@ import numpy as np
 
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
-from ..errors import LogError, ScenarioError, WireError
+from ..errors import LogError, ScenarioError, UnknownName, WireError
 from ..files import open_regular
 from ..net import topics
 from ..net.message_numbers import count_under_way
@@ -62,8 +63,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
-class Log(Result):
-    """A recorded session; `log["m1"]` is a site's part.
+class Log(Result, Mapping[str, SiteLog]):
+    """A recorded session, a mapping: `log["m1"]` is a site's part, `log.items()` has them by name.
 
     Args:
         contents: the contents of its file, or of its files together.
@@ -103,6 +104,7 @@ class Log(Result):
             records = sum(len(self[name]) for name in self.sites)
             missing = sum(map(self.missing, self.sites)) or "none"
             holds = f"{seconds:.3f} s, {records} records, {missing} missing"
+            holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
         except LogError:
             holds = "with records that cannot be read"
         kind = f"{self.driver} session {self.session['session']} of {', '.join(self.sites)}"
@@ -138,6 +140,15 @@ class Log(Result):
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
         """Returns a table of the log as a pandas data frame, see `table`; without a name a row per site."""
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
+
+    __eq__ = object.__eq__  # logs are not compared record by record
+    __hash__ = object.__hash__
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.sites)
+
+    def __len__(self) -> int:
+        return len(self.sites)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.sites)
@@ -186,6 +197,17 @@ class Log(Result):
     def driver(self) -> str:
         """Driver of the session: "live" or "virtual"."""
         return self.session["driver"]
+
+    @cached_property
+    def diverged_s(self) -> float | None:
+        """When the first site left its limits, s, which ended the run; None if none did."""
+        return min((at_s for part in self.values() if (at_s := part.diverged_s) is not None), default=None)
+
+    def warn_if_diverged(self) -> None:
+        """Warns the caller of the caller, in Python, of a run that diverged."""
+        if self.diverged_s is not None:
+            when = f"the run diverged at {self.diverged_s:.3f} s, and ends there"
+            warnings.warn(f"{when}: a joint passed its qd_limit_rad_s", RuntimeWarning, stacklevel=3)
 
     @cached_property
     def complete(self) -> bool:
@@ -336,7 +358,7 @@ class Log(Result):
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
-            raise KeyError(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
+            raise UnknownName(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
@@ -413,7 +435,7 @@ class Log(Result):
                 sample that came in).
 
         Raises:
-            KeyError: there is no such part.
+            UnknownName: there is no such part.
             LogError: its messages cannot be read.
         """
         if name == EVENTS_TABLE and name not in self.sites:
@@ -429,7 +451,7 @@ class Log(Result):
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":
                 return build_arrivals_table(site, self.source, live=self.driver == "live")
-        raise KeyError(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
+        raise UnknownName(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
 
     def tables(self) -> Iterator[Table]:
         """Yields every table, one at a time: of each site, and the events."""
@@ -472,8 +494,10 @@ def open_log(
             if isinstance(one, str | Path):
                 with _reading(str(one)):
                     files.append((stack.enter_context(open_regular(Path(one))), str(one)))
-            else:
+            elif hasattr(one, "seek"):
                 files.append((one, "log"))
+            else:
+                raise LogError(f"a log is a path, or a file opened for reading, not {one!r:.80}")
         sizes = [_measure(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
             with _reading(name):

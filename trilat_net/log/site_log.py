@@ -270,6 +270,12 @@ class SiteLog:
         return int(self.tick[-1]) if len(self) else -1
 
     @property
+    def diverged_s(self) -> float | None:
+        """When the site left its limits, s; None if it did not."""
+        last = self.record(-1) if len(self) else None
+        return last.t_ns / NS_PER_S if last is not None and last.mode == "diverged" else None
+
+    @property
     def missing(self) -> int:
         """How many ticks before the last record have none."""
         return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0

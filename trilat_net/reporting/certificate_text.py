@@ -27,7 +27,7 @@ _SOURCE_NAMES = {
 
 
 _HOLDS = {True: "holds", False: "fails", None: "not told"}
-_MARKS = {
+CERTIFICATE_MARKS = {
     "ok": "[green]ok  [/green]",
     "FAIL": "[red]FAIL[/red]",
     "open": "[yellow]open[/yellow]",
@@ -38,7 +38,7 @@ _MARKS = {
 def compose_certificate(found: Certificate) -> Iterator[Block]:
     """Yields the judgement with what it rests on, the premises, and the energies."""
     for line in describe_certificate(found):
-        yield MarkedText(_MARKS[line.mark], line.text)
+        yield MarkedText(CERTIFICATE_MARKS[line.mark], line.text)
     observed = found.observed
     premises = [*found.premises, *(() if observed is None else observed.premises)]
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]

@@ -21,7 +21,7 @@ from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..results import Result
 from ..theory.end_pose import certify_with_roots
-from .certificate_text import describe_judgement
+from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
 from .result_text import Block, MarkedText
 from .summary_text import format_run_lines
 from .text_table import TextTable
@@ -29,11 +29,12 @@ from .text_table import TextTable
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(Result):
-    """A finished run with its checks: a row per site, lines on links, changes, modes, clocks and certificate.
+    """A finished run: its judgement, checks, a row per site, lines on links, changes, modes and clocks.
 
     `paths` are the log's files, and those that were written.
     """
 
+    verdict: CertificateLine
     table: TextTable
     notes: list[str]
     lines: list[CheckLine]
@@ -46,17 +47,23 @@ class Conclusion(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
-        yield self.table
-        yield from self.notes
+        yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
         for line in self.lines:
             mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
             yield MarkedText(mark, f"{line.label}: {line.text}")
-        yield from (f"  {path}" for path in self.paths)
+        yield self.table
+        yield from self.notes
+        yield from (f"  {path}" for path in self.paths if path != self.page)
+        yield f"open first: {self.page}"
+
+    @property
+    def page(self) -> Path:
+        """The report, which is to be opened first."""
+        return next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
 
     def headline(self) -> str:
         """Returns whether every check passed, and where the page is."""
-        page = next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
-        return f"{'passed' if self.passed else 'FAILED'}; {page}"
+        return f"{'passed' if self.passed else 'FAILED'}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
@@ -66,19 +73,26 @@ class Conclusion(Result):
         """Returns plain values, with the keys of `trilat report --json`."""
         checks = [line._asdict() for line in self.lines]
         paths = [str(path) for path in self.paths]
-        return {"passed": self.passed, "notes": self.notes, "checks": checks, "paths": paths}
+        found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
+        return {**found, "checks": checks, "paths": paths}
 
 
 def conclude(
-    log: Log, folder: Path, progress: Progress | None = None, *, min_coverage: float = MIN_COVERAGE
+    log: Log,
+    folder: Path,
+    progress: Progress | None = None,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    png: bool = False,
 ) -> Conclusion:
-    """Verifies a log from a file, and writes figures, page and summary into a folder that exists.
+    """Verifies a log from a file, and writes page and summary, with `png` figures, into a folder that exists.
 
     Raises:
         LogError: a record cannot be read.
         RunFailed: the process that executes the log was ended.
     """
     # Matplotlib takes a second, and `verify` needs none of it
+    from .figures.registry import write_report_figures
     from .page import write_report
 
     lines: list[CheckLine] = []
@@ -86,8 +100,7 @@ def conclude(
         checking = pool.submit(check_log_files, log.sources, min_coverage)
         twin = _run_without_operators(log)
         certificate = certify_with_roots(log, min_coverage=min_coverage)
-        judgement = f"certificate: {describe_judgement(certificate)}; {certificate.verdict.text}"
-        notes = [*format_run_lines(log), judgement]
+        notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
 
         def verdicts() -> Iterator[CheckLine]:
             try:
@@ -96,12 +109,12 @@ def conclude(
                 raise RunFailed("the process that executes the log again was ended; try again") from None
             yield from lines
 
-        made = write_report(
-            log, folder, twin=twin, certificate=certificate, verdicts=verdicts(), progress=progress
-        )
+        figures = write_report_figures(log, folder, twin, progress) if png else []
+        made = write_report(log, folder, twin=twin, certificate=certificate, verdicts=verdicts())
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
-    return Conclusion(table, notes, lines, [*map(Path, log.sources), *made])
+    paths = [*map(Path, log.sources), *made, *figures]
+    return Conclusion(describe_certificate(certificate)[0], table, notes, lines, paths)
 
 
 def _run_without_operators(log: Log) -> Log | None:

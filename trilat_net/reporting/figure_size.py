@@ -36,5 +36,5 @@ def make_print_size(width_in: float) -> FigureSize:
         UsageError: it is neither.
     """
     if width_in not in (COLUMN_IN, PAGE_IN):
-        raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in:g}")
+        raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in}")
     return FigureSize(width_in, 8.0, 8.0, 600)

@@ -1,4 +1,4 @@
-"""Write the report of a log: `report.html`, `summary.json` and the figures.
+"""Write the report of a log: `report.html` and `summary.json`.
 
 Invariant: the page is one file with images, styles and scripts inside; it loads nothing from a network.
 """
@@ -19,12 +19,11 @@ from ..analysis.run_summary import summarise_run
 from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
 from ..log.log_reader import Log
-from ..log.mcap_reader import Progress
-from . import charts, page_tables, style
+from . import charts, page_tables
 from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.loop_timing import explain_missing_loop_times
-from .figures.registry import explain_absent_operator, write_report_figures
+from .figures.registry import explain_absent_operator
 from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 
 _PAGE_DPI = 110
@@ -67,30 +66,27 @@ def write_report(
     twin: Log | None = None,
     certificate: Certificate | None = None,
     verdicts: Iterable[CheckLine] = (),
-    progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes report.html, summary.json and a PNG per figure, and returns their paths in that order.
+    """Writes report.html and summary.json, and returns their paths.
 
-    Figures are drawn before the verdicts are read, which may still be in the making. Without a certificate
-    the page has no section of it, and without `twin`, the same experiment without operators, no motion due to
-    them. `progress` is called with the number of figures that are drawn, and of all.
+    Charts are made before the verdicts are read, which may still be in the making. Without a certificate the
+    page has no section of it, and without `twin`, the same experiment without operators, no motion due to
+    them.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
-    figures = write_report_figures(log, folder, twin, progress)
-    section = ""
+    section = verdict = ""
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
         section = page_tables.render_certificate(certificate)
-        pictures = {}
+        verdict = page_tables.render_verdict(certificate)
+        pictures = []
         if certificate.balance is not None:
-            pictures["certificate"] = "V and energies", draw_functional(log, certificate)
+            pictures.append(("V and energies", draw_functional(log, certificate)))
         if certificate.observed is not None and certificate.observed.curves:
             drawn = draw_observed_energy(log, certificate.observed)
-            pictures["observed_energy"] = "energies that the laws declare", drawn
-        for name, (words, drawn) in pictures.items():
-            figures.append(folder / f"{name}.png")
-            style.write_figure(drawn, figures[-1], style.REPORT_DPI)
+            pictures.append(("energies that the laws declare", drawn))
+        for words, drawn in pictures:
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
             data = base64.b64encode(stream.getvalue()).decode()
@@ -99,15 +95,23 @@ def write_report(
     lines = list(verdicts)
     facts["checks"] = [line._asdict() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
-    write_whole(page, render_report(log, twin, lines, facts, section))
+    write_whole(page, render_report(log, twin, lines, facts, section, verdict))
     write_whole(numbers, _json(facts, indent=2) + "\n")
-    return [page, numbers, *figures]
+    return [page, numbers]
 
 
 def render_report(
-    log: Log, twin: Log | None, verdicts: Sequence[CheckLine], facts: JsonObject, certificate: str = ""
+    log: Log,
+    twin: Log | None,
+    verdicts: Sequence[CheckLine],
+    facts: JsonObject,
+    certificate: str = "",
+    verdict: str = "",
 ) -> str:
-    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML."""
+    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML.
+
+    The page begins with `verdict`, as HTML too.
+    """
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
     factor = charts.picture_scale(log, bounds)
@@ -119,7 +123,7 @@ def render_report(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
         about=page_tables.render_description(scenario),
-        verdicts=page_tables.render_alarms(log) + page_tables.render_check_lines(verdicts),
+        verdicts=verdict + page_tables.render_alarms(log) + page_tables.render_check_lines(verdicts),
         facts=page_tables.render_run_facts(log, facts),
         sites=page_tables.render_sites(log, facts),
         loops=page_tables.render_loops(log, facts),

@@ -32,6 +32,13 @@ _CERTIFICATE_NOTE = (
 )
 
 
+def render_verdict(certificate: Certificate) -> str:
+    """Returns the judgement of a run, as the first of its verdicts."""
+    mark, text = describe_certificate(certificate)[0]
+    kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
+    return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li></ul>'
+
+
 def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
     """Returns the list of verdicts; "" if nothing was checked."""
     items = ""

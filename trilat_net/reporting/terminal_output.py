@@ -8,6 +8,7 @@ nothing of the bar; it calls a function with (done, total). Imports only Rich at
 
 import json
 import re
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
@@ -135,15 +136,26 @@ def lines_aside(aside: bool) -> Iterator[None]:
         yield
 
 
-def conclude_files(paths: Sequence[Path], folder: Path, *, as_json: bool = False) -> "tuple[Log, Conclusion]":
-    """Checks a log that was just recorded, writes its report into a folder and prints the conclusion."""
+def conclude_files(
+    paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
+) -> "tuple[Log, Conclusion]":
+    """Checks a log that was just recorded, writes its report into a folder and prints the conclusion.
+
+    Interrupted, it says how to do that later.
+    """
     from .conclude import conclude
 
     if not as_json:
         out.print("checking the log and drawing ...")
-    log = open_with_progress(*paths)
-    with progress_bar("executing and drawing") as progress:
-        conclusion = conclude(log, folder, progress)
+    try:
+        log = open_with_progress(*paths)
+        with progress_bar("executing and drawing") as progress:
+            conclusion = conclude(log, folder, progress, png=png)
+    except KeyboardInterrupt:
+        files = shlex.join(map(str, paths))
+        later = f"trilat report {files} -o {shlex.quote(str(folder))} --force"
+        print_note(f"the log is kept: {files}; its report can be drawn later: {later}")
+        raise
     print_result(conclusion, as_json=as_json)
     return log, conclusion
 

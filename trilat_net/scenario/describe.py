@@ -7,6 +7,7 @@ differences.
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -27,6 +28,7 @@ from .laws import (
     ProportionalDerivativeDamped,
 )
 from .sample_uses import count_silences, draw_uses
+from .scenario_reader import load_scenario
 from .scenario_types import Scenario
 
 COUPLED_OPERATORS = (
@@ -71,12 +73,13 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     ]
 
 
-def describe_scenario(scenario: Scenario) -> list[str]:
+def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
     """Returns the facts of a valid scenario and their consequences, as lines; as `trilat scenario check`.
 
-    >>> len(tn.describe_scenario(tn.load_scenario("paper"))) > 5
+    >>> len(tn.describe_scenario("paper")) > 5
     True
     """
+    scenario = load_scenario(scenario)
     beta = scenario.beta
     weights = (
         "none: alpha is reducible, some site's weight is zero"
@@ -164,6 +167,8 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             rates_hz = spec.rate_hz, scenario.sites[peer].rate_hz
             used = draw_uses(link, key, *rates_hz, scenario.duration_s)
             count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
+            if not count:
+                continue
             a_minute = 60.0 * count / scenario.duration_s
             advice = "; a play-out (playout_ms) or a longer silence_ms lessens that" if a_minute > 1.0 else ""
             lines.append(

@@ -8,7 +8,10 @@ the package that contains it; building a site imports it, and only if that file 
 import ast
 import hashlib
 import importlib
+import inspect
+import re
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
@@ -171,11 +174,18 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
     `needs_theta = True`.
     """
     path = f"sites.{context.site}.control.law"
-    methods = ("torque",) if hasattr(kind, "remembers") else ("torque", "memory", "recall")
+    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(kind, "remembers")
+    methods = ("torque", "memory", "recall") if keeps else ("torque",)
     missing = [name for name in methods if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(
             f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}", path=path
+        )
+    if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
+        raise ScenarioError(
+            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its class has "
+            f"remembers = ({written[0]!r},), else remembers = (); see {find_page('own-controller.md')}",
+            path=path,
         )
     stated = getattr(kind, "sites", None)
     ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
@@ -194,6 +204,15 @@ def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: 
             "and leave known out, or choose a law that learns them",
             path=path,
         )
+
+
+def _find_written(kind: Any) -> list[str]:
+    """Returns what a class writes of itself after `__init__`, unless by calls, as of append."""
+    methods = [one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)]
+    sources = [textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"]
+    nodes = (node for text in sources for node in ast.walk(ast.parse(text)))
+    written = [ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)]
+    return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
 
 
 def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
@@ -280,12 +299,12 @@ def name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Returns a value of a scenario with every class in it by its name, see `name_law_class`."""
+    """Returns a value of a scenario as plain ones: classes by `name_law_class`, NumPy's as numbers."""
     if isinstance(value, type):
         return name_law_class(value)
     if isinstance(value, Mapping):
-        return {key: name_law_classes(one) for key, one in value.items()}
-    return value
+        return {str(key): name_law_classes(one) for key, one in value.items()}
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 @contextmanager

@@ -204,7 +204,7 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
         return list(name_law_classes(overrides).items())
     pairs = []
     for text in overrides:
-        key, equals, value = text.partition("=")
+        key, equals, value = str(text).partition("=")
         if not equals or not key.strip():
             raise ScenarioError(f"an override reads KEY=VALUE, as in control.Kd=5, not {text!r}")
         try:

@@ -85,7 +85,8 @@ def load_scenario(
     if isinstance(overrides, Mapping):
         overrides = {**overrides, **more}
     else:
-        overrides = [*overrides, *(f"{key}={value!r}" for key, value in more.items())]
+        listed = overrides if isinstance(overrides, list | tuple) else [overrides]
+        overrides = [*listed, *(f"{key}={value}" for key, value in more.items())]
     if isinstance(source, Scenario):
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))

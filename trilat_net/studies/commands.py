@@ -6,7 +6,8 @@ from typing import Any
 
 import tomli_w
 
-from ..scenario.imported_law import name_law_class
+from ..errors import ScenarioError
+from ..scenario.imported_law import name_law_classes
 
 
 def format_command(*words: str) -> str:
@@ -21,12 +22,14 @@ def set_options(overrides: Iterable[str]) -> list[str]:
 
 def format_toml_value(value: Any) -> str:
     """Returns a value as TOML on one line; numbers as short as they can be."""
-    if isinstance(value, type):
-        value = name_law_class(value)
+    value = name_law_classes(value)
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{key} = {format_toml_value(entry)}' for key, entry in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(format_toml_value, value))}]"
     if isinstance(value, float) and float(f"{value:g}") == value:
         return f"{value:g}"
-    return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
+    try:
+        return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
+    except TypeError:
+        raise ScenarioError(f"{value!r:.80} is no value of a scenario: those are of TOML") from None

@@ -17,7 +17,7 @@ from ..core.compiled_law import plug_law
 from ..core.site_arrays import build_site_arrays
 from ..core.site_setup import SiteSetup
 from ..core.ticks import tick_ns
-from ..core.user_law import LawContext, UserLaw, read_memory
+from ..core.user_law import LawContext, UserLaw, list_remembered, read_memory
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from .textbook_arm import Numbers
@@ -152,4 +152,5 @@ def _name_memory(law: Any, count: int) -> tuple[str, ...]:
     """Returns the names of what a law remembers."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
-    return tuple(f"{name}[{n + 1}]" for name in law.remembers for n in range(np.size(getattr(law, name))))
+    sizes = {name: np.size(getattr(law, name)) for name in list_remembered(law)}
+    return tuple(f"{name}[{n + 1}]" for name, size in sizes.items() for n in range(size))

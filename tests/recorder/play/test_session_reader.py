@@ -98,8 +98,8 @@ def test_more_than_the_limit_is_left_to_be_read_while_it_plays(log_file: Path) -
 @pytest.mark.parametrize(
     ("selection", "problem"),
     [
-        (PlaySelection(start_ns=5 * 10**9), r"--start 5 s: is beyond the end; .* from 0\.000 s to 0\.299 s"),
-        (PlaySelection(stop_ns=-(10**9)), r"--stop -1 s: is before the beginning"),
+        (PlaySelection(start_ns=5 * 10**9), r"start=5 s: is beyond the end; .* from 0\.000 s to 0\.299 s"),
+        (PlaySelection(stop_ns=-(10**9)), r"stop -1 s: is before the beginning"),
         (
             PlaySelection(ChannelFilter(include=("a/b",))),
             r"no message for this selection; .* like trilat/paper/m1/state",

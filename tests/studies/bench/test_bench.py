@@ -206,7 +206,7 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ({"laws": ["p_dd"]}, "no law 'p_dd' in it; did you mean"),
         ({"tasks": ["handover"]}, "no task 'handover' in it"),
         ({"links": ["rtt9"]}, "no link 'rtt9' in it; did you mean"),
-        ({"seeds": 0}, "--seeds is how many, 1 to 1000, not 0"),
+        ({"seeds": 0}, "seeds is how many, 1 to 1000, not 0"),
         ({"study": "full", "laws": ["smith"], "tasks": ["handover"]}, "handover asks for two users"),
     ],
 )
@@ -234,7 +234,7 @@ def test_a_folder_takes_more_of_the_suite_and_nothing_from_elsewhere(
     assert run_bench(prepare_bench_folder(changed, tmp_path / "one"), jobs=1).runs[0] != first.runs[0]
     origin = tmp_path / "one" / "origin.json"
     origin.write_text(origin.read_text().replace("numpy", "numpi"))
-    with pytest.raises(UsageError, match="results are not mixed: choose another folder with --out"):
+    with pytest.raises(UsageError, match="results are not mixed: choose another folder with out"):
         prepare_bench_folder(asked(), tmp_path / "one")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()

@@ -4,13 +4,15 @@ import json
 from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.sweep.sweep_plan import SweepPlan, parse_axis, plan_from_json, plan_sweep
+from trilat_net.studies.sweep.sweep_plan import SweepPlan, list_axes, parse_axis, plan_from_json, plan_sweep
 
 from .quick import SHORT, asked
 
@@ -36,6 +38,30 @@ def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...])
     assert cell == cube.cell_at(places)
     assert cell.law == ["p_d", "adaptive"][law]
     assert cell.values == (20.0 * delay, [0.1, 0.2][pose], ["newest", "in_order"][order])
+
+
+VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
+
+
+@given(delays=VALUES, counts=st.lists(st.integers(0, 50), min_size=1, unique=True), as_array=st.booleans())
+def test_values_by_key_are_the_axes_that_texts_are(
+    delays: list[float], counts: list[int], as_array: bool
+) -> None:
+    given = [np.array(one) if as_array else one for one in (delays, counts)]
+    over = {"link.delay_ms": given[0], "control.d": given[1], "link.order": ["newest", "in_order"]}
+    first, second, third = map(parse_axis, list_axes(over))
+    assert [first.value(n) for n in range(len(delays))] == delays
+    assert [second.value(n) for n in range(len(counts))] == counts
+    assert third == parse_axis("link.order=newest,in_order")
+    assert list_axes("link.delay_ms=0:400:50") == list_axes({"link.delay_ms": "0:400:50"})
+
+
+def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
+    laws, poses = list_axes({"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)})
+    assert laws == 'control.law="tests.laws:Adaptive",p_d'
+    assert len(parse_axis(laws).texts) == len(parse_axis(poses).texts) == 2
+    with pytest.raises(ScenarioError, match="is no value of a scenario"):
+        list_axes({"control.d": [None]})
 
 
 @given(number=st.integers(0, 23), seed=st.integers(1, 3))
@@ -138,7 +164,7 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
 @pytest.mark.parametrize(
     ("laws", "words"),
     [
-        (["p_dd"], ("--law", "no law 'p_dd'", "did you mean 'p_d'?")),
+        (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
         (["mine.laws:Law"], ("no module mine.laws",)),
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
@@ -234,8 +260,8 @@ def test_a_range_of_very_many_values_takes_no_room() -> None:
         ("a=1,2,1", ("has 1 twice",)),
         ("a=0,0x0", ("has 0x0 twice",)),
         ("a=1,1.0", ("has 1.0 twice",)),
-        ("seed=1:9:1", ("--seeds 1..20",)),
-        ("duration_s=1,2", ("--longest",)),
+        ("seed=1:9:1", ("seeds=1..20",)),
+        ("duration_s=1,2", ("longest_s",)),
     ],
 )
 def test_what_makes_no_axis_is_refused_with_what_would_be_right(text: str, words: tuple[str, ...]) -> None:

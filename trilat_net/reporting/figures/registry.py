@@ -118,12 +118,12 @@ FIGURES = {
         draw_authority,
         _unless(sites_with_changing_dominance, "the shares of all sites are constant"),
     ),
-    "certificate": FigureEntry(
+    "certificate": _ReportEntry(
         "V, its parts, who changed it, the energy balance",
         lambda log, form: draw_functional(log, certify(log), form),
         _no_functional,
     ),
-    "observed_energy": FigureEntry(
+    "observed_energy": _ReportEntry(
         "energies that the control laws declare: lines, observers, tanks",
         _draw_observed,
         _unless(_observed_energy, "the laws of this run declare no energies"),

@@ -55,7 +55,7 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
     facts = {"arithmetic": compute_fingerprint(), **{name: known[name] for name in _VERSIONS}}
     file, origin = chosen / ORIGIN_NAME, json.dumps(facts, indent=2) + "\n"
     if not file.exists():
-        make_results_folder(chosen, "", force=False)
+        make_results_folder(chosen, "", force=None)
         write_whole(file, origin)
     elif (before := file.read_text(encoding="utf-8")) != origin:
         there, here = (" ".join(text.split()) for text in (before, origin))

@@ -73,7 +73,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
         before = _read(path)
         _refuse_other(path, before, facts)
         return SweepFolder(path, plan_from_json(before), before)
-    chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=False)
+    chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=None)
     write_whole(chosen / PLAN_FILE, _text(facts), remedy=build_resume_hint(chosen))
     return SweepFolder(chosen, plan, facts)
 

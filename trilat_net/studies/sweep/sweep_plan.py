@@ -14,12 +14,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, apply_overrides
 from ...scenario.fields import is_number, suggest_nearest
 from ...scenario.imported_law import name_law_classes
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import read_experiment
+from ..commands import format_toml_value
 from . import cell_result
 from .sweep_cell import CellTask, SweepCell, SweepSource
 
@@ -80,7 +83,7 @@ def parse_axis(asked: str) -> SweepAxis:
     Raises:
         ScenarioError: it has no key, no values, or values that make no grid.
     """
-    key, equals, text = (part.strip() for part in asked.partition("="))
+    key, equals, text = (part.strip() for part in str(asked).partition("="))
     if not equals or not key:
         raise ScenarioError(f"--over reads KEY=VALUES, {_HOW}, not {asked!r}")
     if key in _ELSEWHERE:
@@ -90,6 +93,23 @@ def parse_axis(asked: str) -> SweepAxis:
         raise ScenarioError(f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key)
     texts = _listed(key, text) if len(parts) == 1 else _steps(key, *(_decimal(key, part) for part in parts))
     return SweepAxis(f"{key}={text}", key, texts)
+
+
+def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
+    """Returns axes as texts, as of `parse_axis`; by their keys they may be lists or arrays of values."""
+    if isinstance(over, Mapping):
+        return [f"{key}={_join_values(values)}" for key, values in over.items()]
+    return list(over) if isinstance(over, list | tuple) else [str(over)]
+
+
+def _join_values(values: Any) -> str:
+    if isinstance(values, str):
+        return values
+    entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
+    is_word = (isinstance(one, str) and one.isidentifier() for one in entries)
+    return ",".join(
+        one if word else format_toml_value(one) for one, word in zip(entries, is_word, strict=True)
+    )
 
 
 def _steps(key: str, first: Decimal, last: Decimal, step: Decimal) -> _Steps:
@@ -245,7 +265,7 @@ def plan_sweep(
     source: str | Path | Mapping[str, Any] | Scenario,
     overrides: Sequence[str] = (),
     *,
-    over: Sequence[str] = (),
+    over: str | Sequence[str] | Mapping[str, Any] = (),
     seeds: int | Sequence[int] = 1,
     laws: Sequence[str | type] = (),
     longest_s: float | None = None,
@@ -255,7 +275,7 @@ def plan_sweep(
     Args:
         source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
         overrides: what is to be changed of it everywhere, as texts KEY=VALUE.
-        over: the axes, as "link.delay_ms=0:1600:50" or "link.order=newest,in_order".
+        over: the axes, as "link.delay_ms=0:1600:50" or "link.order=newest,in_order", or values by key.
         seeds: how many, from the scenario's own on; or which.
         laws: names of laws, or classes, swept besides the axes. One that all sites have stays with the gains
             of the scenario; another one replaces the law of every site, with its default gains. Overrides of
@@ -270,8 +290,9 @@ def plan_sweep(
     folder = None if read.folder is None else str(read.folder)
     written = SweepSource(read.called, read.text, folder, tuple(overrides))
     base = written.scenario()
-    axes = tuple(map(parse_axis, over))
-    chosen: tuple[str, ...] = tuple(dict.fromkeys(map(name_law_classes, laws)))
+    axes = tuple(map(parse_axis, list_axes(over)))
+    named = [laws] if isinstance(laws, str | type) else laws
+    chosen: tuple[str, ...] = tuple(dict.fromkeys(map(name_law_classes, named)))
     _refuse_twice(axes, chosen)
     forced = tuple(_law_overrides(written, base, law) for law in chosen)
     plan = SweepPlan(
@@ -305,8 +326,8 @@ def _refuse_twice(axes: Sequence[SweepAxis], laws: Sequence[str]) -> None:
 
 
 def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
-    if isinstance(asked, int):
-        if not 1 <= asked <= MAX_SEEDS:
+    if isinstance(asked, int | str):
+        if isinstance(asked, str) or not 1 <= asked <= MAX_SEEDS:
             raise UsageError(f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}")
         asked = range(own, own + asked)
     if len(asked) > MAX_SEEDS:

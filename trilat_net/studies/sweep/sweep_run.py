@@ -281,9 +281,9 @@ def _describe_grid_point(plan: SweepPlan, place: GridPoint) -> str:
 def describe_sweep_speed(speed: SweepSpeed) -> str:
     """Returns the speed in words."""
     on = "1 process" if speed.jobs == 1 else f"{speed.jobs} processes"
-    took = f"{speed.simulated_s:.4g} s simulated, in {format_wall_time(speed.wall_s)} by {on}"
     times = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
-    return f"{speed.runs} runs, {took}: {times:.0f} times real time per process"
+    took = f"{speed.simulated_s:.4g} s simulated in {format_wall_time(speed.wall_s)} by {on}"
+    return f"speed: {times:.3g} times real time per process; {took}"
 
 
 def list_next_commands(folder: Path) -> list[str]:

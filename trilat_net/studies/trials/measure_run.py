@@ -15,7 +15,6 @@ import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
-from ...analysis.timeline import first_divergence_s
 from ...analysis.torque_sources import list_walls, wall_force
 from ...core.ticks import BUCKETS_PER_S, NS_PER_S
 from ...core.vectors import Array
@@ -317,7 +316,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     """
     scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
-    diverged_at_s = first_divergence_s(log)
+    diverged_at_s = log.diverged_s
     tallies = {name: _site_stats(scenario, name) for name in log.sites}
     missing = 0
     for name, tally in tallies.items():
