@@ -63,10 +63,10 @@ def make_site_known(
 ) -> Iterator[None]:
     """Keeps a site's file inside the block, if others need no settings of Zenoh to reach it."""
     places = connection.reach([*connection.listen, *(connection.connect or ())])
-    how, here = (connection.mode, connection.keyed), (os.getpid(), SystemClock().identity())
+    how, here = (connection.mode, bool(connection.keys_of)), (os.getpid(), SystemClock().identity())
     known = KnownSite(session, site, sites, *how, places, stop, *here)
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
-        if connection.keyed or not connection.own:
+        if connection.keys_of or not connection.own:
             _find_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
             with os.fdopen(os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600), "wb") as stream:
                 stream.write(msgspec.json.encode(known))
@@ -109,7 +109,7 @@ def list_places(known: Sequence[KnownSite]) -> list[Endpoint]:
 
 def find_known_places(session: str, connection: "Connection") -> list[Endpoint] | None:
     """Returns where the sites of a session are reached, if all of them run here and as this member does."""
-    how = connection.mode, connection.keyed
+    how = connection.mode, bool(connection.keys_of)
     known = [one for one in find_known_sites(session) if (one.mode, one.keyed) == how]
     return list_places(known) if known and {one.site for one in known} == set(known[0].sites) else None
 
