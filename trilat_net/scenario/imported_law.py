@@ -2,18 +2,20 @@
 
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
-the package that contains it; building a site imports it, and only if that file defines a class of that name.
+the package that contains it. `import_law_class` is the one door to code from outside: it opens for
+`allowed_laws`, if the file is still that one and defines a law of that name.
 """
 
 import ast
 import hashlib
 import importlib
+import importlib.util
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 from msgspec import Meta, field
 from msgspec.structs import asdict
@@ -21,8 +23,8 @@ from msgspec.structs import asdict
 from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
-from ..errors import ScenarioError
-from ..files import find_page
+from ..errors import LawWithheld, ScenarioError
+from ..files import find_page, open_regular
 from .fields import Frozen, suggest_nearest
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
@@ -32,6 +34,20 @@ LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
+
+
+class LawConsent(NamedTuple):
+    """A file that may run: where it is, None for where Python finds its module; and its SHA-256."""
+
+    file: Path | None
+    sha256: str
+
+
+LawConsents = dict[tuple[str, str], LawConsent]
+allowed_laws: LawConsents = {}
+"""What may run in this process, by the code and the hash that a scenario names; workers are given it."""
+_executed: dict[LawConsent, Any] = {}
+"""Modules of the files that were executed."""
 
 
 class PluggedLaw(Frozen, frozen=True):
@@ -103,7 +119,7 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = import_law_class(self.code, f"{path}.law")
+            kind = import_law_class(self.code, self.source_sha256, f"{path}.law")
             _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
@@ -130,17 +146,6 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
                 path=f"{path}.source_sha256",
             )
 
-    def changed(self) -> str | None:
-        """Returns the difference of the law's file from the one that the scenario names, or None.
-
-        Raises:
-            ScenarioError: there is no such file.
-        """
-        now = hash_law_source(self.code, "control.law")
-        if now == self.source_sha256:
-            return None
-        return f"its sha256 is {now[:16]}, and was {self.source_sha256[:16]}"
-
 
 def hash_law_source(code: str, path: str) -> str:
     """Returns the SHA-256 of the file that defines a law; errors call the key `path`.
@@ -148,11 +153,21 @@ def hash_law_source(code: str, path: str) -> str:
     Raises:
         ScenarioError: there is no such file.
     """
-    file = _find_file(code, path)
+    return hashlib.sha256(read_law_file(find_law_file(code, path), path)).hexdigest()
+
+
+def read_law_file(file: Path, path: str) -> bytes:
+    """Returns the content of a law's file; errors call the key `path`.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        with open_regular(file) as stream:
+            content: bytes = stream.read()
     except OSError as error:
         raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
+    return content
 
 
 def read_law_sends(code: str, path: str) -> SentVectorSpecs:
@@ -161,7 +176,7 @@ def read_law_sends(code: str, path: str) -> SentVectorSpecs:
     Raises:
         ScenarioError: there is no such file, or no such declaration can be read from it.
     """
-    return read_sends(_find_file(code, path), code, path)
+    return read_sends(find_law_file(code, path), code, path)
 
 
 def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
@@ -206,9 +221,14 @@ def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any
     return law
 
 
-def _find_file(code: str, path: str) -> Path:
+def find_law_file(code: str, path: str) -> Path:
+    """Returns where Python would find the module of a law, without running anything.
+
+    Raises:
+        ScenarioError: there is no such file.
+    """
     module = code.partition(":")[0]
-    with _searching_here():
+    with _searching(None):
         spec = _find_spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
@@ -237,29 +257,82 @@ def _find_spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def import_law_class(code: str, path: str) -> Any:
-    """Returns the class of a law from its file as it is now; refuses a file that does not define it."""
+def import_law_class(code: str, sha256: str, path: str) -> Any:
+    """Returns the class of a law that a scenario names by a hash, from the file that may run for it.
+
+    Raises:
+        LawWithheld: none may, or it has changed since. Nothing has run.
+        ScenarioError: it defines no law of that name: nothing has run; or it cannot be imported.
+    """
     module, _, name = code.partition(":")
-    file = _find_file(code, path)
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
-    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    if name not in classes:
-        hint = suggest_nearest(name, classes) or f"; see {find_page('own-controller.md')}"
-        raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
-    now = hash_law_source(code, path)
-    with _searching_here():
+    if (consent := allowed_laws.get((code, sha256))) is None:
+        problem = f"{code} is code from outside, which a log names and nobody here allowed to run"
+        raise LawWithheld(f"{problem}: --law FILE does (in Python law=...)", path=path)
+    file = consent.file or find_law_file(code, path)
+    source = read_law_file(file, path)
+    if hashlib.sha256(source).hexdigest() != consent.sha256:
+        raise LawWithheld(f"{file} is not as it was when it was allowed to run for {code}", path=path)
+    check_law_class(source, file, code, path)
+    depth = module.count(".") + (file.stem == "__init__")  # beside it, or beside its package
+    with _searching(consent.file and file.parents[min(depth, len(file.parents) - 1)]):
         try:
-            found = importlib.import_module(module)
-            if _imported.setdefault(module, now) != now:  # edited while this program runs
-                found = importlib.reload(found)
-                _imported[module] = now
+            found = _import(module, consent) if consent.file is None else _execute(module, consent, source)
         except (Exception, SystemExit) as error:  # the user's code
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
     return getattr(found, name)
+
+
+def check_law_class(source: bytes, file: Path, code: str, path: str) -> None:
+    """Refuses a file that does not define a law's class, by its syntax alone: nothing of it runs.
+
+    Raises:
+        ScenarioError: it is no Python, or has no such class, or that has no torque and no base to have it of.
+    """
+    name = code.partition(":")[2]
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    if name not in classes:
+        hint = suggest_nearest(name, list(classes)) or f"; see {find_page('own-controller.md')}"
+        raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
+    node = classes[name]
+    named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
+    if not (node.bases or node.keywords or node.decorator_list or "torque" in named):
+        raise ScenarioError(
+            f"{code} is no law: it has no torque; see {find_page('own-controller.md')}", path=path
+        )
+
+
+def _import(module: str, consent: LawConsent) -> Any:
+    """Imports a module that Python finds."""
+    found = importlib.import_module(module)
+    if _imported.setdefault(module, consent.sha256) != consent.sha256:  # edited while this program runs
+        found = importlib.reload(found)
+        _imported[module] = consent.sha256
+    return found
+
+
+def _execute(module: str, consent: LawConsent, source: bytes) -> Any:
+    """Returns a module of the bytes that were checked, and of nothing that is cached beside the file."""
+    if consent in _executed:
+        return _executed[consent]
+    file, before = str(consent.file), sys.modules.get(module)
+    loader = SourceFileLoader(module, file)
+    spec = importlib.util.spec_from_file_location(module, file, loader=loader)
+    assert spec is not None
+    made = sys.modules[module] = importlib.util.module_from_spec(spec)
+    try:
+        exec(compile(source, file, "exec"), made.__dict__)
+        _executed[consent] = made
+    finally:
+        if before is not None:
+            sys.modules[module] = before
+        elif consent not in _executed:
+            del sys.modules[module]
+    return made
 
 
 def name_law_class(kind: type) -> str:
@@ -289,15 +362,15 @@ def name_law_classes(value: Any) -> Any:
 
 
 @contextmanager
-def _searching_here() -> Iterator[None]:
-    """Lets modules be found in the working directory."""
-    here = str(Path.cwd())
-    if here in sys.path:
+def _searching(folder: Path | None) -> Iterator[None]:
+    """Lets modules be found in a folder before all others; None: the working directory, unless it is one."""
+    first = str(folder or Path.cwd())
+    if folder is None and first in sys.path:
         yield
         return
-    sys.path.insert(0, here)
+    sys.path.insert(0, first)
     importlib.invalidate_caches()  # a file may be a moment old
     try:
         yield
     finally:
-        sys.path.remove(here)
+        sys.path.remove(first)
