@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ..errors import LawWithheld, ScenarioError
-from ..log.accounting import Coverage
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
@@ -167,13 +166,11 @@ def _checks(
 
 
 def _records_line(log: Log, result: VerifyResult) -> CheckLine:
-    have, coverage = sum(len(log[name]) for name in log.sites), result.coverage
+    have, coverage = sum(len(log[name]) for name in result.coverage.expected), result.coverage
     made = {event.member for event in log.events if event.kind == "end"}
     silent = [name for name in log.sites if name not in made]
-    judged = {site: ticks for site, ticks in coverage.expected.items() if site not in result.withheld}
-    asked = Coverage(coverage.judged, judged)
     text = f"{have}/{sum(coverage.expected.values())} in the file"
-    text += f"; {asked.describe(result.min_coverage)}" if judged else ""
+    text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
     text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""
     if silent:
         text += f"; {', '.join(silent)} did not report the number of its ticks"
@@ -181,7 +178,7 @@ def _records_line(log: Log, result: VerifyResult) -> CheckLine:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    passed = (not judged or asked.share >= result.min_coverage) and not log.damaged
+    passed = (not coverage.expected or coverage.share >= result.min_coverage) and not log.damaged
     return CheckLine("records", text, passed)
 
 

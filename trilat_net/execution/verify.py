@@ -20,7 +20,7 @@ from ..core.fingerprint import compute_fingerprint
 from ..core.site_setup import StaleAction
 from ..core.site_step import MAX_RAMPS, Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
-from ..errors import LawFailed, LawWithheld, ScenarioError
+from ..errors import LawFailed, ScenarioError
 from ..log.accounting import Coverage
 from ..log.digest_chain import Integrity
 from ..log.integrity import MIN_COVERAGE, judge_integrity
@@ -29,6 +29,7 @@ from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, parse_core_change
+from ..scenario.law_consent import find_user_laws
 from ..scenario.run_changes import count_skipped_ticks
 from .difference import (
     RecordDifference,
@@ -54,7 +55,7 @@ class VerifyResult:
         first: the difference of the earliest tick.
         gaps: missing ticks: (site, first, last).
         absences: ticks that a site did not make between two of its starts, likewise.
-        withheld: sites that were not executed, as nobody allowed their law to run; of the others is the rest.
+        withheld: sites whose law may not run, which were not executed; all else is of the others.
     """
 
     whole_run: bool
@@ -85,6 +86,8 @@ class VerifyResult:
         """Adds the result of other sites, which were executed from another log."""
         for name in ("records", "identical", "unjudged", "differing", "gaps", "absences", "withheld"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in other.withheld:
+            self.coverage.expected.pop(name, None)
         self.whole_run &= other.whole_run
         self.coverage.judged.update(other.coverage.judged)
         self._keep_first(other.first)
@@ -328,15 +331,15 @@ def _execute_sites(
     resume_every: int = 0,
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
-    for name in sites:
+    laws = find_user_laws(log.scenario)
+    withheld = [name for law in laws if not law.allowed for name in law.sites if name in sites]
+    result.withheld += withheld
+    for name in withheld:
+        result.coverage.expected.pop(name, None)
+    for name in (name for name in sites if name not in withheld):
         read = (log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result)
         own = (log.starts.get(name, ()), log.absences.get(name, ()))
-        try:
-            site = SiteVerifier(*read, *own, resume_every)
-        except LawWithheld:
-            result.withheld.append(name)
-            continue
-        site.run(report)
+        SiteVerifier(*read, *own, resume_every).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:

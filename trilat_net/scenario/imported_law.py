@@ -9,13 +9,13 @@ the package that contains it. `import_law_class` is the one door to code from ou
 import ast
 import hashlib
 import importlib
-import importlib.util
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from msgspec import Meta, field
 from msgspec.structs import asdict
@@ -28,7 +28,7 @@ from ..files import find_page, open_regular
 from .fields import Frozen, suggest_nearest
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
-from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
+from .sent_vectors import SentVectorSpecs, convert_sends, parse_classes, read_sends
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
@@ -131,20 +131,6 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
             return _make_law(kind, self.code, context, self.settings)
 
         return make
-
-    def check_unchanged(self, site: str) -> None:
-        """Refuses to start with another law than the scenario names.
-
-        Raises:
-            ScenarioError: the law's file is missing, or has another hash.
-        """
-        path = f"sites.{site}.control"
-        if hash_law_source(self.code, f"{path}.law") != self.source_sha256:
-            raise ScenarioError(
-                f"the file of {self.code} is not the one that the scenario names by this hash; put that one "
-                f"there, or write law = {self.code!r} to take the one that is",
-                path=f"{path}.source_sha256",
-            )
 
 
 def hash_law_source(code: str, path: str) -> str:
@@ -261,22 +247,24 @@ def import_law_class(code: str, sha256: str, path: str) -> Any:
     """Returns the class of a law that a scenario names by a hash, from the file that may run for it.
 
     Raises:
-        LawWithheld: none may, or it has changed since. Nothing has run.
-        ScenarioError: it defines no law of that name: nothing has run; or it cannot be imported.
+        LawWithheld: none may.
+        ScenarioError: it is not as it was when it was let, or defines no such law: nothing has run; or it
+            cannot be imported.
     """
     module, _, name = code.partition(":")
     if (consent := allowed_laws.get((code, sha256))) is None:
-        problem = f"{code} is code from outside, which a log names and nobody here allowed to run"
-        raise LawWithheld(f"{problem}: --law FILE does (in Python law=...)", path=path)
+        problem = f"{code} is code from outside, which may not run: --law FILE lets its file (in Python"
+        raise LawWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
     file = consent.file or find_law_file(code, path)
     source = read_law_file(file, path)
     if hashlib.sha256(source).hexdigest() != consent.sha256:
-        raise LawWithheld(f"{file} is not as it was when it was allowed to run for {code}", path=path)
+        problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
+        raise ScenarioError(f"{problem} there, or write law = {code!r} to take the one that is", path=path)
     check_law_class(source, file, code, path)
-    depth = module.count(".") + (file.stem == "__init__")  # beside it, or beside its package
+    depth = module.count(".") + (file.stem == "__init__")  # of its folder, in that of its package
     with _searching(consent.file and file.parents[min(depth, len(file.parents) - 1)]):
         try:
-            found = _import(module, consent) if consent.file is None else _execute(module, consent, source)
+            found = _execute(module, consent, source) if consent.file else _import(module, consent)
         except (Exception, SystemExit) as error:  # the user's code
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
@@ -284,26 +272,20 @@ def import_law_class(code: str, sha256: str, path: str) -> Any:
 
 
 def check_law_class(source: bytes, file: Path, code: str, path: str) -> None:
-    """Refuses a file that does not define a law's class, by its syntax alone: nothing of it runs.
+    """Refuses a file that does not define the class of a law, by its syntax alone: nothing of it runs.
 
     Raises:
-        ScenarioError: it is no Python, or has no such class, or that has no torque and no base to have it of.
+        ScenarioError: it is no Python, or has no such class, or that neither a torque nor a base.
     """
-    name = code.partition(":")[2]
-    try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    name, classes = code.partition(":")[2], parse_classes(source, file, path)
     if name not in classes:
         hint = suggest_nearest(name, list(classes)) or f"; see {find_page('own-controller.md')}"
         raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
     node = classes[name]
     named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
     if not (node.bases or node.keywords or node.decorator_list or "torque" in named):
-        raise ScenarioError(
-            f"{code} is no law: it has no torque; see {find_page('own-controller.md')}", path=path
-        )
+        page = find_page("own-controller.md")
+        raise ScenarioError(f"{code} is no law: it has no torque; see {page}", path=path)
 
 
 def _import(module: str, consent: LawConsent) -> Any:
@@ -320,18 +302,15 @@ def _execute(module: str, consent: LawConsent, source: bytes) -> Any:
     if consent in _executed:
         return _executed[consent]
     file, before = str(consent.file), sys.modules.get(module)
-    loader = SourceFileLoader(module, file)
-    spec = importlib.util.spec_from_file_location(module, file, loader=loader)
-    assert spec is not None
-    made = sys.modules[module] = importlib.util.module_from_spec(spec)
+    spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
+    made = sys.modules[module] = module_from_spec(cast(ModuleSpec, spec))
     try:
         exec(compile(source, file, "exec"), made.__dict__)
-        _executed[consent] = made
     finally:
+        sys.modules.pop(module, None)  # whatever a log calls it, it takes no other module's place
         if before is not None:
             sys.modules[module] = before
-        elif consent not in _executed:
-            del sys.modules[module]
+    _executed[consent] = made
     return made
 
 

@@ -17,14 +17,8 @@ import msgspec
 
 from ..errors import ScenarioError, UsageError
 from ..files import make_folder, write_whole
-from .imported_law import (
-    ImportedLaw,
-    LawConsent,
-    allowed_laws,
-    check_law_class,
-    find_law_file,
-    read_law_file,
-)
+from . import imported_law
+from .imported_law import ImportedLaw, LawConsent, allowed_laws, find_law_file, read_law_file
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -87,7 +81,7 @@ def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: 
             versions = f"its sha256 is {now[:16]}, and was {sha256[:16]}"
             problem = f"is not the file that ran as {code}: {versions}"
             raise UsageError(f"--law {file}: {problem}; --other-version takes it all the same")
-        check_law_class(source, file, code, "--law")
+        imported_law.check_law_class(source, file, code, "--law")
         allowed_laws[code, sha256] = LawConsent(file.resolve(), now)
     return now
 
@@ -120,15 +114,11 @@ class LoggedUserLaw(NamedTuple):
 
     def __str__(self) -> str:
         of = f"{self.code} of {', '.join(self.sites)}"
+        state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
         if self.allowed:
-            return f"{of}; its file {self.changed and 'was changed, '}{self.changed or 'is the one that ran'}"
-        other = (
-            f" --other-version: it was changed, {self.changed}"
-            if self.changed
-            else ": it is the one that ran"
-        )
-        how = f"--law {self.file}{other}" if self.file else "--law FILE; Python finds no such module"
-        return f"{of} is code from outside, and not run; if you trust it: {how}"
+            return f"{of}; its file {state}"
+        hint = f"{self.file}{' --other-version' * bool(self.changed)} (it {state})" if self.file else "FILE"
+        return f"{of} is code from outside, which may not run; if you trust it: --law {hint}"
 
 
 def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
