@@ -11,7 +11,7 @@ import re
 from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -33,7 +33,7 @@ def list_imported_laws(scenarios: "Iterable[Scenario]") -> list[ImportedLaw]:
     return [control for control in controls if isinstance(control, ImportedLaw)]
 
 
-def allow_own_laws(scenario: "Scenario", codes: Container[str] | None = None) -> "Scenario":
+def allow_own_laws(scenario: "Scenario", codes: Container[Any] | None = None) -> "Scenario":
     """Returns a scenario of which laws may run: all, of one that a person names, or those that they name."""
     for law in list_imported_laws([scenario]):
         if codes is None or law.code in codes:

@@ -98,7 +98,8 @@ def load_scenario(
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))
             changed = parse_scenario(source.text, source.name, expanded) if overrides else source
-            return allow_own_laws(changed, {str(v) for key, v in expanded.items() if key.endswith(".law")})
+            laws = [one.get("law") if isinstance(one, dict) else one for one in expanded.values()]
+            return allow_own_laws(changed, laws)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)
