@@ -11,7 +11,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, trilat
-from tests.log_editing import edited
+from tests.log_editing import edited, opened
 from trilat_net.errors import LawWithheld, ScenarioError, UsageError
 from trilat_net.scenario.imported_law import allowed_laws
 
@@ -86,11 +86,11 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         setting = ("--set", "sites.s.control.law=mylaws:Spring")
         trilat("sim", "paper", "--duration", "0.05", *setting, "-o", "run.mcap", cwd=folder).succeeds()
     assert (folder / "witness").exists()  # it does tell
-    (before, now) = (
-        hashlib.sha256(one.encode()).hexdigest() for one in (LAW, FILES["not a law"]["mylaws.py"])
-    )
-    other = edited((folder / "run.mcap").read_bytes(), scenario=lambda text: text.replace(before, now))
-    (folder / "not a law.mcap").write_bytes(other)
+    before, now = (hashlib.sha256(one.encode()).hexdigest() for one in (LAW, FILES["not a law"]["mylaws.py"]))
+    log = (folder / "run.mcap").read_bytes()
+    text = opened(log).scenario_text.replace(before, now)
+    named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    (folder / "not a law.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
     return folder
 
 
@@ -106,7 +106,12 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _marks(words: list[str], law: str) -> tuple[Any, ...]:
-    return (pytest.mark.long,) if words[0] == "report" and law != "beside the log" else ()
+    brief = words[0] in ("verify", "-c") or "--own-laws" in words or (words, 0) not in READING
+    return (
+        ()
+        if brief and "--json" not in words and law in ("beside the log", "changed")
+        else (pytest.mark.long,)
+    )
 
 
 @pytest.mark.parametrize(
@@ -213,7 +218,6 @@ def test_a_remembered_file_runs_for_its_hash_alone(place: Path) -> None:
     trilat("verify", "run.mcap", "--remember", cwd=place).refuses("give --law FILE too")
     assert trilat("verify", "run.mcap", "--law", file, "--remember", cwd=place).code == 0
     assert trilat("verify", "run.mcap", cwd=place).code == 0
-    assert trilat("report", "run.mcap", "-o", "page", cwd=place).code == 0
     file.write_text(f"{LAW}# a word\n")
     assert trilat("verify", "run.mcap", cwd=place).code == 4
 

@@ -133,7 +133,9 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
         consent, file, now = allowed_laws.get((code, sha256)), None, ""
         with suppress(ScenarioError):
             file = (consent and consent.file) or find_law_file(code, "")
-            now = hashlib.sha256(read_law_file(file, "")).hexdigest()
+            source = read_law_file(file, "")
+            imported_law.check_law_class(source, file, code, "")
+            now = hashlib.sha256(source).hexdigest()
         allowed = consent is not None and consent.sha256 == now
         changed = "" if now in ("", sha256) else f"its sha256 is {now[:16]}, and was {sha256[:16]}"
         found.append(LoggedUserLaw(code, owners, allowed, file if now else None, changed))
