@@ -28,7 +28,7 @@ from ..files import find_page, open_regular
 from .fields import Frozen, suggest_nearest
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
-from .sent_vectors import SentVectorSpecs, convert_sends, parse_classes, read_sends
+from .sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
@@ -46,7 +46,7 @@ class LawConsent(NamedTuple):
 LawConsents = dict[tuple[str, str], LawConsent]
 allowed_laws: LawConsents = {}
 """What may run in this process, by the code and the hash that a scenario names; workers are given it."""
-_executed: dict[LawConsent, Any] = {}
+_executed: dict["LawSource", Any] = {}
 """Modules of the files that were executed."""
 
 
@@ -133,36 +133,27 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
         return make
 
 
-def hash_law_source(code: str, path: str) -> str:
-    """Returns the SHA-256 of the file that defines a law; errors call the key `path`.
+class LawSource(NamedTuple):
+    """The file of a law, as it is: where, its content, and the SHA-256 of that."""
+
+    file: Path
+    content: bytes
+    sha256: str
+
+
+def read_law_source(code: str, path: str, file: Path | None = None) -> LawSource:
+    """Returns a law's file, or that which Python finds, of which nothing runs; errors call the key `path`.
 
     Raises:
-        ScenarioError: there is no such file.
+        ScenarioError: there is no such file, or it cannot be read.
     """
-    return hashlib.sha256(read_law_file(find_law_file(code, path), path)).hexdigest()
-
-
-def read_law_file(file: Path, path: str) -> bytes:
-    """Returns the content of a law's file; errors call the key `path`.
-
-    Raises:
-        ScenarioError: it cannot be read.
-    """
+    place = file or _find_file(code, path)
     try:
-        with open_regular(file) as stream:
-            content: bytes = stream.read()
+        with open_regular(place) as stream:
+            content = stream.read()
     except OSError as error:
-        raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
-    return content
-
-
-def read_law_sends(code: str, path: str) -> SentVectorSpecs:
-    """Returns what a law declares that it sends; errors call the key `path`.
-
-    Raises:
-        ScenarioError: there is no such file, or no such declaration can be read from it.
-    """
-    return read_sends(find_law_file(code, path), code, path)
+        raise ScenarioError(f"{place} cannot be read: {error.strerror}", path=path) from None
+    return LawSource(place, content, hashlib.sha256(content).hexdigest())
 
 
 def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
@@ -207,12 +198,7 @@ def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any
     return law
 
 
-def find_law_file(code: str, path: str) -> Path:
-    """Returns where Python would find the module of a law, without running anything.
-
-    Raises:
-        ScenarioError: there is no such file.
-    """
+def _find_file(code: str, path: str) -> Path:
     module = code.partition(":")[0]
     with _searching(None):
         spec = _find_spec(module)
@@ -255,32 +241,32 @@ def import_law_class(code: str, sha256: str, path: str) -> Any:
     if (consent := allowed_laws.get((code, sha256))) is None:
         problem = f"{code} is code from outside, which may not run: --law FILE lets its file (in Python"
         raise LawWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
-    file = consent.file or find_law_file(code, path)
-    source = read_law_file(file, path)
-    if hashlib.sha256(source).hexdigest() != consent.sha256:
+    source = read_law_source(code, path, consent.file)
+    if source.sha256 != consent.sha256:
         problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
         raise ScenarioError(f"{problem} there, or write law = {code!r} to take the one that is", path=path)
-    check_law_class(source, file, code, path)
-    depth = module.count(".") + (file.stem == "__init__")  # of its folder, in that of its package
-    with _searching(consent.file and file.parents[min(depth, len(file.parents) - 1)]):
+    check_law_class(source, code, path)
+    folders = source.file.parents  # its own, or that of its package
+    depth = min(module.count(".") + (source.file.stem == "__init__"), len(folders) - 1)
+    with _searching(consent.file and folders[depth]):
         try:
-            found = _execute(module, consent, source) if consent.file else _import(module, consent)
+            found = _execute(module, source) if consent.file else _import(module, source.sha256)
         except (Exception, SystemExit) as error:  # the user's code
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
     return getattr(found, name)
 
 
-def check_law_class(source: bytes, file: Path, code: str, path: str) -> None:
+def check_law_class(source: LawSource, code: str, path: str) -> None:
     """Refuses a file that does not define the class of a law, by its syntax alone: nothing of it runs.
 
     Raises:
         ScenarioError: it is no Python, or has no such class, or that neither a torque nor a base.
     """
-    name, classes = code.partition(":")[2], parse_classes(source, file, path)
+    name, classes = code.partition(":")[2], parse_classes(source.content, source.file, path)
     if name not in classes:
         hint = suggest_nearest(name, list(classes)) or f"; see {find_page('own-controller.md')}"
-        raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
+        raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
     node = classes[name]
     named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
     if not (node.bases or node.keywords or node.decorator_list or "torque" in named):
@@ -288,29 +274,29 @@ def check_law_class(source: bytes, file: Path, code: str, path: str) -> None:
         raise ScenarioError(f"{code} is no law: it has no torque; see {page}", path=path)
 
 
-def _import(module: str, consent: LawConsent) -> Any:
+def _import(module: str, sha256: str) -> Any:
     """Imports a module that Python finds."""
     found = importlib.import_module(module)
-    if _imported.setdefault(module, consent.sha256) != consent.sha256:  # edited while this program runs
+    if _imported.setdefault(module, sha256) != sha256:  # edited while this program runs
         found = importlib.reload(found)
-        _imported[module] = consent.sha256
+        _imported[module] = sha256
     return found
 
 
-def _execute(module: str, consent: LawConsent, source: bytes) -> Any:
-    """Returns a module of the bytes that were checked, and of nothing that is cached beside the file."""
-    if consent in _executed:
-        return _executed[consent]
-    file, before = str(consent.file), sys.modules.get(module)
+def _execute(module: str, source: LawSource) -> Any:
+    """Returns a module of the content that was checked, and of nothing that is cached beside the file."""
+    if source in _executed:
+        return _executed[source]
+    file, before = str(source.file), sys.modules.get(module)
     spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
     made = sys.modules[module] = module_from_spec(cast(ModuleSpec, spec))
     try:
-        exec(compile(source, file, "exec"), made.__dict__)
+        exec(compile(source.content, file, "exec"), made.__dict__)
     finally:
         sys.modules.pop(module, None)  # whatever a log calls it, it takes no other module's place
         if before is not None:
             sys.modules[module] = before
-    _executed[consent] = made
+    _executed[source] = made
     return made
 
 

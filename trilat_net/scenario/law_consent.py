@@ -4,7 +4,6 @@ Invariant: what a log or a member of a session names may run if a person names i
 that the log names, unless another version is asked for.
 """
 
-import hashlib
 import json
 import os
 import re
@@ -17,8 +16,7 @@ import msgspec
 
 from ..errors import ScenarioError, UsageError
 from ..files import make_folder, write_whole
-from . import imported_law
-from .imported_law import ImportedLaw, LawConsent, allowed_laws, find_law_file, read_law_file
+from .imported_law import ImportedLaw, LawConsent, allowed_laws, check_law_class, read_law_source
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -68,9 +66,9 @@ def allow_logged_laws(
 
 def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: bool) -> str:
     """Lets a file run as the laws that have its hash, or else its name; returns its hash."""
-    source = read_law_file(file, "--law")
-    now = hashlib.sha256(source).hexdigest()
-    stem = (file.resolve().parent if file.stem == "__init__" else file).stem
+    source = read_law_source("", "--law", file.resolve())
+    now = source.sha256
+    stem = (source.file.parent if file.stem == "__init__" else file).stem
     alike = [key for key in named if re.split(r"[.:]", key[0])[-2] == stem]
     meant = [key for key in named if key[1] == now] or alike
     if not meant:
@@ -81,8 +79,8 @@ def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: 
             versions = f"its sha256 is {now[:16]}, and was {sha256[:16]}"
             problem = f"is not the file that ran as {code}: {versions}"
             raise UsageError(f"--law {file}: {problem}; --other-version takes it all the same")
-        imported_law.check_law_class(source, file, code, "--law")
-        allowed_laws[code, sha256] = LawConsent(file.resolve(), now)
+        check_law_class(source, code, "--law")
+        allowed_laws[code, sha256] = LawConsent(source.file, now)
     return now
 
 
@@ -92,7 +90,7 @@ def _find_store() -> Path:
 
 
 def _read_remembered() -> dict[str, str]:
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
         return msgspec.json.decode(_find_store().read_bytes(), type=dict[str, str])
     return {}
 
@@ -130,13 +128,12 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
             sites[key] = (*sites.get(key, ()), name)
     found = []
     for (code, sha256), owners in sites.items():
-        consent, file, now = allowed_laws.get((code, sha256)), None, ""
+        consent, now, file = allowed_laws.get((code, sha256)), "", None
         with suppress(ScenarioError):
-            file = (consent and consent.file) or find_law_file(code, "")
-            source = read_law_file(file, "")
-            imported_law.check_law_class(source, file, code, "")
-            now = hashlib.sha256(source).hexdigest()
+            source = read_law_source(code, "", consent and consent.file)
+            check_law_class(source, code, "")
+            now, file = source.sha256, source.file
         allowed = consent is not None and consent.sha256 == now
         changed = "" if now in ("", sha256) else f"its sha256 is {now[:16]}, and was {sha256[:16]}"
-        found.append(LoggedUserLaw(code, owners, allowed, file if now else None, changed))
+        found.append(LoggedUserLaw(code, owners, allowed, file, changed))
     return found

@@ -91,14 +91,14 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
     return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
-def read_sends(file: Path, code: str, path: str) -> SentVectorSpecs:
+def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
     """Returns what the class of a law declares that it sends, as its file writes it, without running it.
 
     Raises:
         ScenarioError: the file is no Python, or the declaration is no literal, or none of vectors.
     """
     found: Any = {}
-    law = parse_classes(file.read_bytes(), file, path).get(code.partition(":")[2])
+    law = parse_classes(source, file, path).get(code.partition(":")[2])
     for node in (line for line in (law.body if law else ()) if isinstance(line, ast.Assign | ast.AnnAssign)):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         if node.value is None or "sends" not in {one.id for one in targets if isinstance(one, ast.Name)}:

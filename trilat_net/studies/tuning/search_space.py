@@ -18,7 +18,7 @@ from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
 from ...scenario.fields import MAX_QUANTITY, field_names, is_number, suggest_nearest
-from ...scenario.imported_law import LawConsent, allowed_laws, hash_law_source, import_law_class
+from ...scenario.imported_law import LawConsent, allowed_laws, import_law_class, read_law_source
 from ...scenario.laws import LAWS
 
 MIN_BOX = 0.1
@@ -333,7 +333,7 @@ def build_own_search_space(code: str) -> SearchSpace:
         ScenarioError: there is no such class.
         UsageError: it has no ranges, or one of them is none.
     """
-    sha256 = hash_law_source(code, "--law")
+    sha256 = read_law_source(code, "--law").sha256
     allowed_laws[code, sha256] = LawConsent(None, sha256)
     kind = import_law_class(code, sha256, "--law")
     ranges = getattr(kind, "tune", None)
