@@ -11,6 +11,7 @@ import trilat_net as tn
 from tests.cli.running import trilat
 from trilat_net.log.log_reader import open_log
 
+LAWS = Path(__file__).parents[1] / "laws.py"
 DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
 SHORT = ("--duration", "0.1")
@@ -123,7 +124,7 @@ def test_a_run_whose_law_fails_is_one_sentence_and_a_finished_log(tmp_path: Path
     done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
     done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
     assert open_log(tmp_path / "two_sites.mcap").complete
-    checked = trilat("verify", "two_sites.mcap", "--virtual", cwd=tmp_path)
+    checked = trilat("verify", "two_sites.mcap", "--virtual", "--law", LAWS, cwd=tmp_path)
     assert checked.code == 0
     assert "81/81 records identical" in checked.out
 
