@@ -71,6 +71,8 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
 ELSEWHERE = {
     "README.md": ".ci/readme",
     "docs/bench.md: trilat bench --small": "tests/cli/test_benches.py",
+    "docs/code-that-runs.md: trilat verify": "tests/cli/test_code_from_logs.py",
+    "docs/code-that-runs.md: log = tn.open_log": "tests/cli/test_code_from_logs.py",
     "docs/external-arm.md: from trilat_net.net.arm_port import ArmPort": "tests/sites/test_external_arm.py",
     "docs/external-arm.md: from trilat_net.net.arm_port import Enable": "tests/sites/test_external_arm.py",
     "docs/lab.md: trilat": "tests/test_lab.py",

@@ -62,6 +62,12 @@ class ScenarioError(TrilatError):
         self.source = source
 
 
+class LawWithheld(ScenarioError):  # noqa: N818 - it names an outcome
+    """A control law that a log names, and that nobody here allowed to run."""
+
+    exit_code = 4
+
+
 class UsageError(TrilatError):
     """Arguments that contradict each other or the machine (a busy port, an existing file)."""
 

@@ -14,6 +14,7 @@ from typer.main import get_command
 
 from trilat_net.cli import app, main
 from trilat_net.core.jit import compiling_notice
+from trilat_net.scenario.imported_law import allowed_laws
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""
@@ -77,7 +78,8 @@ def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -
 
 
 def trilat(*arguments: str | Path, cwd: Path) -> Done:
-    """Runs a command in a folder to its end."""
+    """Runs a command in a folder to its end; laws that another command may run it may not."""
+    allowed_laws.clear()
     out, err = io.StringIO(), io.StringIO()
     code: object = None
     with (

@@ -11,6 +11,7 @@ import trilat_net as tn
 from tests.cli.running import trilat
 from trilat_net.log.log_reader import open_log
 
+LAWS = Path(__file__).parents[1] / "laws.py"
 DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
 SHORT = ("--duration", "0.1")
@@ -80,32 +81,36 @@ def law(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 
 def test_before_code_from_outside_runs_it_is_said_which(law: Path, tmp_path: Path) -> None:
     for command in (["verify"], ["verify", "--json"], ["rerun", "--closed-loop"]):
-        done = trilat(command[0], "two_sites.mcap", *command[1:], cwd=tmp_path)
+        done = trilat(command[0], "two_sites.mcap", *command[1:], "--law", law, cwd=tmp_path)
         assert done.code == 0
         assert done.err.startswith("note: executing this log runs code from outside: ")
         assert f"{law.stem}:Law of m, s; its file is the one that ran" in done.err
 
 
-def test_a_law_whose_file_was_changed_is_told_and_judged(law: Path, tmp_path: Path) -> None:
+def test_a_law_whose_file_was_changed_is_judged_on_request(law: Path, tmp_path: Path) -> None:
     law.write_text(law.read_text() + "# a word\n")
-    done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
+    how = ("--law", law, "--other-version")
+    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses("is not the file that ran as")
+    assert trilat("verify", "two_sites.mcap", cwd=tmp_path).code == 4
+    done = trilat("verify", "two_sites.mcap", *how, cwd=tmp_path)
     assert done.code == 0
     assert "its file was changed" in done.out
     assert "200/200 records identical" in done.out
-    again = trilat("rerun", "two_sites.mcap", "--closed-loop", cwd=tmp_path)
+    again = trilat("rerun", "two_sites.mcap", "--closed-loop", *how, cwd=tmp_path)
     assert "executed as its file is now" in again.out
     law.write_text(law.read_text().replace("pass", "def torque(self, now): return [0.0, 0.0]"))
-    done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
+    done = trilat("verify", "two_sites.mcap", *how, cwd=tmp_path)
     assert done.code == 1
     assert "its file was changed" in done.out
     assert "differ, the first: m, tick " in done.err
 
 
-@pytest.mark.parametrize("command", [["verify"], ["rerun", "--closed-loop"]])
-def test_a_law_whose_file_is_not_there_is_bad_input(law: Path, command: list[str], tmp_path: Path) -> None:
+def test_a_law_whose_file_is_not_there_is_not_judged(law: Path, tmp_path: Path) -> None:
     law.unlink()
-    done = trilat(command[0], "two_sites.mcap", *command[1:], cwd=tmp_path)
-    done.refuses(law.stem, "install it, or be in the folder that it lies in")
+    done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
+    assert done.code == 4
+    assert "if you trust it: --law FILE" in done.err
+    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses(law.stem, "cannot be read")
 
 
 def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path) -> None:
@@ -119,7 +124,7 @@ def test_a_run_whose_law_fails_is_one_sentence_and_a_finished_log(tmp_path: Path
     done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
     done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
     assert open_log(tmp_path / "two_sites.mcap").complete
-    checked = trilat("verify", "two_sites.mcap", "--virtual", cwd=tmp_path)
+    checked = trilat("verify", "two_sites.mcap", "--virtual", "--law", LAWS, cwd=tmp_path)
     assert checked.code == 0
     assert "81/81 records identical" in checked.out
 

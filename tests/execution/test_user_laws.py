@@ -10,12 +10,13 @@ from tests.execution.deliveries import SITES, TICKS
 from tests.execution.logs import OTHER_PLATFORM, numbers, without_records
 from tests.log_editing import Record, edited, opened, recorded
 from trilat_net.core.ticks import PlantState
-from trilat_net.errors import LawFailed, ScenarioError
+from trilat_net.errors import LawFailed, ScenarioError, UsageError
 from trilat_net.execution import virtual
-from trilat_net.execution.verify import find_user_laws, verify
+from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
-from trilat_net.log.log_reader import open_log
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import load_scenario, to_core_change
+from trilat_net.scenario.law_consent import find_user_laws
 from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
 
 LAW = "tests.laws:Adaptive"
@@ -120,33 +121,44 @@ def log_of(file: Path) -> io.BytesIO:
     return stream
 
 
-def test_a_changed_file_is_told_and_judged_all_the_same(file: Path) -> None:
-    log = open_log(log_of(file))
+def test_a_changed_file_is_judged_if_one_asks_for_that_version(file: Path) -> None:
+    stream = log_of(file)
+    log = open_log(stream)
     (law,) = find_user_laws(log.scenario)
-    assert (law.sites, law.changed) == (("m", "s"), "")
+    assert (law.sites, law.allowed, law.changed) == (("m", "s"), True, "")
     assert "is the one that ran" in str(law)
     file.write_text(file.read_text() + "# a word\n")
-    assert "was changed" in str(find_user_laws(log.scenario)[0])
-    assert verify(log).passed
+    (law,) = find_user_laws(log.scenario)
+    assert not law.allowed
+    assert f"--law {file} --other-version (it was changed" in str(law)
+    verdict = verify(log)
+    assert (verdict.withheld, verdict.records, verdict.agreed, verdict.passed) == (["m", "s"], 0, True, False)
+    with pytest.raises(UsageError, match="is not the file that ran"):
+        reopened(stream, law=file)
+    assert verify(reopened(stream, law=file, other_version=True)).passed
     file.write_text(file.read_text().replace("pass", "def memory(self): return [1.0]"))
-    assert verify(log).first.field == "mem"
+    assert verify(reopened(stream, law=file, other_version=True)).first.field == "mem"
+
+
+def reopened(stream: io.BytesIO, **how: Any) -> Log:
+    stream.seek(0)
+    return open_log(stream, **how)
 
 
 def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
     log = open_log(log_of(file))
     file.unlink()
-    advice = "install it, or be in the folder that it lies in"
-    with pytest.raises(ScenarioError, match=advice):
-        find_user_laws(log.scenario)
-    with pytest.raises(ScenarioError, match=advice):
-        verify(log)
+    (law,) = find_user_laws(log.scenario)
+    assert str(law).endswith("code from outside, which may not run; if you trust it: --law FILE")
+    assert verify(log).withheld == ["m", "s"]
 
 
 def test_a_law_that_fails_only_now_is_a_difference_and_the_other_sites_are_judged(file: Path) -> None:
-    log = open_log(log_of(file))
+    stream = log_of(file)
     wrong = "1 / 0 if now.k == 7 and self._facts.site == 's'"
     failing = f"def torque(self, now): return {wrong} else super().torque(now)"
     file.write_text(file.read_text().replace("pass", failing))
+    log = open_log(stream, law=file, other_version=True)
     verdict = verify(log)
     assert (verdict.first.site, verdict.first.tick) == ("s", 7)
     assert "ZeroDivisionError" in str(verdict.first)

@@ -34,6 +34,8 @@ STEP_SHARE = 1.1
 START_TICKS = 100
 FAST_ENOUGH_RAD_S = 5.0
 """A limit of speed that nobody's own motion passes."""
+QUICK_ENOUGH_NM_S = 300.0
+"""Below this limit of a torque's rate the law itself may swing up as it follows."""
 
 
 def stretches(states: Sequence[State]) -> Iterator[list[State]]:
@@ -158,15 +160,17 @@ def allowed_step(scenario: Scenario, undisturbed_nm: float) -> float:
 
 
 def check_liveness(session: FaultSession) -> Iterator[str]:
-    """I8: once everything is mended, everybody follows everybody again, unless its speed alone is a fault."""
+    """I8: once everything is mended, all follow each other, or are in fault by tight limits."""
     rate_hz = session.scenario.sites[SITES[0]].rate_hz
     timetable = session.timetable
     last = round(timetable.length_s * rate_hz)
-    too_fast = any(states[-1].mode == "fault" for states in session.published.states.values())
-    too_fast = too_fast and np.max(session.scenario.setup(SITES[0]).qd_limit_rad_s) < FAST_ENOUGH_RAD_S
+    limits = session.scenario.setup(SITES[0])
+    tight = np.max(limits.qd_limit_rad_s) < FAST_ENOUGH_RAD_S
+    tight |= np.min(limits.limits.tau_rate) < QUICK_ENOUGH_NM_S
+    tight &= any(states[-1].mode == "fault" for states in session.published.states.values())
     for name, states in session.published.states.items():
         modes = {state.mode for state in states if state.tick >= last - timetable.engaged_s * rate_hz}
-        if modes != {"run"} and not (too_fast and modes <= {"hold", "run", "return", "waiting", "fault"}):
+        if modes != {"run"} and not (tight and modes <= {"hold", "run", "return", "waiting", "fault"}):
             yield f"{name} ends in {' and '.join(sorted(modes)) or 'silence'}"
 
 

@@ -57,7 +57,7 @@ def test_every_released_version_has_one() -> None:
 
 def test_a_log_with_a_users_own_law_is_executed_again() -> None:
     made = subprocess.run(
-        [*COMMAND, "verify", "own-law.mcap", "--json"],
+        [*COMMAND, "verify", "own-law.mcap", "--json", "--law", "spring_law.py", "--other-version"],
         cwd=Path(__file__).parent,
         capture_output=True,
         text=True,

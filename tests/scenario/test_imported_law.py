@@ -70,7 +70,7 @@ def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: 
     ("overrides", "fact"),
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
-        ({"control.law": "tests.laws:NoLaw"}, "has no torque;"),
+        ({"control.law": "tests.laws:NoLaw"}, "NoLaw is no law: it has no torque"),
         ({"control.law": LAW, "control.Kdd": 2}, "cannot be made with Kdd = 2: TypeError"),
         ({"control.law": "tests.laws:Pair"}, "is for 2 sites, and here are 3"),
         ({"control.law": "tests.laws:Odd"}, "sites must be as in 2 or (2, 4), is 'many'"),
@@ -149,11 +149,11 @@ def test_settings_stand_beside_the_name_of_the_law() -> None:
 
 
 def test_a_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
-    other = parse_scenario(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
-    RESOLVED.sites["s"].control.check_unchanged("s")
+    other = load_scenario(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
+    Site(RESOLVED.setup("s"))
     with pytest.raises(ScenarioError, match=r"is not the one that the scenario names") as caught:
-        other.sites["s"].control.check_unchanged("s")
-    assert caught.value.path == "sites.s.control.source_sha256"
+        Site(other.setup("s"))
+    assert caught.value.path == "sites.s.control.law"
 
 
 SENDING = """
@@ -232,8 +232,10 @@ def test_a_site_is_built_of_the_law_that_the_scenario_names_in_the_scheme_it_is_
 ) -> None:
     scenario = load_sending(folder, "{'u': {}}")
     made = "def __init__(self, *_): raise OSError"
-    (folder / "sending.py").write_text(SENDING.replace("{SENDS}", f"{sends}\n    {made}"))
-    scenario = load_scenario(scenario, overrides)
+    file, before = folder / "sending.py", scenario.sites["s"].control.source_sha256
+    file.write_text(SENDING.replace("{SENDS}", f"{sends}\n    {made}"))
+    named = scenario.text.replace(before, hashlib.sha256(file.read_bytes()).hexdigest())
+    scenario = load_scenario(load_scenario(named), overrides)
     with pytest.raises(ScenarioError, match=fact or "OSError"):
         Site(scenario.setup("s"))
     assert load_scenario(scenario, {"control.law": "adaptive"}).channel("s").floats == 0

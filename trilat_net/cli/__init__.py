@@ -1,8 +1,8 @@
 """The `trilat` command: registers all commands and maps errors to exit codes.
 
 Invariant: a command parses, calls one function of the library and prints. It exits 0 on success, 1 on a
-failed run or comparison, 2 on bad input, 5 when a disk takes no more, 128 + n when signal n ended it; an
-error is one sentence.
+failed run or comparison, 2 on bad input, 4 when a law of a log may not run, 5 when a disk takes no more,
+128 + n when signal n ended it; an error is one sentence.
 """
 
 import errno

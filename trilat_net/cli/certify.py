@@ -11,11 +11,14 @@ def certify_command(
     accept: options.AcceptOption = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     own_laws: options.OwnLawsOption = False,
+    law: options.LawFilesOption = None,
+    other_version: options.OtherVersionOption = False,
+    remember: options.RememberOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
 
-    Executes nothing but, with --own-laws, the methods by which imported laws declare their energies.
+    Executes nothing but, with --law or --own-laws, the methods by which imported laws declare their energies.
     docs/certificate.md defines every word and every key of the JSON.
 
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
@@ -23,7 +26,8 @@ def certify_command(
     """
     from ..theory.end_pose import certify_with_roots
 
-    log = terminal.open_with_progress(*files)
+    log = terminal.open_with_progress(*files, law=law, other_version=other_version, remember=remember)
+    own_laws = own_laws or bool(law)
     if own_laws:
         terminal.warn_user_laws(log)
     found = certify_with_roots(log, min_coverage=min_coverage, own_laws=own_laws)

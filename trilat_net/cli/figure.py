@@ -40,12 +40,16 @@ def figure_command(
             "--with", metavar="FILE", help="Draw this log over FILE, as the figure overlay; repeatable."
         ),
     ] = None,
+    law: options.LawFilesOption = None,
+    other_version: options.OtherVersionOption = False,
+    remember: options.RememberOption = False,
     listed: Annotated[bool, typer.Option("--list", help="Only list the figures.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
     """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
-    log = terminal.open_with_progress(file)
+    log = terminal.open_with_progress(file, law=law, other_version=other_version, remember=remember)
+    terminal.warn_user_laws(log)
     if listed:
         _list_figures(log, as_json=as_json)
         return

@@ -177,6 +177,16 @@ OwnLawsOption = Annotated[
     bool,
     typer.Option("--own-laws", help="Run code of imported laws for the energies that they declare."),
 ]
+LawFilesOption = Annotated[
+    list[Path] | None,
+    typer.Option("--law", metavar="FILE", help="Let this file run as a law that the log names; repeatable."),
+]
+OtherVersionOption = Annotated[
+    bool, typer.Option("--other-version", help="Take the --law FILE though it is not the one that ran.")
+]
+RememberOption = Annotated[
+    bool, typer.Option("--remember", help="Let the --law FILE run for other logs that name its hash, too.")
+]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")

@@ -25,6 +25,9 @@ def rerun_command(
         bool, typer.Option("--closed-loop", help="Execute all sites, over the network of the log.")
     ] = False,
     overrides: options.SetOption = None,
+    law: options.LawFilesOption = None,
+    other_version: options.OtherVersionOption = False,
+    remember: options.RememberOption = False,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--out", "--output", metavar="FILE", help="Write the result as a log."),
@@ -40,8 +43,8 @@ def rerun_command(
 
     if output is not None:
         _check_output(output, files, force=force)
-    log = terminal.open_with_progress(*files)
-    terminal.warn_user_laws(log, needed=False)  # another law may take its place
+    log = terminal.open_with_progress(*files, law=law, other_version=other_version, remember=remember)
+    terminal.warn_user_laws(log)
     with terminal.progress_bar("executing") as progress:
         again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
     if output is not None:

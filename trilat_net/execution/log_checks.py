@@ -8,21 +8,33 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..errors import ScenarioError
+from ..errors import LawWithheld, ScenarioError
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..results import Result
-from .verify import VerifyResult, find_user_laws, verify
+from ..scenario.imported_law import LawConsents, allowed_laws
+from ..scenario.law_consent import find_user_laws
+from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 
 class CheckLine(NamedTuple):
-    """The result of one check of a log, in words: its subject, its outcome, and whether it passed."""
+    """The result of one check of a log, in words: its subject, its outcome, and whether it passed.
+
+    It did not if it was not `judged`, since it needs code from outside that nobody allowed to run.
+    """
 
     label: str
     text: str
     passed: bool
+    judged: bool = True
+
+
+def choose_exit_code(lines: Sequence[CheckLine]) -> int:
+    """Returns the exit code of checks: 1 if one failed, else that of `LawWithheld` if one was not judged."""
+    failed = any(line.judged and not line.passed for line in lines)
+    return 1 if failed else 0 if all(line.passed for line in lines) else LawWithheld.exit_code
 
 
 MAX_GAPS_NAMED = 60
@@ -67,6 +79,7 @@ class LogCheckReport(Result):
             "identical": result.identical,
             "differing": result.differing,
             "unjudged": result.unjudged,
+            "withheld": result.withheld,
             "coverage": result.coverage.share,
             "min_coverage": result.min_coverage,
             "judged": result.coverage.to_json(),
@@ -94,14 +107,18 @@ def run_log_checks(
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: the file of a user law does not exist.
+        ScenarioError: a user law that may run cannot be made.
     """
     result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
     return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 
-def check_log_files(sources: Sequence[str], min_coverage: float = MIN_COVERAGE) -> list[CheckLine]:
-    """Returns a line per check of a log in files; a user law whose file does not exist fails one."""
+def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawConsents) -> list[CheckLine]:
+    """Returns a line per check of a log in files, in a worker where `allowed` laws may run.
+
+    A user law that cannot be made fails one.
+    """
+    allowed_laws.update(allowed)
     log = open_log(*sources)
     try:
         return run_log_checks(log, virtual=True, min_coverage=min_coverage).lines
@@ -116,11 +133,15 @@ def _checks(
     recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
     yield _records_line(log, result)
     yield CheckLine("integrity", result.integrity.text, result.integrity.passed)
-    yield from (CheckLine("user law", str(law), True) for law in find_user_laws(log.scenario))
+    for law in find_user_laws(log.scenario):
+        yield CheckLine("user law", str(law), law.allowed, law.allowed)
     yield _verify_line(result, recorded)
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield CheckLine("scenario", "is not the one whose hash the log names: it was changed", False)
-    if virtual and recorded:
+    if virtual and result.withheld:
+        why = f"the law of {' and '.join(result.withheld)} may not run"
+        yield CheckLine("virtual time", f"not compared: {why}", False, judged=False)
+    elif virtual and recorded:
         yield CheckLine("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
     elif virtual and log.absences:
         away = " and ".join(log.absences)
@@ -141,17 +162,19 @@ def _checks(
 
 
 def _records_line(log: Log, result: VerifyResult) -> CheckLine:
-    have, coverage = sum(len(log[name]) for name in log.sites), result.coverage
+    have, coverage = sum(len(log[name]) for name in result.coverage.expected), result.coverage
     made = {event.member for event in log.events if event.kind == "end"}
     silent = [name for name in log.sites if name not in made]
-    text = f"{have}/{sum(coverage.expected.values())} in the file; {coverage.describe(result.min_coverage)}"
+    text = f"{have}/{sum(coverage.expected.values())} in the file"
+    text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
+    text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""
     if silent:
         text += f"; {', '.join(silent)} did not report the number of its ticks"
     if log.damaged:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    passed = coverage.share >= result.min_coverage and not log.damaged
+    passed = (not coverage.expected or coverage.share >= result.min_coverage) and not log.damaged
     return CheckLine("records", text, passed)
 
 
@@ -171,7 +194,7 @@ def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
     if not result.records:
-        return CheckLine("executed again", "no records to execute", False)
+        return CheckLine("executed again", "no records to execute", False, not result.withheld)
     return CheckLine("executed again", text, result.agreed)
 
 

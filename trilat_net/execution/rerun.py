@@ -36,12 +36,12 @@ from ..log.site_log import SiteLog
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result
+from ..scenario.law_consent import find_user_laws
 from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
 from .site_channels import SiteChannels, SiteEntry, describe_accounts
-from .verify import find_user_laws
 from .virtual import open_in_memory
 from .virtual_network import Deliveries
 
@@ -308,6 +308,7 @@ def rerun(
         LogError: the log cannot be read, or does not tell enough.
         UsageError: the sites are not named, or in two ways.
         ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
+        LawWithheld: the law of an executed site is code from outside that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
@@ -30,7 +29,7 @@ from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, parse_core_change
-from ..scenario.imported_law import ImportedLaw
+from ..scenario.law_consent import find_user_laws
 from ..scenario.run_changes import count_skipped_ticks
 from .difference import (
     RecordDifference,
@@ -56,6 +55,7 @@ class VerifyResult:
         first: the difference of the earliest tick.
         gaps: missing ticks: (site, first, last).
         absences: ticks that a site did not make between two of its starts, likewise.
+        withheld: sites whose law may not run, which were not executed; all else is of the others.
     """
 
     whole_run: bool
@@ -69,6 +69,7 @@ class VerifyResult:
     first: RecordDifference | None = None
     gaps: list[tuple[str, int, int]] = field(default_factory=list)
     absences: list[tuple[str, int, int]] = field(default_factory=list)
+    withheld: list[str] = field(default_factory=list)
 
     @property
     def agreed(self) -> bool:
@@ -77,13 +78,16 @@ class VerifyResult:
 
     @property
     def passed(self) -> bool:
-        """True if no record differs, enough of the run was judged, and the log is as it was made."""
-        return self.agreed and self.coverage.share >= self.min_coverage and self.integrity.passed
+        """True if no record differs, enough of every site was judged, and the log is as it was made."""
+        enough = not self.withheld and self.coverage.share >= self.min_coverage
+        return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
         """Adds the result of other sites, which were executed from another log."""
-        for name in ("records", "identical", "unjudged", "differing", "gaps", "absences"):
+        for name in ("records", "identical", "unjudged", "differing", "gaps", "absences", "withheld"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in other.withheld:
+            self.coverage.expected.pop(name, None)
         self.whole_run &= other.whole_run
         self.coverage.judged.update(other.coverage.judged)
         self._keep_first(other.first)
@@ -98,37 +102,6 @@ class VerifyResult:
     def _keep_first(self, difference: RecordDifference | None) -> None:
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
-
-
-class LoggedUserLaw(NamedTuple):
-    """A user law that a log names, its sites, and how its file differs from the one that ran, or ""."""
-
-    code: str
-    sites: tuple[str, ...]
-    changed: str
-
-    def __str__(self) -> str:
-        file = f"its file was changed, {self.changed}" if self.changed else "its file is the one that ran"
-        return f"{self.code} of {', '.join(self.sites)}; {file}"
-
-
-def find_user_laws(scenario: Scenario, source: str = "") -> list[LoggedUserLaw]:
-    """Returns the user laws of a scenario without running any code of theirs; `source` is for errors.
-
-    Raises:
-        ScenarioError: the file of a law does not exist.
-    """
-    found: dict[tuple[str, str], LoggedUserLaw] = {}
-    for name, spec in scenario.sites.items():
-        if not isinstance(law := spec.control, ImportedLaw):
-            continue
-        known = found.get(key := (law.code, law.source_sha256))
-        try:
-            changed = known.changed if known else law.changed() or ""
-        except ScenarioError as error:
-            raise ScenarioError(error.problem, path=f"sites.{name}.control", source=source) from None
-        found[key] = LoggedUserLaw(law.code, (*(known.sites if known else ()), name), changed)
-    return list(found.values())
 
 
 PROGRESS_EVERY = 256
@@ -323,7 +296,7 @@ def verify(
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: the file of a user law does not exist.
+        ScenarioError: a user law that may run cannot be made.
     """
     result = _begin(log, min_coverage)
     with process.pause_gc():
@@ -358,7 +331,12 @@ def _execute_sites(
     resume_every: int = 0,
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
-    for name in sites:
+    laws = find_user_laws(log.scenario)
+    withheld = [name for law in laws if not law.allowed for name in law.sites if name in sites]
+    result.withheld += withheld
+    for name in withheld:
+        result.coverage.expected.pop(name, None)
+    for name in (name for name in sites if name not in withheld):
         read = (log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result)
         own = (log.starts.get(name, ()), log.absences.get(name, ()))
         SiteVerifier(*read, *own, resume_every).run(report)

@@ -49,10 +49,8 @@ HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
 """Per site with a live hand what that does at a tick of the site, which is about to make it."""
 
 
-def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
+def check_virtual(scenario: Scenario) -> None:
     """Refuses a scenario that virtual time cannot run, before anything is written.
-
-    With `as_named` the files of user laws must have the hashes that the scenario names.
 
     Raises:
         ScenarioError: an arm is external, or a user law cannot be made, or its file has another hash.
@@ -60,8 +58,6 @@ def check_virtual(scenario: Scenario, *, as_named: bool = True) -> None:
     refuse_external_arms(scenario)
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
-            if as_named:
-                spec.control.check_unchanged(name)
             Site(scenario.setup(name))
 
 
@@ -152,7 +148,6 @@ def write_virtual_log(
     stopped: Callable[[], bool] = lambda: False,
     views_hz: float = 0.0,
     *,
-    as_named: bool = True,
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
@@ -160,7 +155,7 @@ def write_virtual_log(
 
     The stream stays open. Once `stopped` is True the run ends, and the file is finished with what there is.
     `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network`, `hands` and
-    `commands` are as for `execute_virtual`, `as_named` as for `check_virtual`.
+    `commands` are as for `execute_virtual`.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.
@@ -170,7 +165,7 @@ def write_virtual_log(
         ScenarioError: virtual time cannot run the scenario; nothing is written.
         LawFailed: a user law failed; the log holds an event with the reason.
     """
-    check_virtual(scenario, as_named=as_named)
+    check_virtual(scenario)
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
     members: dict[str, _VirtualChannels] = {}
     within = True
@@ -248,16 +243,11 @@ class SimulatedLog(Log):
         return Path(path)
 
 
-def simulate_scenario(
-    scenario: Scenario,
-    *,
-    as_named: bool = True,
-    hands: HandTracks = {},  # noqa: B006
-) -> SimulatedLog:
+def simulate_scenario(scenario: Scenario, *, hands: HandTracks = {}) -> SimulatedLog:  # noqa: B006
     """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
 
     def make(stream: Sink, views_hz: float) -> None:
-        write_virtual_log(scenario, stream, views_hz=views_hz, as_named=as_named, hands=hands)
+        write_virtual_log(scenario, stream, views_hz=views_hz, hands=hands)
 
     stream = io.BytesIO()
     make(stream, 0.0)

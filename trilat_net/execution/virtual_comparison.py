@@ -198,4 +198,4 @@ def _recorded_scenario(log: Log) -> Scenario:
 
 def simulate_without_operators(log: Log) -> Log:
     """Returns the log's experiment in virtual time without operators."""
-    return virtual.simulate_scenario(_recorded_scenario(log).without_hands(), as_named=False)
+    return virtual.simulate_scenario(_recorded_scenario(log).without_hands())

@@ -36,6 +36,7 @@ from ..net.wire import decode
 from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
+from ..scenario.law_consent import LawFiles, allow_logged_laws
 from ..scenario.operators import find_live_hand
 from .accounting import LAST, SessionAccounts
 from .data_tables import (
@@ -470,7 +471,12 @@ class Log(Result, Mapping[str, SiteLog]):
 
 
 def open_log(
-    source: str | Path | BinaryIO, *more: str | Path | BinaryIO, progress: Progress | None = None
+    source: str | Path | BinaryIO,
+    *more: str | Path | BinaryIO,
+    progress: Progress | None = None,
+    law: LawFiles = (),
+    other_version: bool = False,
+    remember: bool = False,
 ) -> Log:
     """Returns the log in a file, or in files that are parts of one session, in any order.
 
@@ -482,8 +488,13 @@ def open_log(
         source: a path, or a file opened for reading.
         more: further parts.
         progress: called while they are read.
+        law: files of control laws that the log names, which may run when it is executed, see
+            docs/code-that-runs.md. Laws of runs that this process has made may.
+        other_version: whether these may have another hash than the log names.
+        remember: whether they may run for other logs that name their hashes too.
 
     Raises:
+        UsageError: `law` is none that the log names.
         LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of different
             sessions, or disagree on a message.
     """
@@ -503,7 +514,9 @@ def open_log(
             with _reading(name):
                 shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
-    return Log(merge_parts(parts))
+    log = Log(merge_parts(parts))
+    allow_logged_laws(log.scenario, law, other_version=other_version, remember=remember)
+    return log
 
 
 @contextmanager

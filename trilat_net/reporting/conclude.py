@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from ..analysis.site_signals import shared_unit
-from ..errors import LawFailed, RunFailed, ScenarioError
-from ..execution.log_checks import CheckLine, check_log_files
+from ..errors import LawFailed, LawWithheld, RunFailed, ScenarioError
+from ..execution.log_checks import CheckLine, check_log_files, choose_exit_code
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.integrity import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..results import Result
+from ..scenario.imported_law import allowed_laws
 from ..theory.end_pose import certify_with_roots
 from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
 from .result_text import Block, MarkedText
@@ -49,7 +50,8 @@ class Conclusion(Result):
         """Yields its text."""
         yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
         for line in self.lines:
-            mark = "[green]ok[/green]  " if line.passed else "[red]FAIL[/red]"
+            bad = "[red]FAIL[/red]" if line.judged else "[yellow]open[/yellow]"
+            mark = "[green]ok[/green]  " if line.passed else bad
             yield MarkedText(mark, f"{line.label}: {line.text}")
         yield self.table
         yield from self.notes
@@ -63,7 +65,8 @@ class Conclusion(Result):
 
     def headline(self) -> str:
         """Returns whether every check passed, and where the page is."""
-        return f"{'passed' if self.passed else 'FAILED'}; {self.page}"
+        words = {0: "passed", LawWithheld.exit_code: "not all was judged"}
+        return f"{words.get(choose_exit_code(self.lines), 'FAILED')}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
@@ -97,7 +100,7 @@ def conclude(
 
     lines: list[CheckLine] = []
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
-        checking = pool.submit(check_log_files, log.sources, min_coverage)
+        checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_laws))
         twin = _run_without_operators(log)
         certificate = certify_with_roots(log, min_coverage=min_coverage)
         notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
@@ -125,7 +128,7 @@ def _run_without_operators(log: Log) -> Log | None:
         return None
     try:
         return simulate_without_operators(log)
-    except (ScenarioError, LawFailed):  # a law from outside that is not there, or fails: the check says so
+    except (ScenarioError, LawFailed):  # a law from outside that may not run, or fails: the check says so
         return None
 
 

@@ -43,7 +43,8 @@ def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
     """Returns the list of verdicts; "" if nothing was checked."""
     items = ""
     for line in verdicts:
-        kind, mark = ("passed", "✓ ok") if line.passed else ("failed", "✗ failed")
+        bad = "✗ failed" if line.judged else "not judged"
+        kind, mark = ("passed", "✓ ok") if line.passed else ("failed", bad)
         items += f'<li class="{kind}"><b>{mark}</b>{escape(line.label)}: {escape(line.text)}</li>'
     return f'<ul class="verdicts">{items}</ul>' if items else ""
 

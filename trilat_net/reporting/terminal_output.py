@@ -190,8 +190,14 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         display.stop()
 
 
-def open_with_progress(first: Path, *more: Path) -> "Log":
-    """Returns the log in a file, or in the files that are its parts, and warns of damage.
+def open_with_progress(
+    first: Path,
+    *more: Path,
+    law: list[Path] | None = None,
+    other_version: bool = False,
+    remember: bool = False,
+) -> "Log":
+    """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns of damage.
 
     Raises:
         LogError: one is missing, is no MCAP file, or no log of trilat-net.
@@ -199,7 +205,8 @@ def open_with_progress(first: Path, *more: Path) -> "Log":
     from ..log.log_reader import open_log
 
     with progress_bar(f"reading {first}") as progress:
-        log = open_log(first, *more, progress=progress)
+        allowed: Any = {"law": law or (), "other_version": other_version, "remember": remember}
+        log = open_log(first, *more, progress=progress, **allowed)
     for path in (first, *more):
         warn_if_unfinished(path)
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
@@ -211,23 +218,12 @@ def open_with_progress(first: Path, *more: Path) -> "Log":
     return log
 
 
-def warn_user_laws(log: "Log", *, needed: bool = True) -> None:
-    """Warns of code outside the log, which an execution of the log runs.
+def warn_user_laws(log: "Log") -> None:
+    """Warns of code outside the log, which an execution of the log runs, or may not run."""
+    from ..scenario.law_consent import find_user_laws
 
-    Raises:
-        ScenarioError: the file of a law does not exist, and nothing can be done without it (`needed`).
-    """
-    from ..errors import ScenarioError
-    from ..execution.verify import find_user_laws
-
-    try:
-        laws = find_user_laws(log.scenario, log.source)
-    except ScenarioError:
-        if needed:
-            raise
-        return
-    for law in laws:
-        print_note(f"executing this log runs code from outside: {law}")
+    for law in find_user_laws(log.scenario):
+        print_note(f"executing this log runs code from outside: {law}" if law.allowed else str(law))
 
 
 def warn_if_unfinished(path: Path) -> None:

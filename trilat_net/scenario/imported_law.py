@@ -2,7 +2,8 @@
 
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
-the package that contains it; building a site imports it, and only if that file defines a class of that name.
+the package that contains it. `import_law_class` is the one door to code from outside: it opens for
+`allowed_laws`, if the file is still that one and defines a law of that name.
 """
 
 import ast
@@ -14,9 +15,10 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from msgspec import Meta, field
 from msgspec.structs import asdict
@@ -24,17 +26,31 @@ from msgspec.structs import asdict
 from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
-from ..errors import ScenarioError
-from ..files import find_page
+from ..errors import LawWithheld, ScenarioError
+from ..files import find_page, open_regular
 from .fields import Frozen, suggest_nearest
 from .law_conditions import LawSituation, StabilityCondition
 from .linear_form import LinearForm, LinearSituation
-from .sent_vectors import SentVectorSpecs, convert_sends, read_sends
+from .sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
+
+
+class LawConsent(NamedTuple):
+    """A file that may run: where it is, None for where Python finds its module; and its SHA-256."""
+
+    file: Path | None
+    sha256: str
+
+
+LawConsents = dict[tuple[str, str], LawConsent]
+allowed_laws: LawConsents = {}
+"""What may run in this process, by the code and the hash that a scenario names; workers are given it."""
+_executed: dict["LawSource", Any] = {}
+"""Modules of the files that were executed."""
 
 
 class PluggedLaw(Frozen, frozen=True):
@@ -106,7 +122,7 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = import_law_class(self.code, f"{path}.law")
+            kind = import_law_class(self.code, self.source_sha256, f"{path}.law")
             _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
@@ -119,52 +135,28 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
 
         return make
 
-    def check_unchanged(self, site: str) -> None:
-        """Refuses to start with another law than the scenario names.
 
-        Raises:
-            ScenarioError: the law's file is missing, or has another hash.
-        """
-        path = f"sites.{site}.control"
-        if hash_law_source(self.code, f"{path}.law") != self.source_sha256:
-            raise ScenarioError(
-                f"the file of {self.code} is not the one that the scenario names by this hash; put that one "
-                f"there, or write law = {self.code!r} to take the one that is",
-                path=f"{path}.source_sha256",
-            )
+class LawSource(NamedTuple):
+    """The file of a law, as it is: where, its content, and the SHA-256 of that."""
 
-    def changed(self) -> str | None:
-        """Returns the difference of the law's file from the one that the scenario names, or None.
-
-        Raises:
-            ScenarioError: there is no such file.
-        """
-        now = hash_law_source(self.code, "control.law")
-        if now == self.source_sha256:
-            return None
-        return f"its sha256 is {now[:16]}, and was {self.source_sha256[:16]}"
+    file: Path
+    content: bytes
+    sha256: str
 
 
-def hash_law_source(code: str, path: str) -> str:
-    """Returns the SHA-256 of the file that defines a law; errors call the key `path`.
+def read_law_source(code: str, path: str, file: Path | None = None) -> LawSource:
+    """Returns a law's file, or that which Python finds, of which nothing runs; errors call the key `path`.
 
     Raises:
-        ScenarioError: there is no such file.
+        ScenarioError: there is no such file, or it cannot be read.
     """
-    file = _find_file(code, path)
+    place = file or _find_file(code, path)
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        with open_regular(place) as stream:
+            content = stream.read()
     except OSError as error:
-        raise ScenarioError(f"{file} cannot be read: {error.strerror}", path=path) from None
-
-
-def read_law_sends(code: str, path: str) -> SentVectorSpecs:
-    """Returns what a law declares that it sends; errors call the key `path`.
-
-    Raises:
-        ScenarioError: there is no such file, or no such declaration can be read from it.
-    """
-    return read_sends(_find_file(code, path), code, path)
+        raise ScenarioError(f"{place} cannot be read: {error.strerror}", path=path) from None
+    return LawSource(place, content, hashlib.sha256(content).hexdigest())
 
 
 def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
@@ -227,7 +219,7 @@ def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any
 
 def _find_file(code: str, path: str) -> Path:
     module = code.partition(":")[0]
-    with _searching_here():
+    with _searching(None):
         spec = _find_spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
@@ -256,29 +248,75 @@ def _find_spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def import_law_class(code: str, path: str) -> Any:
-    """Returns the class of a law from its file as it is now; refuses a file that does not define it."""
+def import_law_class(code: str, sha256: str, path: str) -> Any:
+    """Returns the class of a law that a scenario names by a hash, from the file that may run for it.
+
+    Raises:
+        LawWithheld: none may.
+        ScenarioError: it is not as it was when it was let, or defines no such law: nothing has run; or it
+            cannot be imported.
+    """
     module, _, name = code.partition(":")
-    file = _find_file(code, path)
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
-    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    if name not in classes:
-        hint = suggest_nearest(name, classes) or f"; see {find_page('own-controller.md')}"
-        raise ScenarioError(f"{file} defines no class {name}{hint}", path=path)
-    now = hash_law_source(code, path)
-    with _searching_here():
+    if (consent := allowed_laws.get((code, sha256))) is None:
+        problem = f"{code} is code from outside, which may not run: --law FILE lets its file (in Python"
+        raise LawWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
+    source = read_law_source(code, path, consent.file)
+    if source.sha256 != consent.sha256:
+        problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
+        raise ScenarioError(f"{problem} there, or write law = {code!r} to take the one that is", path=path)
+    check_law_class(source, code, path)
+    folders = source.file.parents  # its own, or that of its package
+    depth = min(module.count(".") + (source.file.stem == "__init__"), len(folders) - 1)
+    with _searching(consent.file and folders[depth]):
         try:
-            found = importlib.import_module(module)
-            if _imported.setdefault(module, now) != now:  # edited while this program runs
-                found = importlib.reload(found)
-                _imported[module] = now
+            found = _execute(module, source) if consent.file else _import(module, source.sha256)
         except (Exception, SystemExit) as error:  # the user's code
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
     return getattr(found, name)
+
+
+def check_law_class(source: LawSource, code: str, path: str) -> None:
+    """Refuses a file that does not define the class of a law, by its syntax alone: nothing of it runs.
+
+    Raises:
+        ScenarioError: it is no Python, or has no such class, or that neither a torque nor a base.
+    """
+    name, classes = code.partition(":")[2], parse_classes(source.content, source.file, path)
+    if name not in classes:
+        hint = suggest_nearest(name, list(classes)) or f"; see {find_page('own-controller.md')}"
+        raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
+    node = classes[name]
+    named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
+    if not (node.bases or node.keywords or node.decorator_list or "torque" in named):
+        page = find_page("own-controller.md")
+        raise ScenarioError(f"{code} is no law: it has no torque; see {page}", path=path)
+
+
+def _import(module: str, sha256: str) -> Any:
+    """Imports a module that Python finds."""
+    found = importlib.import_module(module)
+    if _imported.setdefault(module, sha256) != sha256:  # edited while this program runs
+        found = importlib.reload(found)
+        _imported[module] = sha256
+    return found
+
+
+def _execute(module: str, source: LawSource) -> Any:
+    """Returns a module of the content that was checked, and of nothing that is cached beside the file."""
+    if source in _executed:
+        return _executed[source]
+    file, before = str(source.file), sys.modules.get(module)
+    spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
+    made = sys.modules[module] = module_from_spec(cast(ModuleSpec, spec))
+    try:
+        exec(compile(source.content, file, "exec"), made.__dict__)
+    finally:
+        sys.modules.pop(module, None)  # whatever a log calls it, it takes no other module's place
+        if before is not None:
+            sys.modules[module] = before
+    _executed[source] = made
+    return made
 
 
 def name_law_class(kind: type) -> str:
@@ -308,15 +346,15 @@ def name_law_classes(value: Any) -> Any:
 
 
 @contextmanager
-def _searching_here() -> Iterator[None]:
-    """Lets modules be found in the working directory."""
-    here = str(Path.cwd())
-    if here in sys.path:
+def _searching(folder: Path | None) -> Iterator[None]:
+    """Lets modules be found in a folder before all others; None: the working directory, unless it is one."""
+    first = str(folder or Path.cwd())
+    if folder is None and first in sys.path:
         yield
         return
-    sys.path.insert(0, here)
+    sys.path.insert(0, first)
     importlib.invalidate_caches()  # a file may be a moment old
     try:
         yield
     finally:
-        sys.path.remove(here)
+        sys.path.remove(first)

@@ -39,10 +39,11 @@ from .fields import (
     reword_problem,
     suggest_nearest,
 )
-from .imported_law import LAW_PATH_PATTERN, hash_law_source, read_law_sends
+from .imported_law import LAW_PATH_PATTERN, read_law_source
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
+from .sent_vectors import read_sends
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
@@ -195,9 +196,9 @@ def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: s
         )
     if "sends" in settings:
         raise ScenarioError("is declared by the class of the law, not here", path=f"{path}.sends")
-    sha256 = hash_law_source(code, f"{path}.law")
-    sends = msgspec.to_builtins(read_law_sends(code, f"{path}.law"))
-    return {"law": "own", "code": code, "source_sha256": sha256, "settings": settings, "sends": sends}
+    source = read_law_source(code, f"{path}.law")
+    sends = msgspec.to_builtins(read_sends(source.content, source.file, code, f"{path}.law"))
+    return {"law": "own", "code": code, "source_sha256": source.sha256, "settings": settings, "sends": sends}
 
 
 def _unix_lines(value: Any) -> Any:

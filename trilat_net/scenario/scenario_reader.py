@@ -1,6 +1,7 @@
 """Scenarios by name, by path or from a log, with overrides applied.
 
-Invariant: text from a log or a peer is not trusted: it names no file, and writes out what it has.
+Invariant: text from a log or a peer is not trusted: it names no file, its laws may not run, and it writes out
+what it has.
 """
 
 import re
@@ -16,6 +17,7 @@ from ..errors import ScenarioError
 from ..files import open_regular
 from .fields import suggest_nearest
 from .imported_law import name_law_classes
+from .law_consent import allow_own_laws
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
@@ -90,12 +92,15 @@ def load_scenario(
     if isinstance(source, Scenario):
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))
-            return parse_scenario(source.text, source.name, expanded) if overrides else source
+            changed = parse_scenario(source.text, source.name, expanded) if overrides else source
+            laws = [one.get("law") if isinstance(one, dict) else one for one in expanded.values()]
+            return allow_own_laws(changed, laws)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)
     in_file = not isinstance(source, Mapping) and "\n" not in str(source)
-    return parse_scenario(found.text, found.called if in_file else "scenario", overrides, found.folder)
+    called = found.called if in_file else "scenario"
+    return allow_own_laws(parse_scenario(found.text, called, overrides, found.folder))
 
 
 class ExperimentText(NamedTuple):
@@ -120,7 +125,7 @@ class ExperimentText(NamedTuple):
         """
         if self.folder is None:
             return load_scenario(parse_scenario(self.text, self.called, folder=None), overrides)
-        return parse_scenario(self.text, self.called, overrides, self.folder)
+        return allow_own_laws(parse_scenario(self.text, self.called, overrides, self.folder))
 
 
 def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:

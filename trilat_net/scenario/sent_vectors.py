@@ -78,20 +78,28 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         raise ScenarioError(problem, path=f"{path}.sends")
 
 
-def read_sends(file: Path, code: str, path: str) -> SentVectorSpecs:
+def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
+    """Returns the classes that a file defines at its top level, by their names; nothing of it runs.
+
+    Raises:
+        ScenarioError: it is no Python.
+    """
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
     """Returns what the class of a law declares that it sends, as its file writes it, without running it.
 
     Raises:
         ScenarioError: the file is no Python, or the declaration is no literal, or none of vectors.
     """
-    name = code.partition(":")[2]
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
     found: Any = {}
-    bodies = [node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
-    for node in (line for body in bodies for line in body if isinstance(line, ast.Assign | ast.AnnAssign)):
+    law = parse_classes(source, file, path).get(code.partition(":")[2])
+    for node in (line for line in (law.body if law else ()) if isinstance(line, ast.Assign | ast.AnnAssign)):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         if node.value is None or "sends" not in {one.id for one in targets if isinstance(one, ast.Name)}:
             continue

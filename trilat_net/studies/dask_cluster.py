@@ -20,7 +20,7 @@ from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
 from ..log.log_layout import collect_provenance
 from ..net.clock import SystemClock
-from ..scenario.imported_law import ImportedLaw, hash_law_source
+from ..scenario.imported_law import ImportedLaw, read_law_source
 
 CONNECT_S = 10.0
 """A scheduler that does not answer within this time, or has no worker by then, is given up."""
@@ -81,7 +81,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     missing = []
     for code, sha256 in laws:
         try:
-            found = hash_law_source(code, "control.law")
+            found = read_law_source(code, "control.law").sha256
         except ScenarioError:
             found = ""
         if found != sha256:

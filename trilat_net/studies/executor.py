@@ -19,8 +19,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from ..errors import RunFailed, UsageError
 from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
-from ..scenario import Scenario
-from ..scenario.imported_law import ImportedLaw
+from ..scenario.imported_law import LawConsents, allowed_laws
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 
 T = TypeVar("T")
@@ -58,15 +57,19 @@ class _BatchResult(NamedTuple):
 
 
 def run_batch(
-    function: Callable[[T], Any], items: Sequence[T], required: WorkerRequirements | None = None
+    function: Callable[[T], Any],
+    items: Sequence[T],
+    required: WorkerRequirements | None,
+    allowed: LawConsents,
 ) -> _BatchResult:
-    """Runs a function on the items of a batch, in whatever worker.
+    """Runs a function on the items of a batch, in whatever worker, in which the `allowed` laws may run.
 
     Raises:
         UsageError: this worker does not meet the requirements.
     """
     if required is not None:
         check_this_worker(required)
+    allowed_laws.update(allowed)
     clock = SystemClock()
     began_ns = clock.monotonic_ns()
     results: list[Any] = []
@@ -213,11 +216,12 @@ class WorkerPool:
             if not batch:
                 return
             numbers, items = map(list, zip(*batch, strict=True))
+            work: Any = (function, items, self._required, dict(allowed_laws))
             try:
-                future = self._executor.submit(run_batch, function, items, self._required)
+                future = self._executor.submit(run_batch, *work)
             except BrokenExecutor:
                 self._replace(self._executor)
-                future = self._executor.submit(run_batch, function, items, self._required)
+                future = self._executor.submit(run_batch, *work)
             pending[future] = _Batch(numbers, items, self._executor)
 
     def _collect(
@@ -285,12 +289,6 @@ def open_worker_pool(
                 return stack.enter_context(opened)
 
             yield WorkerPool(start(), count, start, hint=hint) if count > 1 else WorkerPool(None, 1)
-
-
-def list_imported_laws(scenarios: Iterable[Scenario]) -> list[ImportedLaw]:
-    """Returns the laws of users' own that some scenarios need."""
-    controls = (site.control for scenario in scenarios for site in scenario.sites.values())
-    return [control for control in controls if isinstance(control, ImportedLaw)]
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:

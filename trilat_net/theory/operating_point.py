@@ -175,7 +175,7 @@ def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetu
     try:
         return site._replace(own=NumericLaw(site, law.code, np.delete(alpha[i], i).tolist()))
     except ScenarioError as error:
-        raise ScenarioError(error.problem, path=error.path, source=scenario.name) from None
+        raise type(error)(error.problem, path=error.path, source=scenario.name) from None
 
 
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:

@@ -12,7 +12,7 @@ from trilat_net.analysis.run_end import Stability
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.certificate_text import describe_certificate
-from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.scenario import load_scenario
 
 B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
 PAIR = f"""
@@ -47,7 +47,7 @@ damping_nm_s_rad = 10.0
 def clamped(**changes: Any) -> Log:
     """A master that a hand moves, a line, and a slave that is held."""
     overrides = {key.replace("__", "."): value for key, value in changes.items()}
-    return simulate_scenario(load_scenario(parse_scenario(PAIR, "line"), overrides))
+    return simulate_scenario(load_scenario(load_scenario(PAIR), overrides))
 
 
 def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:

@@ -22,6 +22,7 @@ from ...errors import UsageError
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
+from ...scenario.law_consent import find_user_laws
 from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
 from . import joint_motion
@@ -56,8 +57,10 @@ explain_absent_operator = _unless(sites_with_operator, NO_OPERATOR)
 """Returns why there is no torque of an operator to draw; "" if there is one."""
 
 
-def _has_script(log: Log) -> bool:
-    return any(site.hands for site in log.scenario.sites.values())
+def _explain_no_twin(log: Log) -> str:
+    """Returns why there is no run without operators, which runs the laws of the log."""
+    withheld = (str(law) for law in find_user_laws(log.scenario) if not law.allowed)
+    return next(withheld, "") if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
 
 
 def _no_functional(log: Log) -> str:
@@ -106,7 +109,7 @@ FIGURES = {
     "hands_moved": _ReportEntry(
         "the log minus the same run without operators",
         joint_motion.draw_operator_displacement,
-        _unless(_has_script, NO_OPERATOR),
+        _explain_no_twin,
     ),
     "contact": FigureEntry(
         "force of the walls, and depth in them",

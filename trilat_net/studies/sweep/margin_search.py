@@ -22,8 +22,9 @@ from ...files import write_whole
 from ...reporting.text_table import TextTable
 from ...results import Result
 from ...scenario import Scenario
+from ...scenario.law_consent import list_imported_laws
 from ...theory import find_root_crossings
-from ..executor import Progress, Workers, ignore_progress, list_imported_laws, open_worker_pool
+from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import cell_result
 from .map_plane import StableInterval, label_axis
 from .stability_map import (

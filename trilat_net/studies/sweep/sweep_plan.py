@@ -20,6 +20,7 @@ from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, apply_overrides
 from ...scenario.fields import is_number, suggest_nearest
 from ...scenario.imported_law import name_law_classes
+from ...scenario.law_consent import allow_own_laws
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import read_experiment
 from ..commands import format_toml_value
@@ -310,7 +311,7 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
         ScenarioError: it cannot run here.
     """
     written = SweepSource(facts["source"], facts["text"], facts["folder"], tuple(facts["overrides"]))
-    base = written.scenario()
+    base = allow_own_laws(written.scenario())
     axes, laws = tuple(map(parse_axis, facts["over"])), tuple(facts["laws"])
     forced = tuple(_law_overrides(written, base, law) for law in laws)
     return SweepPlan(written, base, axes, laws, forced, tuple(facts["seeds"]), facts["longest_s"])

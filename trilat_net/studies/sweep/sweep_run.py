@@ -17,16 +17,10 @@ from ...errors import ScenarioError, UsageError
 from ...files import write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
+from ...scenario.law_consent import list_imported_laws
 from ...scenario.scenario_reader import read_source
 from ..commands import format_command
-from ..executor import (
-    Progress,
-    WorkerPool,
-    Workers,
-    ignore_progress,
-    list_imported_laws,
-    open_worker_pool,
-)
+from ..executor import Progress, WorkerPool, Workers, ignore_progress, open_worker_pool
 from ..run_journal import RunJournal
 from . import cell_result
 from .cell_result import CellClass

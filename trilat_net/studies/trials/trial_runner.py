@@ -13,7 +13,8 @@ from ...errors import TrilatError
 from ...execution import virtual
 from ...net.clock import SystemClock
 from ...scenario import Scenario
-from ..executor import MAX_LOSSES, Workers, list_imported_laws, open_worker_pool
+from ...scenario.law_consent import list_imported_laws
+from ..executor import MAX_LOSSES, Workers, open_worker_pool
 from .trial import Trial, TrialResult, trials
 from .trial_report import TrialReport
 

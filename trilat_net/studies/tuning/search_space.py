@@ -18,7 +18,7 @@ from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
 from ...scenario.fields import MAX_QUANTITY, field_names, is_number, suggest_nearest
-from ...scenario.imported_law import import_law_class
+from ...scenario.imported_law import LawConsent, allowed_laws, import_law_class, read_law_source
 from ...scenario.laws import LAWS
 
 MIN_BOX = 0.1
@@ -333,7 +333,9 @@ def build_own_search_space(code: str) -> SearchSpace:
         ScenarioError: there is no such class.
         UsageError: it has no ranges, or one of them is none.
     """
-    kind = import_law_class(code, "--law")
+    sha256 = read_law_source(code, "--law").sha256
+    allowed_laws[code, sha256] = LawConsent(None, sha256)
+    kind = import_law_class(code, sha256, "--law")
     ranges = getattr(kind, "tune", None)
     if not isinstance(ranges, Mapping) or not ranges:
         raise UsageError(f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}')

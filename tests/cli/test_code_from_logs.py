@@ -1,0 +1,258 @@
+"""Code from a log: none is imported unless somebody names its file (docs/code-that-runs.md)."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import trilat_net as tn
+from tests.cli.running import COMMAND, PLAIN, trilat
+from tests.log_editing import edited, opened
+from trilat_net.errors import LawWithheld, ScenarioError, UsageError
+from trilat_net.scenario.imported_law import allowed_laws
+
+WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
+"""A module that begins so tells that it was imported."""
+LAW = f"""{WITNESS}
+class Spring:
+    remembers = ()
+    def __init__(self, facts, K=60.0):
+        self.K = K
+    def torque(self, now):
+        return [now.gravity[i] - self.K * (now.q[i] - now.q_des[i]) for i in range(now.joints)]
+"""
+FILES = {
+    "foreign": {
+        "mylaws.py": f"{WITNESS}raise SystemExit('a stranger')\nclass Spring: torque = memory = recall = 1"
+    },
+    "changed": {"mylaws.py": f"{LAW}# a word\n"},
+    "missing": {},
+    "not a law": {"mylaws.py": f"{WITNESS}Spring = 1\n"},
+    "beside the log": {"mylaws.py": LAW},
+}
+"""What stands in the working directory, beside a log that names mylaws:Spring for s."""
+
+HANDS = ["figure", "run.mcap", "hands_moved", "--format", "png"]
+SCRIPT = """
+import trilat_net as tn
+log = tn.open_log("run.mcap")
+assert tn.verify("run.mcap", virtual=True, resume_every=10).result.withheld == ["s"]
+tn.certify(log), tn.metrics(log), tn.rerun(log, ["m1"]), tn.figure(log, "overview")
+def withheld(run):
+    try:
+        run()
+    except tn.errors.LawWithheld:
+        return True
+assert withheld(lambda: tn.rerun(log, ["s"]))
+assert withheld(lambda: tn.certify(log, own_laws=True))
+assert withheld(lambda: tn.simulate(log.scenario))
+assert withheld(lambda: tn.simulate(log.scenario, {"control.K": 5}))
+assert withheld(lambda: tn.linear(log.scenario))
+"""
+EXECUTING: list[tuple[list[str], int]] = [
+    (["verify", "run.mcap", "--virtual"], 4),
+    (["report", "run.mcap", "-o", "page"], 4),
+    (["rerun", "run.mcap", "--closed-loop"], 4),
+    (HANDS, 2),
+]
+READING: list[tuple[list[str], int]] = [
+    (["certify", "run.mcap", "--own-laws"], 4),
+    (["certify", "run.mcap", "--accept", "open"], 0),
+    (["verify", "run.mcap", "--resume-every", "10", "--json"], 4),
+    (["figure", "run.mcap", "--list"], 0),
+    (["compare", "run.mcap", "run.mcap"], 0),
+    (["metrics", "run.mcap"], 0),
+    (["log", "info", "run.mcap"], 0),
+    (["log", "check", "run.mcap"], 0),
+    (["log", "recover", "run.mcap", "-o", "whole.mcap"], 0),
+    (["log", "export", "run.mcap", "--to", "csv", "-o", "tables"], 0),
+    (["-c", SCRIPT], 0),
+]
+CASES = [(words, code, law) for words, code in EXECUTING for law in FILES]
+CASES += [(words, code, "beside the log") for words, code in READING]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log for every law; where it is no law, the log names the hash of that file."""
+    folder = tmp_path_factory.mktemp("logs")
+    (folder / "mylaws.py").write_text(LAW)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WITNESS", str(folder / "witness"))
+        setting = ("--set", "sites.s.control.law=mylaws:Spring")
+        trilat("sim", "paper", "--duration", "0.05", *setting, "-o", "run.mcap", cwd=folder).succeeds()
+    assert (folder / "witness").exists()  # it does tell
+    before, now = (hashlib.sha256(one.encode()).hexdigest() for one in (LAW, FILES["not a law"]["mylaws.py"]))
+    log = (folder / "run.mcap").read_bytes()
+    text = opened(log).scenario_text.replace(before, now)
+    named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    (folder / "not a law.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    return folder
+
+
+@pytest.fixture
+def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a log, in which commands run; nothing is allowed, and nothing remembered."""
+    shutil.copy(logs / "run.mcap", tmp_path)
+    monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
+    monkeypatch.chdir(tmp_path)
+    allowed_laws.clear()
+    return tmp_path
+
+
+def _marks(words: list[str], law: str) -> tuple[Any, ...]:
+    brief = words[0] in ("verify", "-c") or "--own-laws" in words or (words, 0) not in READING
+    return (
+        ()
+        if brief and "--json" not in words and law in ("beside the log", "changed")
+        else (pytest.mark.long,)
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "law"),
+    [
+        pytest.param(*case, id=f"{' '.join(case[0][:3])[:30]!r} {case[2]}", marks=_marks(case[0], case[2]))
+        for case in CASES
+    ],
+)
+def test_no_command_imports_what_a_log_names(
+    words: list[str], code: int, law: str, logs: Path, place: Path
+) -> None:
+    for name, text in FILES[law].items():
+        (place / name).write_text(text)
+    if law == "not a law":
+        shutil.copy(logs / "not a law.mcap", place / "run.mcap")
+    command = [COMMAND[0], *words] if words[0] == "-c" else [*COMMAND, *words]
+    environment = {
+        **PLAIN,
+        "WITNESS": os.environ["WITNESS"],
+        "XDG_CONFIG_HOME": os.environ["XDG_CONFIG_HOME"],
+    }
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
+    assert not (place / "witness").exists()
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_table_has_all_that_was_asked_for() -> None:
+    assert len(CASES) >= 26
+    assert {law for _, _, law in CASES} == set(FILES)
+
+
+def imports(place: Path) -> list[str]:
+    """The files that were imported."""
+    witness = place / "witness"
+    return witness.read_text().split(";")[:-1] if witness.exists() else []
+
+
+def test_the_named_file_runs_and_no_other_of_its_name(place: Path) -> None:
+    """Not the module of the working directory, and nothing that Python keeps of the file."""
+    (place / "mylaws.py").write_text(FILES["foreign"]["mylaws.py"])
+    (place / "kept").mkdir()
+    file = place / "kept" / "spring-v1.py"
+    file.write_text(LAW)
+    log = tn.open_log("run.mcap", law=file)
+    assert tn.verify(log, virtual=True).passed
+    assert imports(place) == [str(file)]
+    tn.verify("run.mcap")  # this process has it already
+    assert imports(place) == [str(file)]
+    assert not list(file.parent.glob("__pycache__"))
+
+
+def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
+    import importlib.util
+    import py_compile
+
+    file, other = place / "mylaws.py", place / "other.py"
+    file.write_text(LAW)
+    other.write_text("raise SystemExit('cached')")
+    cached = importlib.util.cache_from_source(str(file))
+    py_compile.compile(str(other), cached, invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    assert tn.verify(tn.open_log("run.mcap", law=file)).passed
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "error", "fact"),
+    [
+        (f"{LAW}# a word\n", "mylaws.py", UsageError, "is not the file that ran as mylaws:Spring"),
+        (f"{LAW}# a word\n", "other.py", UsageError, "is no law that the log names: these are mylaws:Spring"),
+        (f"{WITNESS}Spring = 1", "mylaws.py", ScenarioError, "defines no class Spring"),
+        (f"{WITNESS}class Spring: pass", "mylaws.py", ScenarioError, "is no law: it has no torque"),
+        (f"{WITNESS}class Spring(", "mylaws.py", ScenarioError, "is no Python"),
+        (None, "mylaws.py", ScenarioError, "cannot be read"),
+    ],
+)
+def test_a_file_that_may_not_be_it_is_refused_before_it_runs(
+    text: str | None, name: str, error: type[Exception], fact: str, place: Path
+) -> None:
+    if text is not None:
+        (place / name).write_text(text)
+    asked = fact.startswith(("defines", "is no law: it", "is no Python"))
+    with pytest.raises(error, match=fact):
+        tn.open_log("run.mcap", law=name, other_version=asked)
+    done = trilat("verify", "run.mcap", "--law", name, *["--other-version"] * asked, cwd=place)
+    done.refuses(fact)
+    assert not imports(place)
+
+
+def test_a_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> None:
+    file = place / "mylaws.py"
+    file.write_text(LAW)
+    log = tn.open_log("run.mcap", law=file)
+    file.write_text(f"{LAW}# a word\n")
+    assert tn.verify(log).result.withheld == ["s"]
+    with pytest.raises(ScenarioError, match="is not the one that the scenario names"):
+        tn.rerun(log, ["s"])
+    assert not imports(place)
+
+
+def test_a_remembered_file_runs_for_its_hash_alone(place: Path) -> None:
+    file = place / "kept.py"
+    file.write_text(LAW)
+    trilat("verify", "run.mcap", "--remember", cwd=place).refuses("give --law FILE too")
+    assert trilat("verify", "run.mcap", "--law", file, "--remember", cwd=place).code == 0
+    assert trilat("verify", "run.mcap", cwd=place).code == 0
+    file.write_text(f"{LAW}# a word\n")
+    assert trilat("verify", "run.mcap", cwd=place).code == 4
+
+
+def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
+    (place / "ownlaw.py").write_text(LAW)
+    log = tn.simulate("two_sites", {"control.law": "ownlaw:Spring"}, duration_s=0.05)
+    log.save("own.mcap")
+    assert tn.verify("own.mcap").passed
+    assert tn.rerun("run.mcap", ["s"], {"sites.s.control.law": "ownlaw:Spring"}).sites["s"].executed == 50
+    with pytest.raises(LawWithheld):
+        tn.rerun("run.mcap", ["s"])
+
+
+def test_a_compiled_law_and_its_neighbours_run_from_the_file_that_was_named(place: Path) -> None:
+    folder = place / "laws"
+    folder.mkdir()
+    (place / "gains.py").write_text(WITNESS)  # of the working directory
+    (folder / "gains.py").write_text("K = 60.0\n")
+    (folder / "quick.py").write_text(
+        "import dataclasses\nimport trilat_net\nfrom gains import K\n"
+        "@dataclasses.dataclass\nclass Note:\n    text: 'str' = ''\n"
+        "@trilat_net.compiled\nclass Spring:\n    remembers = ()\n"
+        "    def __init__(self, facts):\n        self.K = K\n"
+        "    def torque(self, now):\n        for i in range(now.joints):\n"
+        "            now.tau[i] = now.gravity[i] - self.K * (now.q[i] - now.q_des[i])\n"
+    )
+    made = trilat("sim", "two_sites", "--duration", "0.05", "--set", "control.law=quick:Spring", cwd=folder)
+    assert made.code == 0
+    allowed_laws.clear()
+    shown = subprocess.run(
+        [*COMMAND, "verify", "laws/two_sites.mcap", "--law", "laws/quick.py"],
+        cwd=place,
+        capture_output=True,
+        text=True,
+    )
+    assert "100/100 records identical" in shown.stdout, shown.stderr
+    assert not imports(place)
