@@ -95,29 +95,34 @@ class Site:
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._sends = bool(self._sent.size)
-        self._user_law = None if setup.own is None else setup.own(setup.law_context())
-        self._law = None
-        self.law_failure: LawFailed | None = None
-        self._law_memory: list[float] = []
-        if self._user_law is not None:
-            a, b = self._arrays, self._buffers
-            self._law = plug_law(self._user_law, setup, a, self._sent)
-            self._law.bind()  # compiled now, and not within the time that the law has for a tick
-            self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
-            self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
+        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
+        self._plug(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
         self._hand = self._arrays.actors[live[0]] if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
-        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
-        if self._law is not None and self._glides:
-            self._law_memory = self._law.memory
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
         own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
         rest = s["q_rest"][0], s["qd_rest"][0]
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
+
+    def _plug(self, setup: SiteSetup) -> None:
+        """Makes the user's law, if the site has one, and compiles what calls it."""
+        self._user_law = None if setup.own is None else setup.own(setup.law_context())
+        self._law = None
+        self.law_failure: LawFailed | None = None
+        self._law_memory: list[float] = []
+        if self._user_law is None:
+            return
+        a, b = self._arrays, self._buffers
+        self._law = plug_law(self._user_law, setup, a, self._sent)
+        self._law.bind()  # compiled now, and not within the time that the law has for a tick
+        self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
+        self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
+        if self._glides:
+            self._law_memory = self._law.memory
 
     def order(self, command: CoreChange, t_ns: int) -> None:
         """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
