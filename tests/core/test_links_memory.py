@@ -10,14 +10,13 @@ from tests.chains import six_joints
 from tests.core.kinds import KINDS
 from tests.core.sites import linked, one_link, sample, stepped
 from tests.task_arms import planar_task
-from trilat_net.core import site_step
 from trilat_net.core.delay import LinkModel
 from trilat_net.core.link import AHEAD_LIMIT_S, calendar_pages
 from trilat_net.core.site_arrays import (
     MAX_LINKS_BYTES,
+    LinkRoom,
     SiteArrays,
     links_bytes,
-    most_pages,
     needed_pages,
     widen_calendars,
 )
@@ -176,15 +175,12 @@ def test_a_change_that_would_need_more_than_the_limit_is_refused() -> None:
         resolve_change(scenario, present, {**change, "to": {"delay_ms": 9000.0}}, 10**9)
 
 
-def test_links_never_grow_beyond_the_limit_and_what_does_not_fit_is_counted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_links_never_grow_beyond_the_limit_and_what_does_not_fit_is_counted() -> None:
     """Of a site that is given less: stamps from further ahead are refused, all others come into use."""
-    free = one_link(1000, 1000, 1_000_000)
     setup = load_scenario("paper").setup("m1")
-    assert most_pages(setup) == calendar_pages(1000) > needed_pages(setup)
-    monkeypatch.setattr(site_step, "most_pages", lambda _: 1024)
-    tight = one_link(1000, 1000, 1_000_000)
+    assert LinkRoom(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
+    free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
+    tight._room.most_pages = 1024
     ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
         used = [record.used[0] for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])]
@@ -192,3 +188,11 @@ def test_links_never_grow_beyond_the_limit_and_what_does_not_fit_is_counted(
     assert free.counts()[0].refused == 0
     assert tight.counts()[0].refused == 2
     assert tight._arrays.calendars.shape[1] == 1024
+
+
+def test_the_most_pages_are_within_the_limit() -> None:
+    """Where twenty seconds do not fit."""
+    setup = parse_scenario(many(12, 4000, 100.0)).setup("a0")
+    pages = LinkRoom(setup).most_pages
+    assert needed_pages(setup) < pages < calendar_pages(4000)
+    assert links_bytes(setup, pages) <= MAX_LINKS_BYTES < links_bytes(setup, 2 * pages)

@@ -94,7 +94,7 @@ ROWS = (
         "a delay rises for a time",
         "held when no sample comes into use for 20 ms",
         ("delay",),
-        gap="no real link is slowed down: what a cut one keeps comes late (F5)",
+        real=("sites_hold_while_a_delay_is_longer_than_the_links_and_then_follow_again",),
     ),
     Row(
         "F8",
@@ -102,7 +102,7 @@ ROWS = (
         "the same records while it stays within the play-out",
         ("jitter",),
         (SITES + "test_loop.py::test_a_stall_within_the_delay_changes_no_bit",),
-        gap="as F7",
+        ("jitter_within_the_delay_of_the_links_changes_no_record",),
     ),
     Row(
         "F9",

@@ -14,10 +14,11 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_log
+from trilat_net.net import topics
 from trilat_net.scenario import Scenario, load_scenario
 
 from .relay import RelayClock
-from .sessions import Session
+from .sessions import SESSION, Session
 
 S = 1_000_000_000
 GLIDE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 50, "rate_hz": 200}
@@ -353,3 +354,15 @@ def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None
     log = session.run()
     assert kinds_about(log, "s", "m") == ["lost"]
     assert session.ends == {"m": 0, "s": 0}
+
+
+def test_a_site_at_its_end_waits_for_a_recorder_whose_connection_broke(tmp_path: Path) -> None:
+    """Its token is gone, and it heard neither the last records nor the end; then it asks for them."""
+    session = Session.whole(gliding(2.0), tmp_path, ends={})
+    session.clocks["s"].at(3 * S + 600_000_000, lambda: session.lose_token("recorder"))
+    for name in ("m", "s"):
+        for channel in (topics.STATE, topics.EVENT, topics.LINK):
+            session.lose("s", topics.key(SESSION, name, channel), 3 * S + 600_000_000, 6 * S)
+    log = session.run()
+    assert [len(log[name]) for name in log.sites] == [400, 400]
+    assert log.missing("m") == log.missing("s") == 0

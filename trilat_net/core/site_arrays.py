@@ -17,7 +17,7 @@ from .channel import LOST
 from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
-from .link import ChannelArrays, calendar_pages, link_dtype, sample_dtype
+from .link import AHEAD_LIMIT_NS, ChannelArrays, calendar_pages, link_dtype, sample_dtype, span_ticks
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, DominanceRamp, Mode
 from .two_link_arm import JOINTS, PARAMETERS
@@ -214,14 +214,6 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
     return len(setup.links) * (pages * page + 8 * _kept_dues(setup))
 
 
-def most_pages(setup: SiteSetup) -> int:
-    """Returns the pages to which a site's links may grow, for senders far ahead and delays that change."""
-    pages = needed_pages(setup)
-    while pages < calendar_pages(setup.rate_hz) and links_bytes(setup, 2 * pages) <= MAX_LINKS_BYTES:
-        pages *= 2
-    return pages
-
-
 def _kept_dues(setup: SiteSetup) -> int:
     return max(calendar_pages(max(setup.rate_hz, link.rate_hz)) for link in setup.links)
 
@@ -239,6 +231,47 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
         waiting[:, new] = channel.waiting[:, old]
         channel = channel._replace(waiting=waiting)
     return arrays._replace(calendars=calendars, channel=channel)
+
+
+class LinkRoom:
+    """The room of a site's links: for its delays, and more for senders further ahead and delays that grow.
+
+    Never more than `MAX_LINKS_BYTES`: what does not fit is refused as it is filed, like a stamp out of range.
+
+    Attributes:
+        newest: per peer a sample that fits at any tick from the last one on, and all older ones with it.
+    """
+
+    def __init__(self, setup: SiteSetup) -> None:
+        self._rate_hz, self._peer_hz = setup.rate_hz, [link.rate_hz for link in setup.links]
+        self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+        self.newest = [-1] * len(setup.links)
+        self.most_pages = needed_pages(setup)
+        most = calendar_pages(setup.rate_hz)
+        while self.most_pages < most and links_bytes(setup, 2 * self.most_pages) <= MAX_LINKS_BYTES:
+            self.most_pages *= 2
+
+    def clear(self) -> None:
+        """Forgets the last tick."""
+        self.newest = [-1] * len(self.newest)
+
+    def lengthen(self, peer: int, model: LinkModel) -> None:
+        """Takes in a change of a link."""
+        self._delay_us[peer] = max(self._delay_us[peer], max_delay_us([model], [None]))
+        self.newest[peer] = -1
+
+    def make(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
+        """Returns the arrays at tick k with room for a peer's sample, if one from as far ahead is taken."""
+        wait = span_ticks(self._delay_us[peer] * 1000, self._rate_hz) + _SLACK
+        ahead = tick * self._rate_hz // self._peer_hz[peer] - k
+        if ahead > span_ticks(AHEAD_LIMIT_NS, self._rate_hz):
+            return arrays
+        pages = arrays.calendars.shape[1]
+        if ahead + wait > pages < self.most_pages:
+            pages = min(1 << (ahead + wait).bit_length(), self.most_pages)
+            arrays = widen_calendars(arrays, k - int(arrays.site["skipped"][0]), pages)
+        self.newest[peer] = (k + pages - wait) * self._peer_hz[peer] // self._rate_hz
+        return arrays
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:

@@ -17,21 +17,13 @@ import numpy as np
 from ..errors import LawFailed
 from .channel import LOST
 from .compiled_law import plug_law
-from .delay import DelayKind, max_delay_us
+from .delay import DelayKind
 from .dominance import fold_ramps
 from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
-from .link import AHEAD_LIMIT_NS, span_ticks
 from .live_hand import HandInForce, free_hand
-from .site_arrays import (
-    add_model,
-    add_ramp,
-    build_site_arrays,
-    build_tick_buffers,
-    most_pages,
-    widen_calendars,
-)
+from .site_arrays import LinkRoom, add_model, add_ramp, build_site_arrays, build_tick_buffers
 from .site_setup import SiteSetup, StaleAction
 from .ticks import (
     MAX_ARRIVALS,
@@ -75,9 +67,7 @@ class Site:
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
-        self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
-        self._newest_fitting = [-1] * len(setup.links)
-        self._most_pages = most_pages(setup)
+        self._room = LinkRoom(setup)
         self._external = setup.external
         self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
         self.layout = setup.layout
@@ -95,12 +85,13 @@ class Site:
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._sends = bool(self._sent.size)
-        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
-        self._plug(setup)
+        self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
         self._hand = self._arrays.actors[live[0]] if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
+        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
+        self._law_memory: list[float] = [] if self._law is None or not self._glides else self._law.memory
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
         own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
@@ -108,21 +99,17 @@ class Site:
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
 
-    def _plug(self, setup: SiteSetup) -> None:
-        """Makes the user's law, if the site has one, and compiles what calls it."""
+    def _plug_law(self, setup: SiteSetup) -> None:
+        """Makes the law of a setup that has its own."""
         self._user_law = None if setup.own is None else setup.own(setup.law_context())
         self._law = None
         self.law_failure: LawFailed | None = None
-        self._law_memory: list[float] = []
-        if self._user_law is None:
-            return
-        a, b = self._arrays, self._buffers
-        self._law = plug_law(self._user_law, setup, a, self._sent)
-        self._law.bind()  # compiled now, and not within the time that the law has for a tick
-        self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
-        self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
-        if self._glides:
-            self._law_memory = self._law.memory
+        if self._user_law is not None:
+            a, b = self._arrays, self._buffers
+            self._law = plug_law(self._user_law, setup, a, self._sent)
+            self._law.bind()  # compiled now, and not within the time that the law has for a tick
+            self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
+            self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
 
     def order(self, command: CoreChange, t_ns: int) -> None:
         """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
@@ -142,9 +129,7 @@ class Site:
             if self._links[command.peer].models >= self._arrays.models.shape[1]:
                 raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
             add_model(self._arrays, command.peer, command.model)
-            longest = max_delay_us([command.model], [None])
-            self._delay_us[command.peer] = max(self._delay_us[command.peer], longest)
-            self._newest_fitting[command.peer] = -1
+            self._room.lengthen(command.peer, command.model)
         if command.ramp is not None:
             s: Row = self._site[0]
             s.ramps = fold_ramps(t_ns, int(s.ramps), self._arrays.ramps)
@@ -362,7 +347,7 @@ class Site:
             ValueError: more than MAX_ARRIVALS of them wait.
         """
         self._arrays.calendars["tick"] = -1
-        self._newest_fitting = [-1] * len(self.peers)
+        self._room.clear()
         link: Row
         for n, (link, start, sample) in enumerate(zip(self._links, self._starts, in_use, strict=True)):
             # the channel's memory is a function of what went before
@@ -378,30 +363,15 @@ class Site:
         self._pack(k, waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
-    def _make_room(self, k: int, peer: int, tick: int) -> None:
-        """Widens the calendars at tick k for what a peer's sample may wait, and all up to that one.
-
-        What does not fit into `most_pages` is refused as it is filed, like a stamp out of range.
-        """
-        peer_hz, pages = self.peer_rate_hz(peer), self._arrays.calendars.shape[1]
-        wait = span_ticks(self._delay_us[peer] * 1000, self.rate_hz) + 4
-        ahead = tick * self.rate_hz // peer_hz - k
-        if ahead > span_ticks(AHEAD_LIMIT_NS, self.rate_hz):
-            return  # it is refused
-        if ahead + wait > pages < self._most_pages:
-            pages = min(1 << (ahead + wait).bit_length(), self._most_pages)
-            self._arrays = widen_calendars(self._arrays, k - int(self._site["skipped"][0]), pages)
-            self._tick_arrays = (*self._arrays, *self._buffers)
-        self._newest_fitting[peer] = (k + pages - wait) * peer_hz // self.rate_hz
-
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
         """Writes arrivals at tick k into their buffers and makes room for them; returns their bytes there."""
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
-        offset = 0
+        offset, newest = 0, self._room.newest
         for peer, tick, q, qd, *_ in arrivals:
-            if tick > self._newest_fitting[peer]:
-                self._make_room(k, peer, tick)
+            if tick > newest[peer]:
+                self._arrays = self._room.make(self._arrays, k, peer, tick)
+                self._tick_arrays = (*self._arrays, *self._buffers)
             self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
             offset += self._arrival_size
         if self._reflects:
