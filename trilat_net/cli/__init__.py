@@ -10,6 +10,7 @@ import gc
 import inspect
 import os
 import sys
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -19,36 +20,7 @@ from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
-from . import (
-    bench,
-    certify,
-    compare,
-    demo,
-    doctor,
-    figure,
-    keys,
-    linear,
-    live,
-    log,
-    metrics,
-    new,
-    ping,
-    record,
-    replay,
-    report,
-    rerun,
-    router,
-    scenario,
-    sim,
-    site,
-    stop,
-    sweep,
-    test,
-    trace,
-    verify,
-    watch,
-)
-from . import set as set_command
+from .set import set_command
 
 
 class _Commands(TyperGroup):
@@ -97,11 +69,71 @@ def _main(
     pass
 
 
-def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any) -> typer.Typer:
-    """Returns a group of commands: by name a function and arguments of examples, which follow `words`."""
+_SINGLE = {
+    "demo": ["paper --duration 10 --set control.Kd=5"],
+    "live": ["play", "--session paper"],
+    "site": ["m1 --scenario paper"],
+    "record": ["--session paper -o run.mcap --split-duration 600"],
+    "ping": ["--session paper"],
+    "watch": ["--session paper"],
+    "stop": ["--session paper s", "--session paper --end"],
+    "enable": ["--session paper s"],
+    "reset": ["--session paper s"],
+    "doctor": ["--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper"],
+    "router": ["--keys keys/router"],
+    "sim": ["free -o free.mcap --set link.delay_ms=400"],
+    "verify": ["run.mcap"],
+    "certify": ["run.mcap"],
+    "metrics": ["run.mcap"],
+    "compare": ["a.mcap b.mcap", "--tune free --law adaptive,p_d"],
+    "figure": ["run.mcap positions settling --width 3.5 --format pdf --out paper"],
+    "report": ["run.mcap -o report"],
+    "replay": ["run.mcap --rate 2 --start 5"],
+    "rerun": ["run.mcap --replace s --set control.Kd=5 -o kd5.mcap"],
+}
+_LOG = {
+    "info": ["run.mcap"],
+    "check": ["run.mcap", "run.mcap --key lab.pub"],
+    "sign": ["run.mcap --key lab.key"],
+    "recover": ["run.mcap.active"],
+    "export": ["run.mcap --to parquet"],
+    "view": ["run.mcap"],
+}
+_STUDIES = {
+    "test": ["jitter --seeds 1..20 --junit out.xml"],
+    "sweep": [
+        "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
+        "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
+        "runs/sweep-p_d_margin-001 --cell 17",
+    ],
+    "bench": ["--small", "--study round-trips --law wave,smith"],
+    "linear": ["p_d_margin --set control.d=0.9 --over control.d=0.1:3"],
+}
+_SCENARIO = {"list": [""], "show": ["paper --set control.Kd=5"], "check": ["mine.toml"], "new": ["mine.toml"]}
+_NEW = {"law": ["mylaw.py"]}
+_TRACE = {"import": ["irtt run.json.gz", "csv drive.txt --way half -o drive.csv"]}
+_SET = {"link": ["'m1->s' --delay 350ms --loss 5%"], "dominance": ["s m1=0.9 m2=0.1"]}
+_KEYS = {
+    "new": ["keys m1 m2 s recorder operator --host 192.0.2.1"],
+    "pair": ["lab"],
+    "info": ["keys/m1"],
+}
+
+_HOMES = {"enable": "stop", "reset": "stop"}
+"""Modules of commands that share one."""
+
+
+def _group(examples: dict[str, list[str]], module: str = "", words: str = "", **options: Any) -> typer.Typer:
+    """Returns a group of commands: by name the arguments of their examples, which follow `words`.
+
+    The function of a command `info` of the module `log` is `log_info_command`; of one without a group,
+    `ping_command` in the module `ping`.
+    """
     group = typer.Typer(**options)
-    for name, (run, *examples) in commands.items():
-        epilog = "\n\n".join(f"Example: trilat {words}{name} {example}".rstrip() for example in examples)
+    for name, arguments in examples.items():
+        home = import_module(f".{module or _HOMES.get(name, name)}", __package__)
+        run = getattr(home, f"{module}_{name}_command".removeprefix("_"))
+        epilog = "\n\n".join(f"Example: trilat {words}{name} {one}".rstrip() for one in arguments)
         text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
         paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
         text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
@@ -109,100 +141,20 @@ def _group(commands: dict[str, tuple[Any, ...]], words: str = "", **options: Any
     return group
 
 
-_SINGLE = {
-    "demo": (demo.demo_command, "paper --duration 10 --set control.Kd=5"),
-    "live": (live.live_command, "play", "--session paper"),
-    "site": (site.site_command, "m1 --scenario paper"),
-    "record": (record.record_command, "--session paper -o run.mcap --split-duration 600"),
-    "ping": (ping.ping_command, "--session paper"),
-    "watch": (watch.watch_command, "--session paper"),
-    "stop": (stop.stop_command, "--session paper s", "--session paper --end"),
-    "enable": (stop.enable_command, "--session paper s"),
-    "reset": (stop.reset_command, "--session paper s"),
-    "doctor": (doctor.doctor_command, "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper"),
-    "router": (router.router_command, "--keys keys/router"),
-    "sim": (sim.sim_command, "free -o free.mcap --set link.delay_ms=400"),
-    "verify": (verify.verify_command, "run.mcap"),
-    "certify": (certify.certify_command, "run.mcap"),
-    "metrics": (metrics.metrics_command, "run.mcap"),
-    "compare": (compare.compare_command, "a.mcap b.mcap", "--tune free --law adaptive,p_d"),
-    "figure": (
-        figure.figure_command,
-        "run.mcap positions settling --width 3.5 --format pdf --out paper",
-    ),
-    "report": (report.report_command, "run.mcap -o report"),
-    "replay": (replay.replay_command, "run.mcap --rate 2 --start 5"),
-    "rerun": (rerun.rerun_command, "run.mcap --replace s --set control.Kd=5 -o kd5.mcap"),
-}
-_LOG = {
-    "info": (log.log_info_command, "run.mcap"),
-    "check": (log.log_check_command, "run.mcap", "run.mcap --key lab.pub"),
-    "sign": (log.log_sign_command, "run.mcap --key lab.key"),
-    "recover": (log.log_recover_command, "run.mcap.active"),
-    "export": (log.log_export_command, "run.mcap --to parquet"),
-    "view": (log.log_view_command, "run.mcap"),
-}
-_STUDIES = {
-    "test": (test.test_command, "jitter --seeds 1..20 --junit out.xml"),
-    "sweep": (
-        sweep.sweep_command,
-        "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
-        "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
-        "runs/sweep-p_d_margin-001 --cell 17",
-    ),
-    "bench": (bench.bench_command, "--small", "--study round-trips --law wave,smith"),
-    "linear": (linear.linear_command, "p_d_margin --set control.d=0.9 --over control.d=0.1:3"),
-}
-_SCENARIO = {
-    "list": (scenario.scenario_list_command, ""),
-    "show": (scenario.scenario_show_command, "paper --set control.Kd=5"),
-    "check": (scenario.scenario_check_command, "mine.toml"),
-    "new": (scenario.scenario_new_command, "mine.toml"),
-}
-_NEW = {"law": (new.new_law_command, "mylaw.py")}
-_TRACE = {
-    "import": (trace.trace_import_command, "irtt run.json.gz", "csv drive.txt --way half -o drive.csv"),
-}
-_SET = {
-    "link": (set_command.set_link_command, "'m1->s' --delay 350ms --loss 5%"),
-    "dominance": (set_command.set_dominance_command, "s m1=0.9 m2=0.1"),
-}
-_KEYS = {
-    "new": (keys.keys_new_command, "keys m1 m2 s recorder operator --host 192.0.2.1"),
-    "pair": (keys.keys_pair_command, "lab"),
-    "info": (keys.keys_info_command, "keys/m1"),
-}
-_CHANGES = _group(_SET, "set --session paper ", no_args_is_help=True)
-_CHANGES.callback()(set_command.set_command)
+def _add(name: str, examples: dict[str, list[str]], more: str = "", **options: Any) -> None:
+    """Adds a group of commands to `trilat`; `more` follows its name in their examples."""
+    group = _group(examples, name, f"{name} {more}", no_args_is_help=True, **options)
+    app.add_typer(group, name=name)
+
+
 app.add_typer(_group(_SINGLE))
-app.add_typer(
-    _group(
-        _LOG, "log ", no_args_is_help=True, help="Inspects, checks, signs, recovers, exports or views a log."
-    ),
-    name="log",
-)
+_add("log", _LOG, help="Inspects, checks, signs, recovers, exports or views a log.")
 app.add_typer(_group(_STUDIES))
-app.add_typer(
-    _group(_SCENARIO, "scenario ", no_args_is_help=True, help="The shipped scenarios and your own."),
-    name="scenario",
-)
-app.add_typer(
-    _group(_NEW, "new ", no_args_is_help=True, help="A control law of your own, with its test."), name="new"
-)
-app.add_typer(
-    _group(_TRACE, "trace ", no_args_is_help=True, help="Imports delays that other programs measured."),
-    name="trace",
-)
-app.add_typer(_CHANGES, name="set")
-app.add_typer(
-    _group(
-        _KEYS,
-        "keys ",
-        no_args_is_help=True,
-        help="Keys that authenticate members of a session, and sign logs.",
-    ),
-    name="keys",
-)
+_add("scenario", _SCENARIO, help="The shipped scenarios and your own.")
+_add("new", _NEW, help="A control law of your own, with its test.")
+_add("trace", _TRACE, help="Imports delays that other programs measured.")
+_add("set", _SET, "--session paper ", callback=set_command)
+_add("keys", _KEYS, help="Keys that authenticate members of a session, and sign logs.")
 
 
 _TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
