@@ -14,14 +14,7 @@ from ..core.ticks import NS_PER_S
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
-from .delivery import (
-    Arrivals,
-    PredictedDelivery,
-    count_sent,
-    mark_judged_samples,
-    predict_delivery,
-    read_arrivals,
-)
+from . import delivery
 from .timeline import StatedModel, list_changes, list_stated_models
 
 MOST_AGE_BINS = 50
@@ -113,12 +106,12 @@ def summarise_links(log: Log) -> list[LinkSummary]:
         LogError: a record names a change that is none.
     """
     changed = list_changes(log)
-    came = {site: read_arrivals(log, site) for site in log.sites}
+    came = {site: delivery.read_arrivals(log, site) for site in log.sites}
     newest = {
         peer: max(int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there)
         for peer in log.sites
     }
-    sent = {peer: count_sent(log, peer, tick) for peer, tick in newest.items()}
+    sent = {peer: delivery.count_sent(log, peer, tick) for peer, tick in newest.items()}
     return [
         _summarise_link(
             log, list_stated_models(log, f"{peer}->{site}", changed), peer, site, sent[peer], over
@@ -157,12 +150,12 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
 
 
 def _summarise_link(
-    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, came: Arrivals
+    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, came: delivery.Arrivals
 ) -> LinkSummary:
     part, used = log[site], log[site].used[peer]
-    fate = predict_delivery(log, peer, site, sent)
+    fate = delivery.predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
-    known = mark_judged_samples(log, site, fate.stamp_ns, came.first)
+    known = delivery.mark_judged_samples(log, site, fate.stamp_ns, came.first)
     for first, last in log.absences.get(peer, ()):
         known[first : last + 1] = False  # the peer made none of these
     gone = np.ones(len(known), dtype=np.bool_)  # judged samples that could not come into use
@@ -195,7 +188,7 @@ def _summarise_link(
 
 
 def _count_samples(
-    part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, judged: int
+    part: SiteLog, used: Ints, fate: delivery.PredictedDelivery, came: delivery.Arrivals, judged: int
 ) -> SampleCounts:
     first = came.first
     release = fate.release(part.rate_hz)[first.sample]

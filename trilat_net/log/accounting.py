@@ -10,6 +10,7 @@ import math
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError
@@ -353,7 +354,9 @@ class SessionAccounts:
         if topic not in self._accounts:
             return
         member, channel = topic.split("/")[-2:]
-        event = self._decode_event(payload) if channel == topics.EVENT and payload else None
+        event: Event | None = None
+        with suppress(WireError):  # an event that cannot be read counts like any other message
+            event = decode(payload, Event, READABLE) if channel == topics.EVENT and payload else None
         number = number_message(channel, sequence, self._rates_hz.get(member, 0))
         if event is None:
             self._count(topic, number)
@@ -402,13 +405,6 @@ class SessionAccounts:
         base = self._bases.setdefault(topic, number if self._continued else 0)
         if number >= base:
             (account or self._accounts[topic]).take(number - base)
-
-    @staticmethod
-    def _decode_event(payload: bytes) -> Event | None:
-        try:
-            return decode(payload, Event, READABLE)
-        except WireError:
-            return None
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         """Yields what lies before a start of a site, by channel."""

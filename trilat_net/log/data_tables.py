@@ -369,11 +369,8 @@ def to_pandas_frame(table: Table) -> "pandas.DataFrame":
     """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers."""
     from pandas import DataFrame
 
-    return DataFrame({one.name: _pandas_values(one) for one in table.columns})
-
-
-def _pandas_values(column: Column) -> NDArray[Any] | list[Any]:
-    return column.rows(0, len(column.values)) if column.is_text else column.numbers()
+    columns = table.columns
+    return DataFrame({c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in columns})
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":

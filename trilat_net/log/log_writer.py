@@ -18,25 +18,9 @@ from ..files import refuse_existing
 from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
+from . import log_layout
 from .digest_chain import ALGORITHM, CHAIN_KEY, PREVIOUS_DIGEST_KEY
 from .log_file import LogFile
-from .log_layout import (
-    ACCOUNTS,
-    ACTIVE_SUFFIX,
-    ALL_CHANNELS,
-    CHANNEL_TYPES,
-    MAX_TIME_NS,
-    PART,
-    RECORDER_CHANNELS,
-    SCENARIO,
-    SESSION,
-    SITE_CHANNELS,
-    ChannelFilter,
-    active_path,
-    collect_provenance,
-    find_parts,
-    part_path,
-)
 from .mcap_writer import McapWriter, Sink
 from .ros2 import cdr
 from .ros2.viz_channels import TakeMessage, VizChannels
@@ -76,7 +60,7 @@ class LogWriter:
         facts: Mapping[str, str] | None = None,
         *,
         part: Mapping[str, str] | None = None,
-        choice: ChannelFilter = ALL_CHANNELS,
+        choice: log_layout.ChannelFilter = log_layout.ALL_CHANNELS,
         views_hz: float = 0.0,
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
@@ -88,7 +72,7 @@ class LogWriter:
         self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
         self._standard: dict[str, int] = {}  # standard schemas and channels in the file
-        self._file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}")
+        self._file = McapWriter(stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}")
         about = {
             "schema_version": str(VERSION),
             "session": session,
@@ -100,26 +84,30 @@ class LogWriter:
             "epoch_unix_ns": str(epoch_unix_ns),
             CHAIN_KEY: ALGORITHM,
         }
-        about |= {**collect_provenance(), **choice.facts(), **(facts or {})}
+        about |= {**log_layout.collect_provenance(), **choice.facts(), **(facts or {})}
         with self._refusing():
-            self._file.add_metadata(SESSION, about)
+            self._file.add_metadata(log_layout.SESSION, about)
             if part:
-                self._file.add_metadata(PART, part)
-            self._file.add_attachment(0, 0, SCENARIO, "application/toml", scenario.text.encode())
+                self._file.add_metadata(log_layout.PART, part)
+            self._file.add_attachment(0, 0, log_layout.SCENARIO, "application/toml", scenario.text.encode())
             self._channels = self._register(scenario, session, choice)
             self._file.flush()
 
-    def _register(self, scenario: Scenario, session: str, choice: ChannelFilter) -> dict[str, int | None]:
+    def _register(
+        self, scenario: Scenario, session: str, choice: log_layout.ChannelFilter
+    ) -> dict[str, int | None]:
         """Registers the channels of the session; returns them by key, None for those that are excluded."""
         schemas = {
             name: self._file.register_schema(
                 f"trilat.{kind.__name__}.v{VERSION}", "jsonschema", json.dumps(json_schema(kind)).encode()
             )
-            for name, kind in CHANNEL_TYPES.items()
+            for name, kind in log_layout.CHANNEL_TYPES.items()
         }
         channels: dict[str, int | None] = {}
         for member in (*scenario.names, topics.RECORDER):
-            for name in SITE_CHANNELS if member != topics.RECORDER else RECORDER_CHANNELS:
+            for name in (
+                log_layout.SITE_CHANNELS if member != topics.RECORDER else log_layout.RECORDER_CHANNELS
+            ):
                 key, about = topics.key(session, member, name), {"member": member}
                 if name == topics.STATE:
                     about["rate_hz"] = str(scenario.sites[member].rate_hz)
@@ -183,7 +171,7 @@ class LogWriter:
         if channel is None:
             return
         self._last_log_ns = log_time_ns
-        sent_ns = min(max(0, self._epoch_unix_ns + t_ns), MAX_TIME_NS)
+        sent_ns = min(max(0, self._epoch_unix_ns + t_ns), log_layout.MAX_TIME_NS)
         try:
             self._file.add_message(channel, log_time_ns, payload, sent_ns, max(0, number) & 0xFFFFFFFF)
             if message is not None and (take := self._takers.get(key)) is not None:
@@ -202,7 +190,7 @@ class LogWriter:
             channel = self._file.register_channel(topic, cdr.ENCODING, self._standard[kind], about)
             self._standard[topic] = channel
         if channel is not None:
-            self._file.add_message(channel, log_ns, data, min(publish_ns, MAX_TIME_NS))
+            self._file.add_message(channel, log_ns, data, min(publish_ns, log_layout.MAX_TIME_NS))
 
     def flush(self) -> None:
         """Closes the open chunk and hands it to the operating system: a crash loses nothing before it.
@@ -233,7 +221,7 @@ class LogWriter:
                 if self._views is not None and whole:
                     self._views.finish(self._last_log_ns)
             finally:
-                self._file.add_metadata(ACCOUNTS, taken)
+                self._file.add_metadata(log_layout.ACCOUNTS, taken)
                 self.records_digest = self._file.close_chain()["records"]
                 self._file.finish()
 
@@ -277,7 +265,7 @@ class LogStorage:
     split_bytes: int | None = None
     split_ns: int | None = None
     carry_on: bool = False
-    choice: ChannelFilter = ALL_CHANNELS
+    choice: log_layout.ChannelFilter = log_layout.ALL_CHANNELS
     views_hz: float = 0.0
 
     @property
@@ -293,11 +281,11 @@ class LogStorage:
         """
         if self.carry_on and self.force:
             raise UsageError("--continue keeps what exists, --force replaces it; give one of them")
-        there = find_parts(self.path)
+        there = log_layout.find_parts(self.path)
         if self.carry_on and there:
             last = max(there)
-            return last + 1, there[last].name.removesuffix(ACTIVE_SUFFIX)
-        refuse_existing(self.path, force=self.force, unfinished=active_path(self.path))
+            return last + 1, there[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
+        refuse_existing(self.path, force=self.force, unfinished=log_layout.active_path(self.path))
         if self.splits and there and not self.force:
             ways = "choose another name, carry on behind it with --continue, or replace it with --force"
             raise UsageError(f"{there[max(there)]}: exists; {ways}")
@@ -345,17 +333,17 @@ class LogParts:
         self._number, self._previous = storage.first()
         self._previous_digest = ""
         if storage.force and storage.splits:  # what was left of a log would seem to belong to the new one
-            for number in (0, *find_parts(storage.path)):
-                name = part_path(storage.path, number)
+            for number in (0, *log_layout.find_parts(storage.path)):
+                name = log_layout.part_path(storage.path, number)
                 name.unlink(missing_ok=True)
-                active_path(name).unlink(missing_ok=True)
+                log_layout.active_path(name).unlink(missing_ok=True)
         self._since_ns: int | None = None
         self._before_bytes = 0
         self._begin()
 
     def _begin(self) -> None:
         """Begins a part."""
-        path = part_path(self._storage.path, self._number)
+        path = log_layout.part_path(self._storage.path, self._number)
         part = {"index": str(self._number), "previous": self._previous} if self._number else {}
         if self._previous_digest:
             part[PREVIOUS_DIGEST_KEY] = self._previous_digest

@@ -14,21 +14,8 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from . import mcap_records
 from .mcap_reader import Progress
-from .mcap_records import (
-    DEFINITIONS,
-    MAGIC,
-    MESSAGE_HEAD,
-    OP_MESSAGE,
-    RECORD_HEAD_BYTES,
-    RecordFrame,
-    RecordScanner,
-    UnreadableRecord,
-    has_right_crc,
-    iterate_records,
-    parse_record,
-    unpack_chunk,
-)
 
 MAX_LISTED_PROBLEMS = 1000
 """Problems that a finding keeps; more are counted."""
@@ -102,7 +89,7 @@ class McapCheck:
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> bool:
         """Checks every byte of a file; returns False if it does not begin as an MCAP file."""
-        scanner = RecordScanner(stream)
+        scanner = mcap_records.RecordScanner(stream)
         self._totals["bytes"] += scanner.size
         if not scanner.begins:
             self.whole.add(file, 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
@@ -111,7 +98,7 @@ class McapCheck:
         end = 0
         for frame in scanner.frames():
             one.take(frame)
-            end = frame.end + len(MAGIC)
+            end = frame.end + len(mcap_records.MAGIC)
             if progress is not None:
                 progress(frame.end, scanner.size)
         for damage in scanner.damaged:
@@ -140,7 +127,7 @@ class McapCheck:
 class _FileCheck:
     """Check of one file; `counts` what it compares."""
 
-    def __init__(self, file: str, scanner: RecordScanner, problems: McapCheck) -> None:
+    def __init__(self, file: str, scanner: mcap_records.RecordScanner, problems: McapCheck) -> None:
         self.counts: Counter[str] = Counter()
         self._file, self._scanner, self._problems = file, scanner, problems
         self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
@@ -152,45 +139,45 @@ class _FileCheck:
         self._entries: dict[int, array[int]] = {}  # of the last chunk: log times and places, by channel
         self._unreadable = False  # something unreadable may have named a channel
 
-    def take(self, frame: RecordFrame) -> None:
+    def take(self, frame: mcap_records.RecordFrame) -> None:
         """Checks one record of the file."""
-        if frame.offset == len(MAGIC) and frame.opcode != Opcode.HEADER:
+        if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
             self._add_records_problem(frame, "the first record is no header")
         try:
             self._take_content(frame, self._scanner.content(frame))
-        except UnreadableRecord as error:
+        except mcap_records.UnreadableRecord as error:
             text = str(error)
             problems = self._problems.checksums if "CRC" in text else self._problems.records
             problems.add(self._file, frame.offset, text)
             self._unreadable = True
 
-    def _add_records_problem(self, frame: RecordFrame, text: str) -> None:
+    def _add_records_problem(self, frame: mcap_records.RecordFrame, text: str) -> None:
         self._problems.records.add(self._file, frame.offset, text)
 
-    def _take_content(self, frame: RecordFrame, content: bytes) -> None:
+    def _take_content(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         opcode = frame.opcode
         if opcode == Opcode.CHUNK:
             self._take_chunk(frame, content)
         elif opcode == Opcode.MESSAGE_INDEX:
             self._take_message_index(frame, content)
-        elif opcode == OP_MESSAGE:
+        elif opcode == mcap_records.OP_MESSAGE:
             self._take_message(frame, content, 0, len(content))
-        elif opcode in DEFINITIONS:
+        elif opcode in mcap_records.DEFINITIONS:
             self._define(frame, opcode, content)
         elif opcode in _OTHERS:
             self._take_other(frame, content)
         elif opcode < 0x80:
             self._add_records_problem(frame, f"a record of kind {opcode} is none of the format")
 
-    def _take_other(self, frame: RecordFrame, content: bytes) -> None:
+    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Takes metadata, an attachment, or a record of the end; those of the index by what they name."""
-        record = parse_record(frame.opcode, content)
+        record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.METADATA:
                 self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
             case Opcode.ATTACHMENT:
-                if not has_right_crc(content):
-                    raise UnreadableRecord("an attachment's CRC differs")
+                if not mcap_records.has_right_crc(content):
+                    raise mcap_records.UnreadableRecord("an attachment's CRC differs")
                 self.counts["crcs"] += content[-4:] != bytes(4)
                 self._found[Opcode.ATTACHMENT_INDEX, frame.offset] = frame.size, record.name
             case Opcode.METADATA_INDEX | Opcode.ATTACHMENT_INDEX:
@@ -202,9 +189,9 @@ class _FileCheck:
             case _:
                 self._ends[frame.opcode] = frame.offset, record
 
-    def _define(self, frame: RecordFrame, opcode: int, content: bytes) -> None:
+    def _define(self, frame: mcap_records.RecordFrame, opcode: int, content: bytes) -> None:
         """Takes a schema or a channel; one that came before must be the same."""
-        record = parse_record(opcode, content)
+        record = mcap_records.parse_record(opcode, content)
         name = "schema" if opcode == Opcode.SCHEMA else "channel"
         if self._defined.setdefault((opcode, record.id), record) != record:
             self._add_records_problem(frame, f"{name} {record.id} is not what it was before")
@@ -213,11 +200,13 @@ class _FileCheck:
             text = f"channel {record.id} names schema {schema}, which comes nowhere before"
             self._add_records_problem(frame, text)
 
-    def _take_message(self, frame: RecordFrame, data: bytes, begin: int, end: int) -> tuple[int, int]:
+    def _take_message(
+        self, frame: mcap_records.RecordFrame, data: bytes, begin: int, end: int
+    ) -> tuple[int, int]:
         """Takes a message; returns its channel and its log time."""
-        if end - begin < MESSAGE_HEAD.size:
-            raise UnreadableRecord("a message is shorter than its head")
-        channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, begin)
+        if end - begin < mcap_records.MESSAGE_HEAD.size:
+            raise mcap_records.UnreadableRecord("a message is shorter than its head")
+        channel, _, log_ns, _ = mcap_records.MESSAGE_HEAD.unpack_from(data, begin)
         if (Opcode.CHANNEL, channel) not in self._defined and channel not in self._unknown:
             self._unknown.add(channel)
             if not self._unreadable:
@@ -226,20 +215,20 @@ class _FileCheck:
         self.counts["messages"] += 1
         return channel, log_ns
 
-    def _take_chunk(self, frame: RecordFrame, content: bytes) -> None:
+    def _take_chunk(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         self._indexes = None
         head = self._scanner.head(frame)
         self.counts["chunks"] += 1
-        data = unpack_chunk(content)
+        data = mcap_records.unpack_chunk(content)
         self.counts["crcs"] += bool(head.crc)
         self._entries.clear()
-        for opcode, begin, end in iterate_records(data):
-            if opcode == OP_MESSAGE:
+        for opcode, begin, end in mcap_records.iterate_records(data):
+            if opcode == mcap_records.OP_MESSAGE:
                 channel, log_ns = self._take_message(frame, data, begin, end)
                 entries = self._entries.setdefault(channel, array("Q"))
                 entries.append(log_ns)
-                entries.append(begin - RECORD_HEAD_BYTES)
-            elif opcode in DEFINITIONS:
+                entries.append(begin - mcap_records.RECORD_HEAD_BYTES)
+            elif opcode in mcap_records.DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
                 self._add_records_problem(frame, f"a chunk holds a record of kind {opcode}")
@@ -247,14 +236,16 @@ class _FileCheck:
         found = frame.size, head.start_ns, head.end_ns, self._indexes
         self._found[Opcode.CHUNK_INDEX, frame.offset] = found
 
-    def _take_message_index(self, frame: RecordFrame, content: bytes) -> None:
+    def _take_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Compares the index of a channel's messages in the last chunk with these."""
         if self._indexes is None:
             return  # the chunk could not be read
         channel, length = int.from_bytes(content[:2], "little"), int.from_bytes(content[2:6], "little")
         body = content[_INDEX_HEAD_BYTES:]
         if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
-            raise UnreadableRecord(f"a message index of {len(body)} bytes says that it has {length}")
+            raise mcap_records.UnreadableRecord(
+                f"a message index of {len(body)} bytes says that it has {length}"
+            )
         self._indexes[channel] = frame.offset
         if not np.array_equal(_sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))):
             text = f"the index of channel {channel} in a chunk is not what is there"
@@ -314,7 +305,12 @@ def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 
 
-_OTHERS = frozenset(Opcode) - {Opcode.CHUNK, OP_MESSAGE, Opcode.MESSAGE_INDEX, *DEFINITIONS}
+_OTHERS = frozenset(Opcode) - {
+    Opcode.CHUNK,
+    mcap_records.OP_MESSAGE,
+    Opcode.MESSAGE_INDEX,
+    *mcap_records.DEFINITIONS,
+}
 _INDEXED_NAMES: dict[int, str] = {
     Opcode.CHUNK_INDEX: "chunk",
     Opcode.ATTACHMENT_INDEX: "attachment",

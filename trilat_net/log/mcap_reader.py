@@ -18,26 +18,19 @@ from numpy.typing import NDArray
 
 from ..errors import LogError
 from ..net import topics
+from . import mcap_records
 from .digest_chain import CHAIN, DigestChain, Integrity
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
-from .mcap_records import (
-    DEFINITIONS,
-    MESSAGE_HEAD,
-    OP_MESSAGE,
-    RECORD_HEAD,
-    RECORD_HEAD_BYTES,
-    Damage,
-    RecordFrame,
-    RecordScanner,
-    UnreadableRecord,
-    has_right_crc,
-    iterate_records,
-    parse_record,
-    unpack_chunk,
-)
 
 _READ = frozenset(
-    {Opcode.CHUNK, Opcode.MESSAGE, *DEFINITIONS, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.HEADER}
+    {
+        Opcode.CHUNK,
+        Opcode.MESSAGE,
+        *mcap_records.DEFINITIONS,
+        Opcode.METADATA,
+        Opcode.ATTACHMENT,
+        Opcode.HEADER,
+    }
 )
 """Records that are read; indexes are of no use to a reader of the whole file."""
 
@@ -126,7 +119,7 @@ class McapReader:
         self.offset = 0
         self.complete = False
         self._chain = DigestChain()
-        self._scanner = RecordScanner(stream)
+        self._scanner = mcap_records.RecordScanner(stream)
         self.size = self._scanner.size
         self._source = name
         self._progress = progress
@@ -136,15 +129,15 @@ class McapReader:
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._room is None else CHANNEL_SHARE * self._room
         self._shares: defaultdict[int, float] = defaultdict(lambda: share)  # what is left, by channel
-        self._cut_short: list[Damage] = []
+        self._cut_short: list[mcap_records.Damage] = []
 
     @property
-    def damaged(self) -> list[Damage]:
+    def damaged(self) -> list[mcap_records.Damage]:
         """Parts that could not be read, so far, and channels that were read in part."""
         return self._scanner.damaged + self._cut_short
 
     @property
-    def torn(self) -> Damage | None:
+    def torn(self) -> mcap_records.Damage | None:
         """The end that was cut off; None in a finished file, and before it was reached."""
         return self._scanner.torn
 
@@ -163,51 +156,53 @@ class McapReader:
             if frame.opcode in _READ:
                 try:
                     yield from self._read_records(self._unpack(frame), frame)
-                except UnreadableRecord as error:
-                    scanner.damaged.append(Damage(frame.offset, frame.size, str(error)))
+                except mcap_records.UnreadableRecord as error:
+                    scanner.damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
         self.complete = scanner.finished
 
-    def _unpack(self, frame: RecordFrame) -> bytes:
+    def _unpack(self, frame: mcap_records.RecordFrame) -> bytes:
         """Returns the records with messages and channels in a record of the file; stores other contents."""
         content = self._scanner.content(frame)
         match frame.opcode:
             case Opcode.CHUNK:
-                data = unpack_chunk(content)
+                data = mcap_records.unpack_chunk(content)
                 self.chunks[self._scanner.head(frame).compression] += 1
                 self.packed_bytes += len(content)
                 self.unpacked_bytes += len(data)
                 return data
             case Opcode.MESSAGE | Opcode.SCHEMA | Opcode.CHANNEL:  # outside of chunks
-                return RECORD_HEAD.pack(frame.opcode, frame.length) + content
+                return mcap_records.RECORD_HEAD.pack(frame.opcode, frame.length) + content
             case Opcode.METADATA:
-                entry = parse_record(frame.opcode, content)
+                entry = mcap_records.parse_record(frame.opcode, content)
                 self.metadata[entry.name] = entry.metadata
                 if entry.name == CHAIN:
                     return b""
             case Opcode.ATTACHMENT:
-                attachment = parse_record(frame.opcode, content)
-                if not has_right_crc(content):
-                    raise UnreadableRecord(f"the attachment {attachment.name[:80]!r}: its CRC differs")
+                attachment = mcap_records.parse_record(frame.opcode, content)
+                if not mcap_records.has_right_crc(content):
+                    raise mcap_records.UnreadableRecord(
+                        f"the attachment {attachment.name[:80]!r}: its CRC differs"
+                    )
                 self.attachments[attachment.name] = attachment.data
             case Opcode.HEADER:
-                self.library = parse_record(frame.opcode, content).library
+                self.library = mcap_records.parse_record(frame.opcode, content).library
         self._chain.add_entry(frame.opcode, content)
         return b""
 
-    def _read_records(self, data: bytes, frame: RecordFrame) -> Iterator[McapMessage]:
+    def _read_records(self, data: bytes, frame: mcap_records.RecordFrame) -> Iterator[McapMessage]:
         find_topic, ours, shares = self._topics.get, self._ours, self._shares
-        parse_head, head_bytes = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
+        parse_head, head_bytes = mcap_records.MESSAGE_HEAD.unpack_from, mcap_records.MESSAGE_HEAD.size
         new = tuple.__new__  # what the class does with its arguments, in half the time
         memory = chained = messages = 0
         view = memoryview(data)
-        for opcode, begin, end in iterate_records(data):
-            if opcode == OP_MESSAGE:
+        for opcode, begin, end in mcap_records.iterate_records(data):
+            if opcode == mcap_records.OP_MESSAGE:
                 length = end - begin
                 messages += 1
                 if length < head_bytes:
-                    raise UnreadableRecord("a message is shorter than its head")
+                    raise mcap_records.UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
                 if channel in ours:
                     cost = _DECODED_BYTES
@@ -223,8 +218,8 @@ class McapReader:
                 payload = data[begin + head_bytes : end]
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
-            elif opcode in DEFINITIONS:
-                self._chain.add_records(view[chained : begin - RECORD_HEAD_BYTES], 0)
+            elif opcode in mcap_records.DEFINITIONS:
+                self._chain.add_records(view[chained : begin - mcap_records.RECORD_HEAD_BYTES], 0)
                 chained = end
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
@@ -237,7 +232,7 @@ class McapReader:
 
     def _define(self, opcode: int, content: bytes) -> None:
         self._chain.add_entry(opcode, content)
-        record = parse_record(opcode, content)
+        record = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
             self._schemas.setdefault(record.id, (record.name, record.encoding, record.data))
         elif record.id not in self._topics:
@@ -248,15 +243,15 @@ class McapReader:
             if topic.startswith("/trilat/"):
                 self._ours.add(record.id)
 
-    def _cut_channel(self, channel: int, frame: RecordFrame) -> None:
+    def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
         """Reports, once, that the rest of a channel is not read."""
         if self._shares[channel] >= 0.0:
             self._shares[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
             text = f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
-            self._cut_short.append(Damage(frame.offset, frame.size, text))
+            self._cut_short.append(mcap_records.Damage(frame.offset, frame.size, text))
 
-    def _take_memory(self, amount: int, frame: RecordFrame) -> None:
+    def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
         """Takes memory for what is kept; raises `LogError` if there is not so much."""
         if self._room is None:
             return

@@ -22,29 +22,12 @@ from ..errors import LogError, NothingSaved, UsageError
 from ..files import describe_write_error, open_regular
 from ..net import topics
 from ..results import Result
+from . import mcap_records
 from .accounting import Coverage, open_session_accounts, parse_counts
 from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
 from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
 from .mcap_reader import McapReader, Progress
-from .mcap_records import (
-    COMPRESSION_NAME_OFFSET,
-    DEFINITIONS,
-    MAX_UNPACKED_BYTES,
-    MAX_UNPACKED_RATIO,
-    MAX_WINDOW_BYTES,
-    MESSAGE_HEAD,
-    OP_MESSAGE,
-    RECORD_HEAD_BYTES,
-    Damage,
-    RecordFrame,
-    RecordScanner,
-    UnreadableRecord,
-    has_right_crc,
-    iterate_records,
-    parse_record,
-    unpack_chunk,
-)
 from .mcap_writer import McapWriter
 
 MAX_LISTED_LOSSES = 20
@@ -177,7 +160,7 @@ def recover_log(
 
 
 def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None) -> Recovery:
-    scanner = RecordScanner(stream)
+    scanner = mcap_records.RecordScanner(stream)
     survey = _Survey(scanner)
     if survey.why_empty:
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
@@ -213,7 +196,7 @@ class _Survey:
         why_empty: the reason if there is nothing to save; else "".
     """
 
-    def __init__(self, scanner: RecordScanner) -> None:
+    def __init__(self, scanner: mcap_records.RecordScanner) -> None:
         self.profile = self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
@@ -225,16 +208,16 @@ class _Survey:
         content = False
         for frame in scanner.frames():
             content |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
-            if frame.opcode in DEFINITIONS:
+            if frame.opcode in mcap_records.DEFINITIONS:
                 entry = frame.opcode, scanner.content(frame)
                 found[frame.offset >= summary_offset, frame.opcode].append(entry)
             elif frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.STATISTICS):
-                with suppress(UnreadableRecord):
-                    self._take(frame.opcode, parse_record(frame.opcode, scanner.content(frame)))
+                with suppress(mcap_records.UnreadableRecord):
+                    self._take(frame.opcode, mcap_records.parse_record(frame.opcode, scanner.content(frame)))
         if summary_offset == scanner.size:
             self.count = None
         self.definitions = [
-            entry for kind in DEFINITIONS for entry in found[True, kind] or found[False, kind]
+            entry for kind in mcap_records.DEFINITIONS for entry in found[True, kind] or found[False, kind]
         ]
         content |= scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == bytes([Opcode.CHUNK])
         self.why_empty = ""
@@ -258,7 +241,9 @@ class _Survey:
 class _FileCopy:
     """Copy of one file into another; of a number's definitions the first one holds."""
 
-    def __init__(self, scanner: RecordScanner, file: LogFile, survey: _Survey, result: Recovery) -> None:
+    def __init__(
+        self, scanner: mcap_records.RecordScanner, file: LogFile, survey: _Survey, result: Recovery
+    ) -> None:
         self._scanner, self._survey, self._result = scanner, survey, result
         by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
         self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
@@ -273,7 +258,7 @@ class _FileCopy:
         for opcode, content in survey.definitions:
             try:
                 self._define(opcode, content)
-            except UnreadableRecord as error:
+            except mcap_records.UnreadableRecord as error:
                 result.lose(f"a definition: {error}", len(content))
         for kind, number in sorted(self._defined):
             if kind == Opcode.CHANNEL:  # with or without messages
@@ -287,7 +272,7 @@ class _FileCopy:
             reported = self._report_damaged(reported)
             try:
                 self._take(frame)
-            except UnreadableRecord as error:
+            except mcap_records.UnreadableRecord as error:
                 self._result.lose(f"{frame.size} bytes at byte {frame.offset}: {error}", frame.size)
             if progress is not None:
                 progress(frame.end, scanner.size)
@@ -304,63 +289,63 @@ class _FileCopy:
                 self._result.lose(str(damage), damage.length)
         return len(self._scanner.damaged)
 
-    def _take(self, frame: RecordFrame) -> None:
+    def _take(self, frame: mcap_records.RecordFrame) -> None:
         """Copies one record of the file."""
         opcode = frame.opcode
-        if opcode == Opcode.HEADER or opcode in DEFINITIONS:
+        if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
             return
         content = self._scanner.content(frame)
         if opcode in _MADE_AGAIN:
             self._pass_over(frame, content)
         elif opcode == Opcode.CHUNK:
-            data = unpack_chunk(content)
-            for inner, begin, end in iterate_records(data):
+            data = mcap_records.unpack_chunk(content)
+            for inner, begin, end in mcap_records.iterate_records(data):
                 self._take_inner(inner, data[begin:end])
-        elif opcode == OP_MESSAGE:
+        elif opcode == mcap_records.OP_MESSAGE:
             self._take_inner(opcode, content)
         elif opcode == Opcode.METADATA:
-            entry = parse_record(opcode, content)
+            entry = mcap_records.parse_record(opcode, content)
             ours = self._accounts is not None
             if entry.name != RECOVERED and not (ours and entry.name in (ACCOUNTS, CHAIN)):
                 self._out.add_metadata(entry.name, entry.metadata)
         elif opcode == Opcode.ATTACHMENT:
-            one = parse_record(opcode, content)
-            if not has_right_crc(content):
+            one = mcap_records.parse_record(opcode, content)
+            if not mcap_records.has_right_crc(content):
                 self._result.lose(f"attachment {one.name}: its CRC differs; it is kept as it is")
             self._out.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
         else:
-            raise UnreadableRecord(f"a record of kind {opcode} is unknown here")
+            raise mcap_records.UnreadableRecord(f"a record of kind {opcode} is unknown here")
 
-    def _pass_over(self, frame: RecordFrame, content: bytes) -> None:
+    def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Leaves out what is made again; raises if it is something else whose kind was damaged."""
         if frame.opcode == Opcode.DATA_END and len(content) == 4:
             self._data_end = frame.offset
         elif frame.opcode == Opcode.MESSAGE_INDEX:
             size = int.from_bytes(content[2:6], "little")
             if size != len(content) - 6 or size % 16:
-                raise UnreadableRecord("a record (message index) is none")
+                raise mcap_records.UnreadableRecord("a record (message index) is none")
         elif frame.offset < self._data_end:
-            raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
+            raise mcap_records.UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
     def _take_inner(self, opcode: int, content: bytes) -> None:
         """Takes a record of a chunk, or a message outside of chunks."""
-        if opcode in DEFINITIONS:
+        if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
-        elif opcode == OP_MESSAGE:
-            if len(content) < MESSAGE_HEAD.size:
-                raise UnreadableRecord("a message is too short")
-            number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
+        elif opcode == mcap_records.OP_MESSAGE:
+            if len(content) < mcap_records.MESSAGE_HEAD.size:
+                raise mcap_records.UnreadableRecord("a message is too short")
+            number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
             new = self._new_channels.get(number) or self._open_channel(number)
             if new is None:
                 self._unnamed[number] += 1
                 return
-            payload = content[MESSAGE_HEAD.size :]
+            payload = content[mcap_records.MESSAGE_HEAD.size :]
             self._out.add_message(new[0], log_ns, payload, publish_ns, sequence)
             if self._accounts is not None:
                 self._accounts.take(new[1], sequence, payload)
 
     def _define(self, opcode: int, content: bytes) -> None:
-        entry = parse_record(opcode, content)
+        entry = mcap_records.parse_record(opcode, content)
         if self._defined.setdefault((opcode, entry.id), entry) != entry:
             self._contradicted.add(entry.id)
 
@@ -382,7 +367,7 @@ class _FileCopy:
             self._accounts.open(known.topic)
         return channel, known.topic
 
-    def _take_torn(self, torn: Damage) -> None:
+    def _take_torn(self, torn: mcap_records.Damage) -> None:
         """Saves what can be saved of the end that was cut off."""
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
         if not torn.length or opcode in _MADE_AGAIN or torn.offset > self._data_end:
@@ -391,8 +376,10 @@ class _FileCopy:
             self._result.lose(str(torn), torn.length)
             return
         before = self._out.messages
-        content = self._scanner.read(torn.offset + RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
-        with suppress(UnreadableRecord):  # what follows makes no sense, and is lost with the rest
+        content = self._scanner.read(torn.offset + mcap_records.RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
+        with suppress(
+            mcap_records.UnreadableRecord
+        ):  # what follows makes no sense, and is lost with the rest
             for entry in _salvage_records(content):
                 self._take_inner(*entry)
         self._result.salvaged = self._out.messages - before
@@ -440,14 +427,16 @@ class _FileCopy:
 
 def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
     """Yields the complete records of a chunk's content that was cut off: opcode and content."""
-    limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
+    limit = max(mcap_records.MAX_UNPACKED_BYTES, mcap_records.MAX_UNPACKED_RATIO * len(content))
     waiting = bytearray()
     for piece in _unpack_pieces(content):
         waiting += piece
         limit -= len(piece)
         done = 0
-        with suppress(UnreadableRecord):  # the rest of the last record comes with the next pieces
-            for opcode, begin, end in iterate_records(waiting):
+        with suppress(
+            mcap_records.UnreadableRecord
+        ):  # the rest of the last record comes with the next pieces
+            for opcode, begin, end in mcap_records.iterate_records(waiting):
                 if not opcode:
                     return
                 yield opcode, bytes(waiting[begin:end])
@@ -459,12 +448,12 @@ def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _unpack_pieces(content: bytes) -> Iterator[bytes]:
     """Yields what is left of a chunk's records, unpacked, up to where the data make no sense."""
-    name_offset = COMPRESSION_NAME_OFFSET + 4
-    letters = int.from_bytes(content[COMPRESSION_NAME_OFFSET:name_offset], "little")
+    name_offset = mcap_records.COMPRESSION_NAME_OFFSET + 4
+    letters = int.from_bytes(content[mcap_records.COMPRESSION_NAME_OFFSET : name_offset], "little")
     data = BytesIO(content[name_offset + letters + 8 :])
     openers: dict[bytes, Callable[[BytesIO], Any]] = {
         b"": lambda data: data,
-        b"zstd": zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).stream_reader,
+        b"zstd": zstandard.ZstdDecompressor(max_window_size=mcap_records.MAX_WINDOW_BYTES).stream_reader,
         b"lz4": lz4.frame.open,
     }
     opener = openers.get(content[name_offset : name_offset + letters])

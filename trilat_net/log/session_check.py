@@ -18,18 +18,8 @@ from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
-from ..net import topics
+from ..net import messages, topics
 from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
-from ..net.messages import (
-    READABLE,
-    SENT_TIME_SINCE,
-    VERSION,
-    Event,
-    LinkStats,
-    RecorderStats,
-    State,
-    json_schema,
-)
 from ..net.wire import decode
 from ..results import Result
 from ..scenario import Scenario, parse_embedded
@@ -232,7 +222,10 @@ class ChannelCheck:
             return f"is {channel.encoding} with {channel.schema_encoding}, not msgpack with jsonschema"
         if channel.schema != (name := f"trilat.{kind.__name__}.v{self._version}"):
             return f"has the schema {channel.schema}, not {name}"
-        if self._version == VERSION and channel.schema_data != json.dumps(json_schema(kind)).encode():
+        if (
+            self._version == messages.VERSION
+            and channel.schema_data != json.dumps(messages.json_schema(kind)).encode()
+        ):
             return f"the schema {channel.schema} is not what it was released as"
         if self.kind == topics.STATE and rate != str(self.rate_hz):
             return f"says {rate} Hz, the scenario {self.rate_hz}"
@@ -242,7 +235,7 @@ class ChannelCheck:
         """Checks a message; `offset` is its place, or that of its chunk."""
         kind: Any = CHANNEL_TYPES[self.kind]
         try:
-            message = decode(stored.payload, kind, READABLE, self._layout)
+            message = decode(stored.payload, kind, messages.READABLE, self._layout)
         except WireError as error:
             self._add("schema", offset, str(error))
             return
@@ -252,7 +245,7 @@ class ChannelCheck:
             self._add("schema", offset, text)
         if identity.member != self.member:
             self._add("schema", offset, f"a message says that it is of {identity.member[:40]!r}")
-        if isinstance(message, State) and (skipped := count_skipped_ticks(message.cmd)):
+        if isinstance(message, messages.State) and (skipped := count_skipped_ticks(message.cmd)):
             self.skips[message.boot].append((message.tick, skipped))
         if identity.number >= 0:  # events have numbers from version 3 on
             self._check_number(stored, identity, offset)
@@ -261,15 +254,17 @@ class ChannelCheck:
     def _add(self, check: str, offset: int | None, text: str) -> None:
         self._problems[check].add(self._file, offset, f"{self.name}: {text}")
 
-    def _identify(self, message: State | LinkStats | Event | RecorderStats) -> MessageIdentity:
+    def _identify(
+        self, message: messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
+    ) -> MessageIdentity:
         match message:
-            case State():
-                sent_ns = message.sent_ns if message.v >= SENT_TIME_SINCE else message.t_ns
+            case messages.State():
+                sent_ns = message.sent_ns if message.v >= messages.SENT_TIME_SINCE else message.t_ns
                 return MessageIdentity(message.site, message.boot, message.tick, message.tick, sent_ns)
-            case LinkStats():
+            case messages.LinkStats():
                 number = number_message(self.kind, message.tick, self.rate_hz)
                 return MessageIdentity(message.site, message.boot, number, message.tick, message.t_ns)
-            case Event():
+            case messages.Event():
                 stated = {"end": self.ends, "join": self.joins}.get(message.kind, {})
                 if message.boot in stated or len(stated) < MAX_BOOTS:
                     stated[message.boot] = message.ticks

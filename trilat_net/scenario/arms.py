@@ -29,20 +29,10 @@ from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, Vector
 from ..errors import ScenarioError
-from .fields import (
-    Frozen,
-    Joints,
-    KeyProblem,
-    NotNegative,
-    NotNegativeJoints,
-    Positive,
-    Real,
-    VectorCounts,
-    field_names,
-)
+from . import fields
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
-Three = Annotated[tuple[Real, ...], Meta(min_length=3, max_length=3)]
+Three = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
 TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
 STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
@@ -60,7 +50,7 @@ _SLIDING = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 """Units of a joint that slides instead of those of one that turns."""
 
 
-class Arm(Frozen, frozen=True):
+class Arm(fields.Frozen, frozen=True):
     """An arm: a chain of joints from a URDF, or the two links of a planar arm.
 
     The defaults of the planar arm are the paper's, as point masses at the link ends. The keys of one kind of
@@ -86,15 +76,15 @@ class Arm(Frozen, frozen=True):
         stops: true: joint limits of the file are springs that an arm may run into.
     """
 
-    l1_m: Positive = 1.0
-    m1_kg: Positive = 1.0
-    lc1_m: NotNegative = 1.0
-    I1_kg_m2: NotNegative = 0.0
-    l2_m: Positive = 1.0
-    m2_kg: Positive = 1.0
-    lc2_m: Positive = 1.0
-    I2_kg_m2: NotNegative = 0.0
-    g_m_s2: NotNegative = 9.81
+    l1_m: fields.Positive = 1.0
+    m1_kg: fields.Positive = 1.0
+    lc1_m: fields.NotNegative = 1.0
+    I1_kg_m2: fields.NotNegative = 0.0
+    l2_m: fields.Positive = 1.0
+    m2_kg: fields.Positive = 1.0
+    lc2_m: fields.Positive = 1.0
+    I2_kg_m2: fields.NotNegative = 0.0
+    g_m_s2: fields.NotNegative = 9.81
     known: bool = True
     dead_man: bool = False
     urdf: str = ""
@@ -103,10 +93,10 @@ class Arm(Frozen, frozen=True):
     base: str = ""
     tip: str = ""
     down: Three = (0.0, 0.0, -1.0)
-    payload_kg: NotNegative = 0.0
+    payload_kg: fields.NotNegative = 0.0
     payload_com_m: Three = (0.0, 0.0, 0.0)
-    payload_inertia_kg_m2: Annotated[tuple[Real, ...], Meta(min_length=6, max_length=6)] = (0.0,) * 6
-    armature_kg_m2: NotNegativeJoints = (0.0,)
+    payload_inertia_kg_m2: Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length=6)] = (0.0,) * 6
+    armature_kg_m2: fields.NotNegativeJoints = (0.0,)
     stops: bool = True
 
     @property
@@ -122,11 +112,11 @@ class Arm(Frozen, frozen=True):
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
 """The keys of an arm that place it in space."""
-CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
+CHAIN_KEYS = fields.field_names(Arm)[fields.field_names(Arm).index("base") :]
 """The keys of an arm that only a chain has."""
 
 
-class Task(Frozen, frozen=True, omit_defaults=True):
+class Task(fields.Frozen, frozen=True, omit_defaults=True):
     """What sites agree on: their joint angles, or their end effectors' places or poses.
 
     Attributes:
@@ -141,29 +131,29 @@ class Task(Frozen, frozen=True, omit_defaults=True):
 
     space: Literal["joints", "position", "pose"] = "joints"
     axes: tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...] = ()
-    scale: Positive = 1.0
-    posture_rad: Joints = ()
-    posture_rate_1_s: NotNegative = 0.0
-    singular_value: Positive = 0.05
+    scale: fields.Positive = 1.0
+    posture_rad: fields.Joints = ()
+    posture_rate_1_s: fields.NotNegative = 0.0
+    singular_value: fields.Positive = 0.05
 
     @property
     def shared(self) -> int:
         """How many coordinates the sites share; 0: as many as there are joints."""
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
-    def find_idle_key(self, written: Mapping[str, object]) -> KeyProblem | None:
+    def find_idle_key(self, written: Mapping[str, object]) -> fields.KeyProblem | None:
         """Returns a key of the written table that has no effect, or None."""
         if not self.shared:
             key = next((key for key in written if key != "space"), None)
             problem = "has no effect while sites share joint angles: set task.space to 'position' or 'pose'"
-            return None if key is None else KeyProblem(key, problem)
+            return None if key is None else fields.KeyProblem(key, problem)
         foreign = [axis for axis in self.axes if axis not in TASK_AXES[: self.shared]]
         if foreign:
-            return KeyProblem(
+            return fields.KeyProblem(
                 "axes", f"has {foreign[0]}, which belongs to a pose, and task.space is 'position'"
             )
         if self.posture_rad and not self.posture_rate_1_s:
-            return KeyProblem("posture_rad", "has no effect while posture_rate_1_s is 0")
+            return fields.KeyProblem("posture_rad", "has no effect while posture_rate_1_s is 0")
         return None
 
     @property
@@ -191,7 +181,7 @@ class ArmModel(NamedTuple):
     """
 
     theta: Array
-    counts: VectorCounts
+    counts: fields.VectorCounts
     joint_names: tuple[str, ...]
     link_names: tuple[str, ...]
     efforts: tuple[float, ...]
@@ -288,7 +278,7 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
         )
     names, bodies_moved, none = ("q1", "q2"), ("link1", "link2"), (math.inf, math.inf)
     if not chains:
-        return ArmModel(theta, VectorCounts(), names, bodies_moved, none, none, (arm.l1_m, arm.l2_m))
+        return ArmModel(theta, fields.VectorCounts(), names, bodies_moved, none, none, (arm.l1_m, arm.l2_m))
     links = ((arm.m1_kg, arm.lc1_m, arm.I1_kg_m2), (arm.m2_kg, arm.lc2_m, arm.I2_kg_m2))
     bodies = [
         (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own) for m, c, own in links
@@ -297,7 +287,7 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
     joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, arm.l1_m))
     joints, gravity = _place_base(arm, joints, (0.0, -arm.g_m_s2, 0.0))
     chain = ChainSetup(joints, gravity, (arm.l2_m, 0.0, 0.0), task=task.setup)
-    counts = VectorCounts.of_chain(2, task.shared)
+    counts = fields.VectorCounts.of_chain(2, task.shared)
     return ArmModel(np.concatenate(bodies), counts, names, bodies_moved, none, none, (0.0, 0.0), chain)
 
 
@@ -370,7 +360,7 @@ def _chain_model(arm: Arm, task: Task, read: UrdfChain) -> ArmModel:
     joints, gravity = _place_base(arm, joints, (size * x, size * y, size * z))
     return ArmModel(
         theta=np.concatenate([joint.inertia for joint in read.joints]),
-        counts=VectorCounts.of_chain(len(joints), task.shared),
+        counts=fields.VectorCounts.of_chain(len(joints), task.shared),
         joint_names=tuple(joint.name for joint in read.joints),
         link_names=tuple(joint.link for joint in read.joints),
         efforts=tuple(joint.effort_limit for joint in read.joints),

@@ -13,33 +13,13 @@ from ..core.control import ROBUST_RESIDUE
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from . import fields, plugged_laws
 from .energy_laws import EnergyTanks, PassivityControl, WaveVariables
-from .fields import (
-    MAX_QUANTITY,
-    Frozen,
-    NotNegative,
-    NotNegativeCoordinates,
-    NotNegativeJoints,
-    NotNegativeParameters,
-    Parameters,
-    PositiveCoordinates,
-    PositiveJoints,
-)
 from .imported_law import ImportedLaw
 from .law_conditions import LawSituation, StabilityCondition, judge_position_exchange
-from .plugged_laws import (
-    Authority,
-    FourChannels,
-    Impedances,
-    SaturatedPositions,
-    SixChannels,
-    SmithPredicted,
-    Synchronised,
-    UnknownLengths,
-)
 
 
-class AdaptiveGains(Frozen, frozen=True):
+class AdaptiveGains(fields.Frozen, frozen=True):
     """The gains of the adaptive laws.
 
     Attributes:
@@ -50,11 +30,11 @@ class AdaptiveGains(Frozen, frozen=True):
         theta_hat0: first estimate of theta, Eq. (24).
     """
 
-    Lambda: PositiveCoordinates = (1.0,)
-    Kp: PositiveJoints = (1.0,)
-    Kd: NotNegativeCoordinates = (3.0,)
-    Gamma: NotNegativeParameters = (1.0,)
-    theta_hat0: Parameters = (0.0,)
+    Lambda: fields.PositiveCoordinates = (1.0,)
+    Kp: fields.PositiveJoints = (1.0,)
+    Kd: fields.NotNegativeCoordinates = (3.0,)
+    Gamma: fields.NotNegativeParameters = (1.0,)
+    theta_hat0: fields.Parameters = (0.0,)
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core, for an arm of parameters theta."""
@@ -84,8 +64,8 @@ class AdaptiveBox(AdaptiveGains, frozen=True, tag_field="law", tag="adaptive_box
         theta_high: upper bound.
     """
 
-    theta_low: Parameters = (-MAX_QUANTITY,)
-    theta_high: Parameters = (MAX_QUANTITY,)
+    theta_low: fields.Parameters = (-fields.MAX_QUANTITY,)
+    theta_high: fields.Parameters = (fields.MAX_QUANTITY,)
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the core."""
@@ -116,9 +96,9 @@ class AdaptiveRobust(AdaptiveBox, frozen=True, tag_field="law", tag="adaptive_ro
         friction: share of the joints' own friction that the law knows, 0: nothing.
     """
 
-    rho_nm: NotNegativeJoints = (1.0,)
-    width_rad_s: PositiveJoints = (0.1,)
-    friction: NotNegative = 0.0
+    rho_nm: fields.NotNegativeJoints = (1.0,)
+    width_rad_s: fields.PositiveJoints = (0.1,)
+    friction: fields.NotNegative = 0.0
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the core."""
@@ -139,7 +119,7 @@ class AdaptiveRobust(AdaptiveBox, frozen=True, tag_field="law", tag="adaptive_ro
         )
 
 
-class KnownGravity(Frozen, frozen=True):
+class KnownGravity(fields.Frozen, frozen=True):
     """A law of known gravity; a subclass has the key `gravity`, and some of K, Kd, d and k_f."""
 
     def gains(self, theta: Array) -> Gains:
@@ -162,9 +142,9 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveCoordinates = (10.0,)
-    d: NotNegativeJoints = (3.0,)
-    gravity: NotNegative = 1.0
+    K: fields.PositiveCoordinates = (10.0,)
+    d: fields.NotNegativeJoints = (3.0,)
+    gravity: fields.NotNegative = 1.0
 
 
 class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", tag="pd_d"):
@@ -179,10 +159,10 @@ class ProportionalDerivativeDamped(KnownGravity, frozen=True, tag_field="law", t
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveCoordinates = (10.0,)
-    Kd: NotNegativeCoordinates = (3.0,)
-    d: NotNegativeJoints = (5.0,)
-    gravity: NotNegative = 1.0
+    K: fields.PositiveCoordinates = (10.0,)
+    Kd: fields.NotNegativeCoordinates = (3.0,)
+    d: fields.NotNegativeJoints = (5.0,)
+    gravity: fields.NotNegative = 1.0
 
 
 class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
@@ -200,13 +180,13 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: NotNegativeCoordinates = (0.0,)
-    d: NotNegativeJoints = (5.0,)
-    k_f: NotNegativeCoordinates = (0.0,)
-    gravity: NotNegative = 1.0
+    K: fields.NotNegativeCoordinates = (0.0,)
+    d: fields.NotNegativeJoints = (5.0,)
+    k_f: fields.NotNegativeCoordinates = (0.0,)
+    gravity: fields.NotNegative = 1.0
 
 
-class LeeSpong(Frozen, frozen=True, tag_field="law", tag="lee_spong"):
+class LeeSpong(fields.Frozen, frozen=True, tag_field="law", tag="lee_spong"):
     """PD+d under its published bound: d = K T_max + P_e for delays up to T_max.
 
     Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22, 2006.
@@ -219,11 +199,11 @@ class LeeSpong(Frozen, frozen=True, tag_field="law", tag="lee_spong"):
         gravity: share of gravity that it knows, 1: exactly.
     """
 
-    K: PositiveCoordinates = (10.0,)
-    Kd: NotNegativeCoordinates = (3.0,)
-    T_max_ms: NotNegative = 200.0
-    P_e: NotNegativeJoints = (0.0,)
-    gravity: NotNegative = 1.0
+    K: fields.PositiveCoordinates = (10.0,)
+    Kd: fields.NotNegativeCoordinates = (3.0,)
+    T_max_ms: fields.NotNegative = 200.0
+    P_e: fields.NotNegativeJoints = (0.0,)
+    gravity: fields.NotNegative = 1.0
 
     @property
     def damping(self) -> tuple[float, ...]:
@@ -244,14 +224,14 @@ class LeeSpong(Frozen, frozen=True, tag_field="law", tag="lee_spong"):
 
 KnownGravityLaw = ProportionalDamped | ProportionalDerivativeDamped | ForceReflecting | LeeSpong
 PluggedLaws = (
-    FourChannels
-    | SixChannels
-    | SaturatedPositions
-    | Authority
-    | Synchronised
-    | UnknownLengths
-    | Impedances
-    | SmithPredicted
+    plugged_laws.FourChannels
+    | plugged_laws.SixChannels
+    | plugged_laws.SaturatedPositions
+    | plugged_laws.Authority
+    | plugged_laws.Synchronised
+    | plugged_laws.UnknownLengths
+    | plugged_laws.Impedances
+    | plugged_laws.SmithPredicted
 )
 EnergyLaws = WaveVariables | PassivityControl | EnergyTanks
 ControlLaw = (
@@ -264,5 +244,5 @@ def identify_law(law: Any) -> str:
     return law.code if isinstance(law, ImportedLaw) else str(law.__struct_config__.tag)
 
 
-LAWS: dict[str, type[Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
+LAWS: dict[str, type[fields.Frozen]] = {str(law.__struct_config__.tag): law for law in get_args(ControlLaw)}
 """The laws by name."""

@@ -18,32 +18,14 @@ from ..core.chain import MAX_JOINTS
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.live_hand import HandRules
 from ..errors import ScenarioError
+from . import fields
 from .distributions import Draws
-from .fields import (
-    MAX_QUANTITY,
-    Frozen,
-    Joints,
-    NotNegative,
-    NotNegativeAxes,
-    NotNegativeJoints,
-    Point,
-    Positive,
-    Real,
-    StructType,
-    TomlTable,
-    VectorCounts,
-    check_choice,
-    check_keys,
-    expand_vectors,
-    field_names,
-    find_count_problem,
-)
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
-RecordedPoint = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
+RecordedPoint = Annotated[tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
 
 
-class ActorBase(Frozen, frozen=True, tag_field="kind"):
+class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     """An operator or an environment."""
 
     def _source(self) -> TorqueSource:
@@ -64,9 +46,9 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
         peak_nm: its peak on each joint, N m.
     """
 
-    start_s: NotNegative
-    end_s: Positive
-    peak_nm: Joints
+    start_s: fields.NotNegative
+    end_s: fields.Positive
+    peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
@@ -87,14 +69,14 @@ class JointSpring(ActorBase, frozen=True, tag="spring"):
         sampled: true: evaluated once a tick and held.
     """
 
-    to_rad: Joints
-    from_rad: Joints
-    stiffness_nm_rad: NotNegativeJoints
-    damping_nm_s_rad: NotNegativeJoints = (0.0,)
-    move_start_s: NotNegative = 0.0
-    move_end_s: NotNegative = 0.0
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    to_rad: fields.Joints
+    from_rad: fields.Joints
+    stiffness_nm_rad: fields.NotNegativeJoints
+    damping_nm_s_rad: fields.NotNegativeJoints = (0.0,)
+    move_start_s: fields.NotNegative = 0.0
+    move_end_s: fields.NotNegative = 0.0
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
@@ -112,14 +94,14 @@ class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
         move_start_s: as of `JointSpring`, like those that follow.
     """
 
-    to_m: Point
-    from_m: Point
-    stiffness_n_m: NotNegativeAxes
-    damping_n_s_m: NotNegativeAxes = (0.0,)
-    move_start_s: NotNegative = 0.0
-    move_end_s: NotNegative = 0.0
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    to_m: fields.Point
+    from_m: fields.Point
+    stiffness_n_m: fields.NotNegativeAxes
+    damping_n_s_m: fields.NotNegativeAxes = (0.0,)
+    move_start_s: fields.NotNegative = 0.0
+    move_end_s: fields.NotNegative = 0.0
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
@@ -158,12 +140,12 @@ class Chirp(ActorBase, frozen=True, tag="chirp"):
         end_s: when it ends.
     """
 
-    peak_nm: Joints
+    peak_nm: fields.Joints
     from_hz: Frequency
     to_hz: Frequency
-    sweep_s: Positive
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    sweep_s: fields.Positive
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
 
     def _source(self) -> TorqueSource:
         sweep = (self.start_s, self.start_s + self.sweep_s)
@@ -185,11 +167,11 @@ class Multisine(ActorBase, frozen=True, tag="multisine"):
         end_s: when it ends.
     """
 
-    amplitude_nm: Joints
+    amplitude_nm: fields.Joints
     frequencies_hz: Annotated[tuple[Frequency, ...], Meta(min_length=1, max_length=64)]
-    phases_rad: Annotated[tuple[Real, ...], Meta(max_length=64)] = ()
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
 
     def _source(self) -> TorqueSource:
         count = len(self.frequencies_hz)
@@ -220,16 +202,16 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """
 
     mode: Literal["tip", "joint", "force"] = "tip"
-    stiffness_n_m: NotNegativeAxes = (300.0,)
-    damping_n_s_m: NotNegativeAxes = (20.0,)
-    force_limit_n: Positive = 40.0
-    speed_limit_m_s: Positive = 1.5
-    stiffness_nm_rad: NotNegativeJoints = (40.0,)
-    damping_nm_s_rad: NotNegativeJoints = (3.0,)
-    torque_limit_nm: Positive = 20.0
-    speed_limit_rad_s: Positive = 4.0
+    stiffness_n_m: fields.NotNegativeAxes = (300.0,)
+    damping_n_s_m: fields.NotNegativeAxes = (20.0,)
+    force_limit_n: fields.Positive = 40.0
+    speed_limit_m_s: fields.Positive = 1.5
+    stiffness_nm_rad: fields.NotNegativeJoints = (40.0,)
+    damping_nm_s_rad: fields.NotNegativeJoints = (3.0,)
+    torque_limit_nm: fields.Positive = 20.0
+    speed_limit_rad_s: fields.Positive = 4.0
 
-    def rules(self, rate_hz: int, counts: VectorCounts) -> HandRules:
+    def rules(self, rate_hz: int, counts: fields.VectorCounts) -> HandRules:
         """Returns what somebody who holds an arm of such vectors may do."""
         if self.mode == "joint":
             return HandRules(counts.joints, rate_hz, self.speed_limit_rad_s)
@@ -267,9 +249,9 @@ class ViscousEnvironment(ActorBase, frozen=True, tag="viscous"):
         sampled: true: evaluated once a tick and held.
     """
 
-    damping_nm_s_rad: NotNegativeJoints
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    damping_nm_s_rad: fields.NotNegativeJoints
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
@@ -291,12 +273,12 @@ class Wall(ActorBase, frozen=True, tag="wall"):
         sampled: true: evaluated once a tick and held, as a digital haptic wall is.
     """
 
-    point_m: Point
-    normal: Point
-    stiffness_n_m: NotNegative
-    damping_n_s_m: NotNegative = 0.0
-    start_s: NotNegative = 0.0
-    end_s: Positive = MAX_QUANTITY
+    point_m: fields.Point
+    normal: fields.Point
+    stiffness_n_m: fields.NotNegative
+    damping_n_s_m: fields.NotNegative = 0.0
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
     sampled: bool = False
 
     def _source(self) -> TorqueSource:
@@ -315,8 +297,12 @@ def _sum_squares(vector: tuple[float, ...]) -> float:
 
 Operator = Pulse | JointSpring | EndEffectorSpring | RecordedTorque | Chirp | Multisine | LiveHand
 Environment = ViscousEnvironment | Wall
-OPERATORS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Operator)}
-ENVIRONMENTS: dict[str, type[Frozen]] = {str(one.__struct_config__.tag): one for one in get_args(Environment)}
+OPERATORS: dict[str, type[fields.Frozen]] = {
+    str(one.__struct_config__.tag): one for one in get_args(Operator)
+}
+ENVIRONMENTS: dict[str, type[fields.Frozen]] = {
+    str(one.__struct_config__.tag): one for one in get_args(Environment)
+}
 """The operators and the environments by the name of their kind."""
 
 _TIME = "a time of at least 0 s"
@@ -371,18 +357,18 @@ class Holding(NamedTuple):
         end_effector_m: returns the end effector's place in that pose.
     """
 
-    counts: VectorCounts
+    counts: fields.VectorCounts
     q0_rad: Any
     end_effector_m: Callable[[], list[float]]
 
 
 def resolve_operators(
     written: Any,
-    kinds: Mapping[str, type[Frozen]],
+    kinds: Mapping[str, type[fields.Frozen]],
     holding: Holding,
     path: str,
     draws: Draws,
-) -> list[TomlTable]:
+) -> list[fields.TomlTable]:
     """Returns a site's operators or environments, complete, of the kinds that it may hold.
 
     Errors call the list `path`; `draws` gives the numbers of distributions.
@@ -393,13 +379,13 @@ def resolve_operators(
 
 
 def _resolve_actor(
-    entry: Any, kinds: Mapping[str, type[Frozen]], holding: Holding, path: str, draws: Draws
-) -> TomlTable:
+    entry: Any, kinds: Mapping[str, type[fields.Frozen]], holding: Holding, path: str, draws: Draws
+) -> fields.TomlTable:
     if not isinstance(entry, dict):
         raise ScenarioError("must be a table", path=path)
     kind = _check_kind(entry, kinds, path)
-    check_keys(entry, ("kind", *field_names(kinds[kind])), path)
-    table = draws.draw_numbers(expand_vectors(entry, kinds[kind], holding.counts), path)
+    fields.check_keys(entry, ("kind", *fields.field_names(kinds[kind])), path)
+    table = draws.draw_numbers(fields.expand_vectors(entry, kinds[kind], holding.counts), path)
     if kind == "live":
         _keep_live_keys(table, entry, path)
     if kind == "spring":
@@ -412,10 +398,10 @@ def _resolve_actor(
     return table
 
 
-def _keep_live_keys(table: TomlTable, entry: TomlTable, path: str) -> None:
+def _keep_live_keys(table: fields.TomlTable, entry: fields.TomlTable, path: str) -> None:
     """Leaves out of a live hand what another mode has; refuses what the author wrote of that."""
     mode = entry.get("mode", "tip")
-    check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
+    fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
     for key in [key for key in table if key not in ("kind", "mode", *LIVE_KEYS[mode])]:
         if key in entry:
             which = next(name for name, keys in LIVE_KEYS.items() if key in keys)
@@ -427,7 +413,7 @@ def _keep_live_keys(table: TomlTable, entry: TomlTable, path: str) -> None:
         del table[key]
 
 
-def _check_kind(entry: TomlTable, kinds: Mapping[str, StructType], path: str) -> str:
+def _check_kind(entry: fields.TomlTable, kinds: Mapping[str, fields.StructType], path: str) -> str:
     """Returns the kind of an actor; refuses one in the wrong list with the name of the right one."""
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
@@ -435,15 +421,19 @@ def _check_kind(entry: TomlTable, kinds: Mapping[str, StructType], path: str) ->
     for group, others in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
         if isinstance(kind, str) and kind in others and kind not in kinds:
             raise ScenarioError(f"is {kind!r}, which belongs in {group}", path=f"{path}.kind")
-    check_choice(kind, list(kinds), f"{path}.kind")
+    fields.check_choice(kind, list(kinds), f"{path}.kind")
     return str(kind)
 
 
 def _check_values(
-    table: TomlTable, kind: StructType, entry: TomlTable, path: str, counts: VectorCounts
+    table: fields.TomlTable,
+    kind: fields.StructType,
+    entry: fields.TomlTable,
+    path: str,
+    counts: fields.VectorCounts,
 ) -> None:
     """Refuses a wrong or a missing value, with the values that its key takes."""
-    words = {name: both[counts != VectorCounts()] for name, both in _IN_WORDS.items()}
+    words = {name: both[counts != fields.VectorCounts()] for name, both in _IN_WORDS.items()}
 
     def describe_values(key: str) -> str:
         return (_WORDS.get(key) or _WORDS[f"{table['kind']}.{key}"]).format(**words)
@@ -468,9 +458,9 @@ def _check_values(
         raise ScenarioError(f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}") from None
 
 
-def _check_lengths(table: TomlTable, kind: StructType, counts: VectorCounts) -> None:
+def _check_lengths(table: fields.TomlTable, kind: fields.StructType, counts: fields.VectorCounts) -> None:
     """Raises `msgspec.ValidationError` for a vector, or a row of a table, that does not fit the arm."""
-    if found := find_count_problem(table, kind, counts):
+    if found := fields.find_count_problem(table, kind, counts):
         raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
     for n, row in enumerate(table.get("points", ())):
         if len(row) != 1 + counts.joints:

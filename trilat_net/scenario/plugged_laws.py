@@ -17,16 +17,7 @@ from ..core.laws.smith_predictor import SmithPredictor
 from ..core.laws.synchronisation import Synchronisation
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
-from .fields import (
-    Joints,
-    NotNegative,
-    NotNegativeJoints,
-    NotNegativeParameters,
-    Parameters,
-    Positive,
-    PositiveJoints,
-    Share,
-)
+from . import fields
 from .imported_law import PluggedLaw
 from .law_conditions import LawSituation, StabilityCondition, judge_position_exchange
 from .linear_form import LinearForm, LinearSituation
@@ -60,12 +51,12 @@ class FourChannels(PluggedLaw, frozen=True, tag_field="law", tag="four_channel")
 
     core_class = FourChannel
 
-    K: PositiveJoints = (100.0,)
-    B: NotNegativeJoints = (20.0,)
-    force_peer: Joints = (1.0,)
-    force_own: Joints = (0.0,)
-    acceleration: Share = 0.0
-    gravity: NotNegative = 1.0
+    K: fields.PositiveJoints = (100.0,)
+    B: fields.NotNegativeJoints = (20.0,)
+    force_peer: fields.Joints = (1.0,)
+    force_own: fields.Joints = (0.0,)
+    acceleration: fields.Share = 0.0
+    gravity: fields.NotNegative = 1.0
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the same law as one of known gravity, which has neither qdd nor the arm's own torque."""
@@ -128,10 +119,10 @@ class SaturatedPositions(PluggedLaw, frozen=True, tag_field="law", tag="saturate
     core_class = SaturatedPd
     linear_note = "saturated_pd has the slope K of small errors: where sites disagree at rest it pulls less"
 
-    K: PositiveJoints = (10.0,)
-    P: PositiveJoints = (5.0,)
-    d: NotNegativeJoints = (3.0,)
-    gravity: NotNegative = 1.0
+    K: fields.PositiveJoints = (10.0,)
+    P: fields.PositiveJoints = (5.0,)
+    d: fields.NotNegativeJoints = (3.0,)
+    gravity: fields.NotNegative = 1.0
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns P+d, with the stiffness of small errors."""
@@ -169,10 +160,10 @@ class Authority(PluggedLaw, frozen=True, tag_field="law", tag="authority"):
 
     core_class = SharedAuthority
 
-    K: PositiveJoints = (10.0,)
-    d: NotNegativeJoints = (3.0,)
+    K: fields.PositiveJoints = (10.0,)
+    d: fields.NotNegativeJoints = (3.0,)
     leads: bool = True
-    gravity: NotNegative = 1.0
+    gravity: fields.NotNegative = 1.0
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns its damping and its gravity."""
@@ -213,10 +204,10 @@ class Synchronised(PluggedLaw, frozen=True, tag_field="law", tag="sync"):
 
     core_class = Synchronisation
 
-    Lambda: PositiveJoints = (1.0,)
-    K: PositiveJoints = (3.0,)
-    Gamma: NotNegativeParameters = (1.0,)
-    theta_hat0: Parameters = (0.0,)
+    Lambda: fields.PositiveJoints = (1.0,)
+    K: fields.PositiveJoints = (3.0,)
+    Gamma: fields.NotNegativeParameters = (1.0,)
+    theta_hat0: fields.Parameters = (0.0,)
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
         """Returns the adaptive law whose r is that of the absolute pose."""
@@ -254,15 +245,15 @@ class UnknownLengths(PluggedLaw, frozen=True, tag_field="law", tag="adaptive_kin
 
     core_class = AdaptiveJacobian
 
-    Lambda: PositiveJoints = (1.0,)
-    Kp: PositiveJoints = (1.0,)
-    Kd: PositiveJoints = (3.0,)
-    Gamma: NotNegativeParameters = (1.0,)
-    theta_hat0: Parameters = (0.0,)
-    length_gain_m_n: NotNegative = 0.01
-    lengths0_m: PositiveJoints = (1.0,)
-    least_m: Positive = 0.2
-    most_m: Positive = 3.0
+    Lambda: fields.PositiveJoints = (1.0,)
+    Kp: fields.PositiveJoints = (1.0,)
+    Kd: fields.PositiveJoints = (3.0,)
+    Gamma: fields.NotNegativeParameters = (1.0,)
+    theta_hat0: fields.Parameters = (0.0,)
+    length_gain_m_n: fields.NotNegative = 0.01
+    lengths0_m: fields.PositiveJoints = (1.0,)
+    least_m: fields.Positive = 0.2
+    most_m: fields.Positive = 3.0
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the premises: constant delays, elbows that stay bent, lengths within their bounds."""
@@ -290,9 +281,9 @@ class Impedances(PluggedLaw, frozen=True, tag_field="law", tag="impedance"):
 
     core_class = ImpedanceControl
 
-    M: PositiveJoints = (1.0,)
-    B: NotNegativeJoints = (10.0,)
-    K: PositiveJoints = (50.0,)
+    M: fields.PositiveJoints = (1.0,)
+    B: fields.NotNegativeJoints = (10.0,)
+    K: fields.PositiveJoints = (50.0,)
     follows: bool = False
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -369,11 +360,11 @@ class SmithPredicted(PluggedLaw, frozen=True, tag_field="law", tag="smith"):
 
     core_class = SmithPredictor
 
-    K: PositiveJoints = (10.0,)
-    d: NotNegativeJoints = (3.0,)
-    inertia: PositiveJoints = (1.0,)
+    K: fields.PositiveJoints = (10.0,)
+    d: fields.NotNegativeJoints = (3.0,)
+    inertia: fields.PositiveJoints = (1.0,)
     predicts: bool = False
-    gravity: NotNegative = 1.0
+    gravity: fields.NotNegative = 1.0
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns its damping and its gravity; of the slave, which is P+d, its stiffness too."""

@@ -17,21 +17,10 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
-from ..core import dominance
+from ..core import dominance, site_setup
 from ..core.chain import MAX_JOINTS
 from ..core.law_channel import LawChannel
 from ..core.philox import link_key
-from ..core.site_setup import (
-    Gains,
-    Layout,
-    LinkSetup,
-    MotionLimits,
-    RestGains,
-    Scheme,
-    SiteSetup,
-    StaleAction,
-    StaleRule,
-)
 from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
@@ -73,14 +62,16 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     on_lost: Literal["hold", "degrade"] = "hold"
 
     @property
-    def rule(self) -> StaleRule:
+    def rule(self) -> site_setup.StaleRule:
         """The rule as the core has it."""
         if self.action == "glide":
             silence_ns = round(self.silence_ms * 1e6)
             limits = self.align_speed_rad_s, self.align_limit_rad
-            return StaleRule(StaleAction.GLIDE, silence_ns, 1, *limits, self.on_lost == "degrade")
-        return StaleRule(
-            StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
+            return site_setup.StaleRule(
+                site_setup.StaleAction.GLIDE, silence_ns, 1, *limits, self.on_lost == "degrade"
+            )
+        return site_setup.StaleRule(
+            site_setup.StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
         )
 
 
@@ -115,9 +106,9 @@ class Limits(Frozen, frozen=True):
     q_max_rad: Real | Joints | None = None
 
     @property
-    def motion(self) -> MotionLimits:
+    def motion(self) -> site_setup.MotionLimits:
         """Those that the core has besides the first two."""
-        return MotionLimits(
+        return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
             q_max=math.inf if self.q_max_rad is None else self.q_max_rad,
             qd_des_limit=math.inf if self.qd_des_limit_rad_s is None else self.qd_des_limit_rad_s,
@@ -375,21 +366,21 @@ class Scenario(Frozen, frozen=True, dict=True):
     def channel(self, site: str) -> LawChannel:
         """Returns what the law of a site sends to its peers."""
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        return build_channel(sends, Layout.of_arm(self.arms[site].chain), len(self.names) - 1)
+        return build_channel(sends, site_setup.Layout.of_arm(self.arms[site].chain), len(self.names) - 1)
 
-    def layout(self, site: str) -> Layout:
+    def layout(self, site: str) -> site_setup.Layout:
         """Returns how many numbers the vectors of a site have."""
         live = find_live_hand(self.sites[site].hands)
         actors = () if live is None else (live.actor,)
-        return Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
+        return site_setup.Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
 
-    def setup(self, site: str) -> SiteSetup:
+    def setup(self, site: str) -> site_setup.SiteSetup:
         """Returns all that the core needs to build a site."""
         spec, arm = self.sites[site], self.arms[site]
-        return SiteSetup(
+        return site_setup.SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
-            scheme=Scheme[self.scheme.upper()],
+            scheme=site_setup.Scheme[self.scheme.upper()],
             gains=self.gains(site),
             theta=arm.theta,
             g_m_s2=spec.arm.g_m_s2,
@@ -414,11 +405,11 @@ class Scenario(Frozen, frozen=True, dict=True):
             chain=arm.chain,
             channel=self.channel(site),
             limits=spec.limits.motion,
-            rest=self._rest_gains(site) if spec.on_stale.action == "glide" else RestGains(),
+            rest=self._rest_gains(site) if spec.on_stale.action == "glide" else site_setup.RestGains(),
             bit=1 << self.names.index(site),
         )
 
-    def gains(self, site: str) -> Gains:
+    def gains(self, site: str) -> site_setup.Gains:
         """Returns the gains of a site's law; under the rule `glide` its estimates are in a box."""
         spec, arm = self.sites[site], self.arms[site]
         gains = spec.control.gains(arm.theta)
@@ -426,7 +417,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             return gains
         return add_credible_box(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
-    def _rest_gains(self, site: str) -> RestGains:
+    def _rest_gains(self, site: str) -> site_setup.RestGains:
         spec, arm = self.sites[site], self.arms[site]
         control = spec.control
         gains = control.linear_gains(arm.theta) if isinstance(control, PluggedLaw) else None
@@ -435,11 +426,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         limit, known = spec.limits.tau_limit_nm, spec.arm.known
         return find_rest_gains(arm, spec.q0_rad, own, limit, spec.rate_hz, known=known)
 
-    def _link_setup(self, peer: str, site: str) -> LinkSetup:
+    def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
         name = f"{peer}->{site}"
         first = self.links[name]
         models: list[tuple[int, LinkBase]] = [(0, first), *scheduled_links(self.timeline, name)]
-        return LinkSetup(
+        return site_setup.LinkSetup(
             peer=peer,
             alpha=self.dominance[site].get(peer, 0.0),
             rate_hz=self.sites[peer].rate_hz,

@@ -19,6 +19,7 @@ from ..core.dominance import is_irreducible
 from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
 from ..errors import ScenarioError
 from ..files import find_page
+from . import operators
 from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
@@ -27,16 +28,6 @@ from .expect import find_expect_problem
 from .fields import TomlTable, reword_problem
 from .imported_law import ImportedLaw, PluggedLaw
 from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
-from .operators import (
-    EndEffectorSpring,
-    Environment,
-    JointSpring,
-    LiveHand,
-    Multisine,
-    Operator,
-    RecordedTorque,
-    Wall,
-)
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 from .sent_vectors import check_sends
 
@@ -376,22 +367,28 @@ def _check_task_poses(scenario: Scenario) -> None:
             )
 
 
-def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
+def _check_actors(actors: Sequence[operators.Operator | operators.Environment], path: str) -> None:
     """Refuses actors that end before they begin, walls without a side, and recorded torque out of order."""
     for n, actor in enumerate(actors):
         key, problem = "", ""
-        if isinstance(actor, LiveHand):
+        if isinstance(actor, operators.LiveHand):
             continue
-        if isinstance(actor, RecordedTorque):
+        if isinstance(actor, operators.RecordedTorque):
             if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
                 key, problem = "points", "must be in the order of their times"
         elif actor.end_s <= actor.start_s:
             key, problem = "end_s", f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}"
-        elif isinstance(actor, Multisine) and len(actor.phases_rad) not in (0, len(actor.frequencies_hz)):
+        elif isinstance(actor, operators.Multisine) and len(actor.phases_rad) not in (
+            0,
+            len(actor.frequencies_hz),
+        ):
             key, problem = "phases_rad", f"must be {len(actor.frequencies_hz)} angles, as many as frequencies"
-        elif isinstance(actor, Wall) and math.hypot(*actor.normal) < 1e-6:
+        elif isinstance(actor, operators.Wall) and math.hypot(*actor.normal) < 1e-6:
             key, problem = "normal", "must point somewhere, is zero"
-        elif isinstance(actor, JointSpring | EndEffectorSpring) and actor.move_end_s < actor.move_start_s:
+        elif (
+            isinstance(actor, operators.JointSpring | operators.EndEffectorSpring)
+            and actor.move_end_s < actor.move_start_s
+        ):
             start_s, end_s = actor.move_start_s, actor.move_end_s
             key, problem = "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
         if problem:
@@ -400,7 +397,7 @@ def _check_actors(actors: Sequence[Operator | Environment], path: str) -> None:
 
 def _check_live_hands(site: SiteSpec, path: str) -> None:
     """Refuses a second live hand of an arm, and one of an arm that is outside of the program."""
-    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, LiveHand)]
+    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, operators.LiveHand)]
     if live and site.plant == "external":
         raise ScenarioError(
             "is a live hand, and the arm is outside of the program: who holds that arm is measured "

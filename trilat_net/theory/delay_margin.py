@@ -19,13 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-from .characteristic_roots import (
-    Complex,
-    Pencil,
-    compute_delay_spectrum,
-    find_moving_part,
-    limit_blas_threads,
-)
+from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
@@ -136,7 +130,7 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
     """Returns the number of roots to the right of the imaginary axis, with conjugates and multiplicities."""
     wanted = 8
     while True:
-        roots = compute_delay_spectrum(loop, wanted).roots
+        roots = characteristic_roots.compute_delay_spectrum(loop, wanted).roots
         right = [root for root in roots if root.s.real > 0.0]
         if len(right) < len(roots) or len(roots) < wanted:
             return sum(root.multiplicity * (2 if root.s.imag else 1) for root in right)
@@ -145,10 +139,10 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 def find_axis_crossings(loop: LinearLoop) -> list[AxisCrossing]:
     """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`."""
-    pencil = find_moving_part(set_common_delay(loop, 1.0)).pencil
+    pencil = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0)).pencil
     if not len(pencil.delays):
         return []
-    with limit_blas_threads():
+    with characteristic_roots.limit_blas_threads():
         sweep = _FrequencySweep(pencil)
         grid = sweep.grid()
         crossings = []
@@ -176,11 +170,11 @@ def _merge(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
 class _FrequencySweep:
     """The eigenvalues of G(j w) over frequency."""
 
-    def __init__(self, pencil: Pencil) -> None:
+    def __init__(self, pencil: characteristic_roots.Pencil) -> None:
         self._A, self._delayed, self._rates = pencil.A, pencil.delayed_states, pencil.rates
         self._Ad = pencil.Ad[0][:, self._delayed]
         self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))
-        self._modes: Complex = np.concatenate(
+        self._modes: characteristic_roots.Complex = np.concatenate(
             [np.linalg.eigvals(pencil.A), np.linalg.eigvals(pencil.A + pencil.Ad[0])]
         ).astype(np.complex128)
 
@@ -193,7 +187,7 @@ class _FrequencySweep:
         kept: Array = both[(both >= even[0]) & (both <= even[-1])]
         return kept
 
-    def eigenvalues(self, omega: Array) -> Complex:
+    def eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
         """Returns the eigenvalues of G(j w), shape (K, c)."""
         inner = 1j * omega[:, np.newaxis, np.newaxis] * self._rates - self._A
         G = np.linalg.solve(inner, np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape)))

@@ -21,14 +21,8 @@ from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.imported_law import ImportedLaw
 from ..scenario.operators import Chirp, Multisine
+from . import linear_loop
 from .characteristic_roots import limit_blas_threads
-from .linear_loop import (
-    LinearLoop,
-    find_loop_states,
-    find_references,
-    gather_site_arguments,
-    linearise_loop,
-)
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
@@ -130,14 +124,14 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
 
     The derivatives of the angles are zero.
     """
-    x = gather_site_arguments(conditions, rest)
+    x = linear_loop.gather_site_arguments(conditions, rest)
     states = [np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate]) for one in conditions.rates(x)]
     return _select_loop_states(conditions, states)
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
     """Returns what is in the loop of all states of every site, one site after the other."""
-    masks = find_loop_states(conditions)
+    masks = linear_loop.find_loop_states(conditions)
     return np.concatenate([own[mask] for own, mask in zip(states, masks, strict=True)])
 
 
@@ -155,7 +149,7 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
-        loop = linearise_loop(conditions, rest, every_estimate=True)
+        loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
         effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
         # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
         free = [n for n, name in enumerate(loop.names) if not _is_speed(name) and np.any(effects[n])]
@@ -181,7 +175,7 @@ def _is_speed(state: str) -> bool:
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
-    masks = find_loop_states(conditions)
+    masks = linear_loop.find_loop_states(conditions)
     parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
     q, theta_hat = np.array(rest.q), np.array(rest.theta_hat)
     for n, (site, mask, part) in enumerate(zip(conditions.sites, masks, parts, strict=True)):
@@ -201,7 +195,7 @@ def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    for site, x in zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True):
+    for site, x in zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True):
         arm = place_arm(site, x[lay_out_arguments(site).q])
         if not follow_peers(site, arm, x).least > SINGULAR:
             raise ScenarioError(
@@ -235,14 +229,16 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
             at = lay_out_arguments(site)
             moved.append(np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]]))
         deviation = _select_loop_states(conditions, moved)
-        kept = _project_on_zero_roots(linearise_loop(conditions, rest, every_estimate=True), deviation)
+        kept = _project_on_zero_roots(
+            linear_loop.linearise_loop(conditions, rest, every_estimate=True), deviation
+        )
         if kept is None:
             break
         rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))
     return rest._replace(how="predicted from the start poses: what the linear loop keeps of its start")
 
 
-def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
+def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
     """Returns the part of a constant deviation that stays; None if roots at zero have too few vectors."""
     left, values, right = np.linalg.svd(loop.static_matrix)
     count = int(np.sum(values <= _FLAT * values[0]))
@@ -336,7 +332,7 @@ def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: 
     """Returns an equilibrium with what laws of one's own remember after so many ticks at its pose."""
     theta_hat = rest.theta_hat.copy()
     for n, (site, x) in enumerate(
-        zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True)
+        zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)
     ):
         if isinstance(site.own, NumericLaw):
             theta_hat[n, : len(site.own.memory)] = site.own.settle(x, ticks)
@@ -398,7 +394,7 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
     alike = conditions._replace(alpha=np.full((count, count), 1.0 / count))
-    return tuple(find_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
+    return tuple(linear_loop.find_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
@@ -434,7 +430,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
             f"the pose is no equilibrium: accelerations or rates of {rest.residual:.2g} remain, and the "
             "roots are those of equations frozen at it"
         )
-    x = gather_site_arguments(conditions, rest)
+    x = linear_loop.gather_site_arguments(conditions, rest)
     for site, own in zip(conditions.sites, x, strict=True):
         least = follow_peers(site, place_arm(site, own[lay_out_arguments(site).q]), own).least ** 0.5
         task = None if site.chain is None else site.chain.task

@@ -23,18 +23,9 @@ from scipy.linalg import block_diag, qr
 from ..core.vectors import Array
 from ..scenario import Scenario
 from ..scenario.linear_form import LinearForm, Place
+from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
-from .site_dynamics import (
-    COMPLEX_STEP,
-    ArgumentLayout,
-    SiteRates,
-    differentiate_site_rates,
-    evaluate_site_rates,
-    has_estimate,
-    lay_out_arguments,
-    share_own_pose,
-)
 from .textbook_task import PLACE_COORDINATES, evaluate_reference
 
 _DEPENDENT = 1e-9
@@ -51,8 +42,8 @@ class SiteJacobian(NamedTuple):
         left_out: number of estimates that no small motion moves or shows.
     """
 
-    at: ArgumentLayout
-    rates: SiteRates
+    at: site_dynamics.ArgumentLayout
+    rates: site_dynamics.SiteRates
     states: tuple[str, ...]
     left_out: int = 0
 
@@ -126,17 +117,17 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     """Returns the arguments of every site's rates at an equilibrium, shape (arguments,) each."""
     arguments = []
     for site, q, theta_hat in zip(conditions.sites, rest.q, rest.theta_hat, strict=True):
-        at = lay_out_arguments(site)
+        at = site_dynamics.lay_out_arguments(site)
         x = np.zeros(at.arguments)
         x[at.q], x[at.estimate] = q[: at.joints], theta_hat[: at.parameters]
         arguments.append(x)
     for x, site, x_des in zip(arguments, conditions.sites, find_references(conditions, rest), strict=True):
-        x[lay_out_arguments(site).q_des] = x_des
+        x[site_dynamics.lay_out_arguments(site).q_des] = x_des
     reflected = [one.reflected for one in conditions.rates(arguments)]
     for x, site, felt in zip(arguments, conditions.sites, conditions.alpha @ reflected, strict=True):
-        x[lay_out_arguments(site).peer_torque] = felt
+        x[site_dynamics.lay_out_arguments(site).peer_torque] = felt
     for i, (x, site) in enumerate(zip(arguments, conditions.sites, strict=True)):
-        at, others = lay_out_arguments(site), [j for j in range(len(arguments)) if j != i]
+        at, others = site_dynamics.lay_out_arguments(site), [j for j in range(len(arguments)) if j != i]
         for place in range(at.peers):
             j, rest_qd = others[place], np.zeros(at.coordinates)
             x[at.of_peer(place)] = np.r_[rest.q[j][: at.coordinates], rest_qd, -reflected[j]]
@@ -146,7 +137,7 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 def _share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Returns what each site shares of its pose at an equilibrium."""
     return [
-        share_own_pose(site, q[: site.layout.joints])
+        site_dynamics.share_own_pose(site, q[: site.layout.joints])
         for site, q in zip(conditions.sites, rest.q, strict=True)
     ]
 
@@ -179,8 +170,8 @@ def differentiate_references(
 def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) -> Array:
     """Returns the derivative of what site i follows by what j shares, by a complex step."""
     poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
-    poses[j] = poses[j] + 1j * COMPLEX_STEP * np.eye(len(shared[j]))
-    derivative: Array = evaluate_reference(row, poses[i], poses).imag / COMPLEX_STEP
+    poses[j] = poses[j] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[j]))
+    derivative: Array = evaluate_reference(row, poses[i], poses).imag / site_dynamics.COMPLEX_STEP
     return derivative
 
 
@@ -211,9 +202,9 @@ def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
     """Returns which states of every site are in the loop, shape (states,) each: estimates if it learns."""
     masks = []
     for site in conditions.sites:
-        at = lay_out_arguments(site)
+        at = site_dynamics.lay_out_arguments(site)
         mask = np.ones(at.states, dtype=bool)
-        mask[at.estimate] = has_estimate(site)
+        mask[at.estimate] = site_dynamics.has_estimate(site)
         masks.append(mask)
     return masks
 
@@ -228,11 +219,11 @@ def differentiate_rates(
     x, references = gather_site_arguments(conditions, rest), differentiate_references(conditions, rest)
     jacobians = []
     for i, (site, own) in enumerate(zip(conditions.sites, x, strict=True)):
-        at, rates = lay_out_arguments(site), differentiate_site_rates(site, own)
+        at, rates = site_dynamics.lay_out_arguments(site), site_dynamics.differentiate_site_rates(site, own)
         if conditions.has_forms:  # what such a law remembers holds the arm there
-            left = evaluate_site_rates(site, own).qdd
+            left = site_dynamics.evaluate_site_rates(site, own).qdd
             own[at.external_torque] -= np.linalg.solve(rates.qdd[:, at.external_torque], left)
-            rates = differentiate_site_rates(site, own)
+            rates = site_dynamics.differentiate_site_rates(site, own)
         if (i, i) in references:  # what it follows depends on its own orientation
             of_own = references[i, i] @ rates.x[:, : at.states]
             for by in rates:
@@ -240,7 +231,7 @@ def differentiate_rates(
         learnt = tuple(f"theta{p + 1}" for p in range(at.parameters))
         if isinstance(site.own, NumericLaw):
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *site.own.names))
-        elif not has_estimate(site):
+        elif not site_dynamics.has_estimate(site):
             jacobian = _replace_estimate(at, rates, np.zeros((0, at.parameters)), ())
         elif site.chain is None or every_estimate:
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))
@@ -265,7 +256,9 @@ def _find_independent_rows(matrix: Array) -> list[int]:
     return sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
 
 
-def _replace_estimate(at: ArgumentLayout, rates: SiteRates, T: Array, names: tuple[str, ...]) -> SiteJacobian:
+def _replace_estimate(
+    at: site_dynamics.ArgumentLayout, rates: site_dynamics.SiteRates, T: Array, names: tuple[str, ...]
+) -> SiteJacobian:
     """Returns a site's derivatives with the states z = T theta_hat, shape (m, P), in place of theta_hat.
 
     All effects of the estimate must be combinations of z.
@@ -276,7 +269,7 @@ def _replace_estimate(at: ArgumentLayout, rates: SiteRates, T: Array, names: tup
         """Returns derivatives by the new states."""
         return np.hstack([by[:, : at.estimate.start], by[:, at.estimate] @ shown, by[:, at.estimate.stop :]])
 
-    converted = SiteRates(*map(convert, rates))
+    converted = site_dynamics.SiteRates(*map(convert, rates))
     return SiteJacobian(
         at._replace(parameters=len(T)),
         converted._replace(estimate=T @ converted.estimate),

@@ -19,17 +19,8 @@ from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law
 from ..core.vectors import Array
 from ..scenario import Scenario
+from . import frequency_search, port_response
 from .characteristic_roots import compute_delay_spectrum
-from .frequency_search import (
-    HIGH_HZ,
-    LOW_HZ,
-    Minima,
-    build_frequency_grid,
-    cache_response,
-    find_minima,
-    find_resolved_hz,
-    refine_frequencies,
-)
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_passivity import (
@@ -40,23 +31,6 @@ from .port_passivity import (
     find_best_weights,
     llewellyn_parameter,
     llewellyn_rounding,
-)
-from .port_response import (
-    CLAMPED,
-    LoopOutput,
-    PoleAtZero,
-    PortResponse,
-    apply_loads,
-    build_admittance,
-    evaluate_transfer,
-    find_longest_delay_s,
-    find_pole_at_zero,
-    find_site_ports,
-    group_ports_by_joint,
-    list_port_sites,
-    parse_port_site,
-    select_ports,
-    to_imaginary_axis,
 )
 from .port_transparency import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
 from .task_ports import list_followed_axes, name_ports, use_end_effector_ports
@@ -80,7 +54,7 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
     return use_end_effector_ports(frozen, rest, linearise_loop(frozen, rest))
 
 
-def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> LoopOutput | None:
+def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> port_response.LoopOutput | None:
     """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
 
     In task space it is J r, with places in q's stead. None if a site has another law than the paper's, which
@@ -95,7 +69,9 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> Loo
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
     for i, site in enumerate(conditions.sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
-        for row, joint in zip(find_site_ports(loop, site.name), list_followed_axes(site), strict=True):
+        for row, joint in zip(
+            port_response.find_site_ports(loop, site.name), list_followed_axes(site), strict=True
+        ):
             C[row, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
             for j in np.flatnonzero(conditions.alpha[i]):
                 if joint not in list_followed_axes(conditions.sites[j]):
@@ -103,7 +79,7 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> Loo
                 angle = loop.names.index(f"{conditions.sites[j].name}.q{joint}")
                 factor = Lambda[joint - 1] * conditions.alpha[i, j]
                 delayed[float(conditions.age_s[i, j])][row, angle] -= factor
-    return LoopOutput(C, tuple(sorted(delayed.items())))
+    return port_response.LoopOutput(C, tuple(sorted(delayed.items())))
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
@@ -128,7 +104,7 @@ class TwoPort(NamedTuple):
     sites: tuple[str, str]
     joint: int
     clamped: str
-    minima: Minima
+    minima: frequency_search.Minima
 
 
 class PortAnalysis(NamedTuple):
@@ -158,13 +134,13 @@ class PortAnalysis(NamedTuple):
     band_hz: tuple[float, float]
     resolved_hz: float
     verdict: str
-    pole: PoleAtZero
+    pole: port_response.PoleAtZero
     velocity: Passivity
     joints: dict[int, Passivity]
     proof: Passivity | None
     beta: Array
     estimates_true: bool
-    absolute: Minima
+    absolute: frequency_search.Minima
     two_ports: tuple[TwoPort, ...]
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
@@ -202,7 +178,7 @@ def analyse_ports(
     scenario: Scenario,
     rest: Equilibrium,
     of: str | None = None,
-    band_hz: tuple[float, float] = (LOW_HZ, HIGH_HZ),
+    band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
 ) -> PortAnalysis:
     """Returns the analysis of a scenario's ports at an equilibrium, over a band, Hz.
 
@@ -217,20 +193,20 @@ def analyse_ports(
     loop = linearise_teleoperator(conditions, rest)
     slaves = [name for name, site in scenario.sites.items() if site.role == "slave"]
     of = of or (*slaves, scenario.names[-1])[0]
-    sites, delay_s = list_port_sites(loop), find_longest_delay_s(loop)
-    Y = build_admittance(loop)
-    w_rad_s = refine_frequencies(Y, build_frequency_grid(*band_hz, delay_s))
-    Y = cache_response(Y, w_rad_s)
+    sites, delay_s = port_response.list_port_sites(loop), port_response.find_longest_delay_s(loop)
+    Y = port_response.build_admittance(loop)
+    w_rad_s = frequency_search.refine_frequencies(Y, frequency_search.build_frequency_grid(*band_hz, delay_s))
+    Y = frequency_search.cache_response(Y, w_rad_s)
     return PortAnalysis(
         scenario=scenario,
         band_hz=band_hz,
-        resolved_hz=find_resolved_hz(*band_hz, delay_s),
+        resolved_hz=frequency_search.find_resolved_hz(*band_hz, delay_s),
         verdict=compute_delay_spectrum(loop, 1).verdict,
-        pole=find_pole_at_zero(loop),
+        pole=port_response.find_pole_at_zero(loop),
         velocity=check_passivity(Y, w_rad_s),
         joints={
-            joint: check_passivity(select_ports(Y, places), w_rad_s)
-            for joint, places in group_ports_by_joint(loop).items()
+            joint: check_passivity(port_response.select_ports(Y, places), w_rad_s)
+            for joint, places in port_response.group_ports_by_joint(loop).items()
         },
         proof=_check_proof(conditions, loop, w_rad_s),
         beta=compute_proof_weights(conditions),
@@ -238,7 +214,7 @@ def analyse_ports(
             site.gains.law is Law.OWN or np.allclose(own[: len(site.theta)], site.theta)
             for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
         ),
-        absolute=find_minima(
+        absolute=frequency_search.find_minima(
             lambda w: find_best_weights(Y(w), _find_owners(loop)).margin,
             w_rad_s,
             tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
@@ -247,15 +223,19 @@ def analyse_ports(
         transparency=tuple(
             one for site in sites if site != of for one in measure_transparency(loop, site, of)
         ),
-        clamped_verdict=compute_delay_spectrum(apply_loads(loop, {of: CLAMPED}), 1).verdict,
+        clamped_verdict=compute_delay_spectrum(
+            port_response.apply_loads(loop, {of: port_response.CLAMPED}), 1
+        ).verdict,
         axes=name_ports(conditions),
     )
 
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
     """Returns the place of the site of each port among the sites of the ports."""
-    sites = list_port_sites(loop)
-    return np.array([sites.index(parse_port_site(port)) for port in loop.inputs], dtype=np.int64)
+    sites = port_response.list_port_sites(loop)
+    return np.array(
+        [sites.index(port_response.parse_port_site(port)) for port in loop.inputs], dtype=np.int64
+    )
 
 
 def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
@@ -263,24 +243,30 @@ def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Arr
     beta = compute_proof_weights(conditions)[_find_owners(loop)]
     if output is None or not (beta > 0.0).all():
         return None
-    return check_passivity(lambda w: evaluate_transfer(loop, to_imaginary_axis(w), output), w_rad_s, beta)
+    return check_passivity(
+        lambda w: port_response.evaluate_transfer(loop, port_response.to_imaginary_axis(w), output),
+        w_rad_s,
+        beta,
+    )
 
 
-def _check_two_ports(loop: LinearLoop, Y: PortResponse, w_rad_s: Array) -> tuple[TwoPort, ...]:
+def _check_two_ports(loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array) -> tuple[TwoPort, ...]:
     two_ports = []
-    for pair in combinations(list_port_sites(loop), 2):
-        others = [site for site in list_port_sites(loop) if site not in pair]
+    for pair in combinations(port_response.list_port_sites(loop), 2):
+        others = [site for site in port_response.list_port_sites(loop) if site not in pair]
         for clamped in ("", *others) if len(others) == 1 else ("",):
-            fixed = find_site_ports(loop, clamped) if clamped else []
-            for joint, places in group_ports_by_joint(loop).items():
-                keep = [port for port in places if parse_port_site(loop.inputs[port]) in pair]
+            fixed = port_response.find_site_ports(loop, clamped) if clamped else []
+            for joint, places in port_response.group_ports_by_joint(loop).items():
+                keep = [port for port in places if port_response.parse_port_site(loop.inputs[port]) in pair]
                 if len(keep) == len(pair):
                     two_ports.append(TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s)))
     return tuple(two_ports)
 
 
-def _check_llewellyn(Y: PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array) -> Minima:
-    return find_minima(
+def _check_llewellyn(
+    Y: port_response.PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array
+) -> frequency_search.Minima:
+    return frequency_search.find_minima(
         lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
         w_rad_s,
         level=1.0,
@@ -321,7 +307,7 @@ def _passivity_to_json(one: Passivity) -> dict[str, Any]:
     return {**_minima_to_json(one.minima), "lacking_nm_s_rad": finite_or_none(one.lacking_nm_s_rad)}
 
 
-def _minima_to_json(one: Minima) -> dict[str, Any]:
+def _minima_to_json(one: frequency_search.Minima) -> dict[str, Any]:
     return {
         "holds": not one.below,
         "least": one.least,

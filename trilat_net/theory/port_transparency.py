@@ -16,17 +16,9 @@ import numpy as np
 
 from ..core.vectors import Array
 from ..errors import UsageError
+from . import port_response
 from .characteristic_roots import Complex
 from .linear_loop import LinearLoop
-from .port_response import (
-    CLAMPED,
-    FREE,
-    PortLoad,
-    apply_loads,
-    build_admittance,
-    find_site_ports,
-    select_ports,
-)
 
 TRANSPARENCY_BAND_HZ = (0.1, 10.0)
 """The band of the means: below it operators drift, above it they do not move deliberately."""
@@ -96,7 +88,7 @@ def measure_transparency(
     loop: LinearLoop,
     at: str,
     of: str,
-    others: Mapping[str, PortLoad] | None = None,
+    others: Mapping[str, port_response.PortLoad] | None = None,
     band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ,
 ) -> tuple[Transparency, ...]:
     """Returns the transparency along each joint of site `at`, with site `of` free and clamped.
@@ -110,16 +102,18 @@ def measure_transparency(
     low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
     w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
-    places = find_site_ports(loop, at)
+    places = port_response.find_site_ports(loop, at)
     if at == of or at in (others or {}):
         raise UsageError(f"a load at {at} would be at the operator's own site")
 
-    def admittance(load: PortLoad) -> Complex:
+    def admittance(load: port_response.PortLoad) -> Complex:
         """Returns the admittance at the operator's site with a load at the other one."""
-        loaded = apply_loads(loop, {**(others or {}), of: load})
-        return select_ports(build_admittance(loaded), find_site_ports(loaded, at))(w_rad_s)
+        loaded = port_response.apply_loads(loop, {**(others or {}), of: load})
+        return port_response.select_ports(
+            port_response.build_admittance(loaded), port_response.find_site_ports(loaded, at)
+        )(w_rad_s)
 
-    free, clamped = admittance(FREE), admittance(CLAMPED)
+    free, clamped = admittance(port_response.FREE), admittance(port_response.CLAMPED)
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
         Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)

@@ -21,18 +21,7 @@ from scipy.linalg import block_diag, expm
 
 from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array
-from .characteristic_roots import (
-    Complex,
-    MovingPart,
-    Pencil,
-    Spectrum,
-    compute_delay_spectrum,
-    count_zero_roots,
-    extract_moving_part,
-    limit_blas_threads,
-    refine_roots,
-    sort_root_guesses,
-)
+from . import characteristic_roots
 from .linear_loop import SiteJacobian, couple_sites, differentiate_rates, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions
 
@@ -114,8 +103,8 @@ def find_common_rate_hz(conditions: OperatingConditions) -> int | None:
 
 
 def compute_sampled_spectrum(
-    conditions: OperatingConditions, rest: Equilibrium, near: Complex, wanted: int = 6
-) -> Spectrum | None:
+    conditions: OperatingConditions, rest: Equilibrium, near: characteristic_roots.Complex, wanted: int = 6
+) -> characteristic_roots.Spectrum | None:
     """Returns the rightmost roots s = ln(z) / h of the sampled loop; None if the sites have several rates.
 
     Also where a law has states or waves of its own, which is linearised in continuous time alone.
@@ -127,40 +116,44 @@ def compute_sampled_spectrum(
     pencil, names, constant = build_tick_pencil(conditions, rest)
     h_s = 1.0 / conditions.sites[0].rate_hz
 
-    def logarithms(matrix: Array) -> Complex:
+    def logarithms(matrix: Array) -> characteristic_roots.Complex:
         """Returns ln(z) / h of the eigenvalues that are not next to zero, 1/s."""
         z = np.linalg.eigvals(matrix).astype(np.complex128)
         return (np.log(z[np.abs(z) > 1e-8]) / h_s).astype(np.complex128)
 
-    with limit_blas_threads():
-        zeros, drifting = count_zero_roots(pencil)
+    with characteristic_roots.limit_blas_threads():
+        zeros, drifting = characteristic_roots.count_zero_roots(pencil)
         size = len(names) + int(pencil.delays.max(initial=0)) * len(pencil.delayed_states)
         if size <= MAX_COMPANION_SIZE:
-            guesses = sort_root_guesses(logarithms(build_companion_matrix(pencil)), zeros)
+            guesses = characteristic_roots.sort_root_guesses(
+                logarithms(build_companion_matrix(pencil)), zeros
+            )
             tries = wanted + 2
         else:
             guesses = np.concatenate(
                 [near, logarithms(pencil.A), logarithms(pencil.A + pencil.Ad.sum(axis=0))]
             )
-            guesses = sort_root_guesses(guesses[np.abs(guesses) > 1e-6], 0)
+            guesses = characteristic_roots.sort_root_guesses(guesses[np.abs(guesses) > 1e-6], 0)
             tries = len(guesses)
-        roots, dropped = refine_roots(pencil, guesses, names, wanted, tries, 2.0 * math.pi / h_s)
-    return Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
+        roots, dropped = characteristic_roots.refine_roots(
+            pencil, guesses, names, wanted, tries, 2.0 * math.pi / h_s
+        )
+    return characteristic_roots.Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
 
 
 def compute_decisive_spectrum(
     conditions: OperatingConditions, rest: Equilibrium, wanted: int, guesses: int
-) -> Spectrum:
+) -> characteristic_roots.Spectrum:
     """Returns the rightmost roots of the sampled loop; of the continuous one if there are several rates.
 
     The sampled ones are sought near `guesses` roots of the continuous loop.
     """
-    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), guesses)
+    continuous = characteristic_roots.compute_delay_spectrum(linearise_loop(conditions, rest), guesses)
     near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
     return compute_sampled_spectrum(conditions, rest, near, wanted) or continuous
 
 
-def build_companion_matrix(pencil: Pencil) -> Array:
+def build_companion_matrix(pencil: characteristic_roots.Pencil) -> Array:
     """Returns the matrix that carries the state, and the past of its delayed part, from tick to tick."""
     n, delayed = len(pencil.A), pencil.delayed_states
     depth, c = int(pencil.delays.max(initial=0)), len(delayed)
@@ -174,7 +167,7 @@ def build_companion_matrix(pencil: Pencil) -> Array:
     return whole
 
 
-def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> MovingPart:
+def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> characteristic_roots.MovingPart:
     """Returns the part of the sampled loop that moves; all sites must have one rate."""
     h_s = 1.0 / conditions.sites[0].rate_hz
     sites = differentiate_rates(conditions, rest)
@@ -189,5 +182,7 @@ def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> Mov
         S_d[at[i], at[j]] += maps[i].Q @ coupling @ maps[j].sent
     ticks = np.array(sorted(Sd), dtype=np.int64)
     delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
-    moving = extract_moving_part(Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names])
+    moving = characteristic_roots.extract_moving_part(
+        characteristic_roots.Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names]
+    )
     return moving._replace(constant=moving.constant + sum(one.left_out for one in sites))

@@ -147,7 +147,7 @@ def derive_site_energies(
             motion,
             energy_terms.evaluate_functional(motion),
             energy_terms.compute_dissipation(motion),
-            energy_terms.compute_transfer(motion),
+            energy_terms.compute_transfer(motion, np.array(common or 1.0)),
             energy_terms.compute_work(motion),
             energy_terms.compute_sampling_work(motion),
             np.logical_and.reduce(known),

@@ -344,7 +344,7 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     damping = ((r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right))
     found = {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
     if not all(site.common):
-        found["open axes"] = _compute_transfer(site, 1.0 - np.array(site.common))
+        found["open axes"] = compute_transfer(site, 1.0 - np.array(site.common))
     friction = [
         (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
         for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
@@ -352,13 +352,11 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     return {**found, "friction": _trapezoid(site, *friction)} if np.any(friction) else found
 
 
-def compute_transfer(site: SiteMotion) -> Increment:
-    """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that follow it."""
-    return _compute_transfer(site, np.array(site.common or 1.0))
+def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
+    """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that follow it.
 
-
-def _compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Returns the same along some axes alone: those of weight 1 and not of weight 0."""
+    That is along the axes of weight 1, and not along those of weight 0.
+    """
     c = site.constants._replace(Kd=axes * site.constants.Kd)
     own = 0.5 * _norm(c, site.records.shared_rate)
     left, right = own[:-1], own[1:]

@@ -23,19 +23,7 @@ from ...net.messages import Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..site_log import find_task_errors
-from .cdr import (
-    ENCODING,
-    FLOAT64_ARRAY,
-    JOINT_STATE,
-    LOG,
-    STRING,
-    TRANSFORMS,
-    ArrayDimension,
-    RosLogLevel,
-    make_float_array_packer,
-    pack_log,
-    pack_string,
-)
+from . import cdr
 from .robot_model import build_robot_model
 
 EVENTS, LINES = "events", "log"
@@ -56,22 +44,22 @@ class Ros2Channel(NamedTuple):
 
 
 SESSION_CHANNELS = {
-    EVENTS: Ros2Channel(STRING, {"content": "what happened, member first"}),
-    LINES: Ros2Channel(LOG, {"content": "the same as lines of a log"}),
+    EVENTS: Ros2Channel(cdr.STRING, {"content": "what happened, member first"}),
+    LINES: Ros2Channel(cdr.LOG, {"content": "the same as lines of a log"}),
 }
 ROBOT_CHANNELS = {
-    ROBOT: Ros2Channel(STRING, {"content": "URDF, with links named after their site"}),
-    FRAMES: Ros2Channel(TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
+    ROBOT: Ros2Channel(cdr.STRING, {"content": "URDF, with links named after their site"}),
+    FRAMES: Ros2Channel(cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
 }
 _LEVELS = {
-    "diverged": RosLogLevel.ERROR,
-    "failed": RosLogLevel.ERROR,
-    "lost": RosLogLevel.WARN,
-    "left": RosLogLevel.WARN,
-    "unheard": RosLogLevel.WARN,
-    "waiting": RosLogLevel.WARN,
-    "refused": RosLogLevel.WARN,
-    "clock fault": RosLogLevel.WARN,
+    "diverged": cdr.RosLogLevel.ERROR,
+    "failed": cdr.RosLogLevel.ERROR,
+    "lost": cdr.RosLogLevel.WARN,
+    "left": cdr.RosLogLevel.WARN,
+    "unheard": cdr.RosLogLevel.WARN,
+    "waiting": cdr.RosLogLevel.WARN,
+    "refused": cdr.RosLogLevel.WARN,
+    "clock fault": cdr.RosLogLevel.WARN,
 }
 _MODES = {mode.name.lower(): float(mode) for mode in Mode}
 
@@ -83,8 +71,11 @@ def mode_number(mode: str | Mode) -> float:
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
     """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below 0."""
-    yield EVENTS, pack_string(f"{event.member}: {event.text}")
-    yield LINES, pack_log(stamp_ns, _LEVELS.get(event.kind, RosLogLevel.INFO), event.member, event.text)
+    yield EVENTS, cdr.pack_string(f"{event.member}: {event.text}")
+    yield (
+        LINES,
+        cdr.pack_log(stamp_ns, _LEVELS.get(event.kind, cdr.RosLogLevel.INFO), event.member, event.text),
+    )
 
 
 class ArrayChannel:
@@ -92,14 +83,14 @@ class ArrayChannel:
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
         self.channel = Ros2Channel(
-            FLOAT64_ARRAY,
+            cdr.FLOAT64_ARRAY,
             {"content": content, "unit": unit, "names": "; ".join(" ".join(axis) for axis in axes)},
         )
         labels = [f"{content}: {' '.join(axis)}" if not n else " ".join(axis) for n, axis in enumerate(axes)]
         labels[-1] += f" ({unit})"
         self.size = math.prod(map(len, axes))
-        self.pack = make_float_array_packer(
-            *(ArrayDimension(*one) for one in zip(labels, map(len, axes), strict=True))
+        self.pack = cdr.make_float_array_packer(
+            *(cdr.ArrayDimension(*one) for one in zip(labels, map(len, axes), strict=True))
         )
 
 
@@ -159,7 +150,7 @@ class Ros2SiteChannels:
         """Returns a channel of joint states with these names."""
         units = ", ".join(map(self._unit, ("rad", "rad/s", "N m")[: 2 + effort]))
         return Ros2Channel(
-            JOINT_STATE, {"unit": units, "names": " ".join("_".join(n.split()) for n in names)}
+            cdr.JOINT_STATE, {"unit": units, "names": " ".join("_".join(n.split()) for n in names)}
         )
 
     def _unit(self, unit: str) -> str:
@@ -233,7 +224,7 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
     return {
         channel.topic: Ros2Channel(summary.schemas[channel.schema_id].name, dict(channel.metadata))
         for channel in sorted(summary.channels.values(), key=lambda channel: channel.id)
-        if channel.message_encoding == ENCODING and channel.schema_id in summary.schemas
+        if channel.message_encoding == cdr.ENCODING and channel.schema_id in summary.schemas
     }
 
 

@@ -18,19 +18,8 @@ from ...net import topics
 from ...net.messages import Event, LinkStats
 from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
+from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
-from .ros2_messages import (
-    FRAMES,
-    ROBOT,
-    ROBOT_CHANNELS,
-    SESSION_CHANNELS,
-    Record,
-    Ros2Channel,
-    Ros2SiteChannels,
-    SignalRow,
-    pack_event,
-    stack_signals,
-)
 
 VIZ_HZ = 100.0
 """Messages a second by default, of the joints and their error."""
@@ -48,7 +37,7 @@ PutMessage = Callable[[str, bytes, int, int], None]
 """Writes one message: topic, bytes, publish time and log time, Unix ns."""
 TakeMessage = Callable[[Any, int], None]
 """Takes one message of the log's own, and its log time, Unix ns."""
-StampedRow = tuple[int, SignalRow]
+StampedRow = tuple[int, ros2_messages.SignalRow]
 """A stamp, Unix ns, and its signals."""
 
 _tick = attrgetter("tick")
@@ -60,7 +49,7 @@ class _BucketOutput:
     `write` takes stamp, signals and log time.
     """
 
-    def __init__(self, write: Callable[[int, SignalRow, int], None]) -> None:
+    def __init__(self, write: Callable[[int, ros2_messages.SignalRow, int], None]) -> None:
         self._write = write
         self._waiting: Sequence[StampedRow] = ()
 
@@ -92,7 +81,7 @@ class _SiteBuckets:
     ) -> None:
         self._rate_hz = rate_hz = scenario.sites[site].rate_hz
         self._put, self._epoch_unix_ns = put, epoch_ns
-        self._shapes = shapes = Ros2SiteChannels(scenario, site)
+        self._shapes = shapes = ros2_messages.Ros2SiteChannels(scenario, site)
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
         joints, sent = len(shapes.joints), scenario.channel(site).floats
@@ -100,23 +89,25 @@ class _SiteBuckets:
         self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
         arrays = {name: array for name, array in shapes.arrays.items() if name not in shapes.task}
         self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in arrays}
-        self.channels: dict[str, Ros2Channel] = {
+        self.channels: dict[str, ros2_messages.Ros2Channel] = {
             self._states_topic: shapes.joint_states(names),
             **{self._topics[name]: array.channel for name, array in arrays.items()},
         }
         if shapes.robot is not None:
-            self._topics |= {name: f"{VIZ_ROOT}{site}/{name}" for name in ROBOT_CHANNELS}
-            self.channels |= {self._topics[name]: channel for name, channel in ROBOT_CHANNELS.items()}
+            self._topics |= {name: f"{VIZ_ROOT}{site}/{name}" for name in ros2_messages.ROBOT_CHANNELS}
+            self.channels |= {
+                self._topics[name]: channel for name, channel in ros2_messages.ROBOT_CHANNELS.items()
+            }
         self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
         self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
         self._fast, self._slow = _BucketOutput(self._write_fast), _BucketOutput(self._write_slow)
         self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
-        self._open: list[Record] = []
+        self._open: list[ros2_messages.Record] = []
         self._slow_open: list[StampedRow] = []
-        self._late: list[Record] = []
+        self._late: list[ros2_messages.Record] = []
 
-    def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
+    def _write_fast(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
         """Writes the joint states, the angles of the reference as joints of their own; and the error."""
         none, n = self._none, len(self._none)
         velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : 4 * n], *none]
@@ -128,14 +119,14 @@ class _SiteBuckets:
         if robot is not None:
             if not self._described:
                 self._described = True
-                self._put(self._topics[ROBOT], pack_string(robot.description), stamp_ns, log_ns)
-            self._put(self._topics[FRAMES], robot.pack(stamp_ns, row[:n]), stamp_ns, log_ns)
+                self._put(self._topics[ros2_messages.ROBOT], pack_string(robot.description), stamp_ns, log_ns)
+            self._put(self._topics[ros2_messages.FRAMES], robot.pack(stamp_ns, row[:n]), stamp_ns, log_ns)
 
-    def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
+    def _write_slow(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
         for name, data in self._shapes.slow(row):
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
-    def record(self, message: Record, log_ns: int) -> None:
+    def record(self, message: ros2_messages.Record, log_ns: int) -> None:
         """Takes the record of one tick."""
         tick = message.tick
         if tick < self._first:  # its bucket is closed: with others of that bucket it waits for the next close
@@ -188,14 +179,14 @@ class _SiteBuckets:
             self._slow.add_late([(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows], log_ns)
             self._late = []
 
-    def _decimate(self, records: list[Record]) -> list[StampedRow]:
+    def _decimate(self, records: list[ros2_messages.Record]) -> list[StampedRow]:
         """Returns the extremes of a bucket: two rows, or one of a single record."""
         records.sort(key=_tick)  # they nearly always are
         stamps_ns = [
             max(0, self._epoch_unix_ns + record.tick * NS_PER_S // self._rate_hz)
             for record in (records[0], records[len(records) // 2])
         ]
-        return _stamp_extremes(stamps_ns[: len(records)], stack_signals(records))
+        return _stamp_extremes(stamps_ns[: len(records)], ros2_messages.stack_signals(records))
 
 
 def parse_viz_rate(text: str) -> float:
@@ -214,7 +205,7 @@ def parse_viz_rate(text: str) -> float:
     return rate_hz
 
 
-def _stamp_extremes(stamps_ns: Sequence[int], columns: Iterable[SignalRow]) -> list[StampedRow]:
+def _stamp_extremes(stamps_ns: Sequence[int], columns: Iterable[ros2_messages.SignalRow]) -> list[StampedRow]:
     """Returns the extremes of columns at the first and the middle of their stamps; a single row as it is."""
     chosen = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])[: len(stamps_ns)]
     return list(zip(chosen, decimate_min_max(columns)))  # noqa: B905 - of a single row both are the same
@@ -239,7 +230,9 @@ class VizChannels:
         self, scenario: Scenario, session: str, epoch_unix_ns: int, views_hz: float, put: PutMessage
     ) -> None:
         self._epoch_unix_ns, self._put = epoch_unix_ns, put
-        self.channels = {f"{VIZ_ROOT}{name}": channel for name, channel in SESSION_CHANNELS.items()}
+        self.channels = {
+            f"{VIZ_ROOT}{name}": channel for name, channel in ros2_messages.SESSION_CHANNELS.items()
+        }
         self.takers: dict[str, TakeMessage] = {
             topics.key(session, member, topics.EVENT): self._event
             for member in (*scenario.names, topics.RECORDER)
@@ -255,7 +248,7 @@ class VizChannels:
     def _event(self, event: Event, log_ns: int) -> None:
         """Writes an event with its time of arrival: events sent at once may arrive in another order."""
         stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
-        for name, data in pack_event(event, stamp_ns):
+        for name, data in ros2_messages.pack_event(event, stamp_ns):
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
@@ -269,7 +262,7 @@ class VizChannels:
         return sum(buckets.most_pending_bytes for buckets in self._buckets)
 
 
-def decimate_min_max(columns: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
+def decimate_min_max(columns: Iterable[ros2_messages.SignalRow]) -> tuple[list[float], list[float]]:
     """Returns the smallest and the largest number of each column, the one that came first in the first list.
 
     Each column has one finite number at least, in the order in which they came.

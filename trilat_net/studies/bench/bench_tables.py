@@ -82,15 +82,11 @@ def tabulate_verdicts(results: BenchResults) -> TextTable:
     return TextTable(("stable runs of all, not stable", *tasks), rows, align="lr")
 
 
-def choose_links(results: BenchResults) -> list[str]:
-    """Returns the links of a table for people."""
-    links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
-    return [link for link in links if link in _SHOWN_LINKS] if len(links) > len(_SHOWN_LINKS) else links
-
-
 def tabulate_quantity(results: BenchResults, asked: BenchQuantity) -> TextTable:
     """Returns a row per law and a column per link: means over seeds; marks say what is not stable."""
-    links = choose_links(results)
+    links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
+    if len(links) > len(_SHOWN_LINKS):
+        links = [link for link in links if link in _SHOWN_LINKS]
     rows = []
     for law, form in list_laws(results):
         cells = []

@@ -19,26 +19,14 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.law_consent import list_imported_laws
 from ...scenario.scenario_reader import read_source
+from .. import executor
 from ..commands import format_command
-from ..executor import Progress, WorkerPool, Workers, ignore_progress, open_worker_pool
 from ..run_journal import RunJournal
-from . import cell_result
+from . import cell_result, sweep_results
 from .cell_result import CellClass
 from .sweep_cell import CellRun, SweepSource, run_cell
 from .sweep_folder import SweepFolder, build_resume_hint
 from .sweep_plan import SweepPlan
-from .sweep_results import (
-    GRID_POINTS_FILE,
-    GridPoint,
-    ResultRow,
-    SweepResults,
-    build_result_rows,
-    collect_grid_points,
-    encode_grid_points,
-    encode_results,
-    reproduction_duration_s,
-    require_polars,
-)
 
 MAX_RUNS = 1_000_000
 MAX_SWEEP_S = 86_400.0
@@ -69,7 +57,7 @@ class SweepSpeed(NamedTuple):
 class FinishedSweep(NamedTuple):
     """A finished sweep, and the speed of what was run this time."""
 
-    results: SweepResults
+    results: sweep_results.SweepResults
     folder: SweepFolder
     speed: SweepSpeed
 
@@ -129,9 +117,9 @@ def format_wall_time(seconds: float) -> str:
 def run_sweep(
     folder: SweepFolder,
     jobs: int | None = None,
-    progress: Progress = ignore_progress,
+    progress: executor.Progress = executor.ignore_progress,
     known: Iterable[CellRun] = (),
-    on: Workers = None,
+    on: executor.Workers = None,
 ) -> FinishedSweep:
     """Runs what is left of a sweep, writes its results, and returns them.
 
@@ -147,7 +135,7 @@ def run_sweep(
         RunFailed: a cell ended its workers, or the cluster is gone. What is done is kept.
         UsageError: polars is not installed.
     """
-    require_polars()
+    sweep_results.require_polars()
     plan = folder.plan
     clock = SystemClock()
     with folder.journal() as journal:
@@ -157,23 +145,27 @@ def run_sweep(
         left = plan.cells * len(plan.seeds) - len(before)
         laws = list_imported_laws([plan.base])
         workers = on if left else None
-        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
+        with executor.open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _run_cells(plan, journal, pool, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         made = [entry for key, entry in journal.done.items() if key not in before]
-        rows = build_result_rows(plan, list(journal.done.values()))
-    results = SweepResults(plan, rows)
+        rows = sweep_results.build_result_rows(plan, list(journal.done.values()))
+    results = sweep_results.SweepResults(plan, rows)
     if len(plan.seeds) > 1:
-        points = encode_grid_points(plan, collect_grid_points(results))
-        write_whole(folder.path / GRID_POINTS_FILE, points, remedy=build_resume_hint(folder.path))
-    table = encode_results(plan, rows, folder.facts)
+        points = sweep_results.encode_grid_points(plan, sweep_results.collect_grid_points(results))
+        write_whole(
+            folder.path / sweep_results.GRID_POINTS_FILE, points, remedy=build_resume_hint(folder.path)
+        )
+    table = sweep_results.encode_results(plan, rows, folder.facts)
     write_whole(folder.results, table, remedy=build_resume_hint(folder.path))
     speed = SweepSpeed(len(made), sum(entry.outcome.ran_s for entry in made), wall_s, count)
     return FinishedSweep(results, folder, speed)
 
 
-def _run_cells(plan: SweepPlan, journal: RunJournal[CellRun], pool: WorkerPool, progress: Progress) -> None:
+def _run_cells(
+    plan: SweepPlan, journal: RunJournal[CellRun], pool: executor.WorkerPool, progress: executor.Progress
+) -> None:
     """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = plan.seeds
 
@@ -216,7 +208,7 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     return [*lines, f"  {first_s:g} s each{extended}"]
 
 
-def summarize_sweep(results: SweepResults) -> Iterator[str]:
+def summarize_sweep(results: sweep_results.SweepResults) -> Iterator[str]:
     """Yields a summary: verdicts, extensions, seeds."""
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
@@ -233,7 +225,7 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
         yield from _of_seeds(results)
 
 
-def _describe_totals(rows: Sequence[ResultRow]) -> Iterator[str]:
+def _describe_totals(rows: Sequence[sweep_results.ResultRow]) -> Iterator[str]:
     """Yields the ranges of the numbers of all runs that stayed within their limits."""
     kept = [row for row in rows if row["diverged_s"] is None]
     words = []
@@ -245,11 +237,11 @@ def _describe_totals(rows: Sequence[ResultRow]) -> Iterator[str]:
         yield f"within their limits {len(kept)}: {', '.join(words)}"
 
 
-def _of_seeds(results: SweepResults) -> Iterator[str]:
+def _of_seeds(results: sweep_results.SweepResults) -> Iterator[str]:
     fixed = sum(not row["random"] for row in results.rows)
     if fixed:
         yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
-    doubtful = [place for place in collect_grid_points(results) if place.doubtful]
+    doubtful = [place for place in sweep_results.collect_grid_points(results) if place.doubtful]
     if doubtful:
         yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
     for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
@@ -262,7 +254,7 @@ def _cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def _describe_grid_point(plan: SweepPlan, place: GridPoint) -> str:
+def _describe_grid_point(plan: SweepPlan, place: sweep_results.GridPoint) -> str:
     where = [f"{one.key} {value}" for one, value in zip(plan.axes, place.values, strict=True)]
     law = [place.law] if plan.laws else []
     low, high = (100.0 * end for end in place.interval)
@@ -289,7 +281,9 @@ def list_next_commands(folder: Path) -> list[str]:
     ]
 
 
-def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> tuple[str, str]:
+def build_reproduce_command(
+    results: sweep_results.SweepResults, row: sweep_results.ResultRow, folder: Path
+) -> tuple[str, str]:
     """Returns the command that repeats a row, and a note on it or ""."""
     source = results.plan.written.source
     if _source_unchanged(results.plan.written, results.plan.cell(row["cell"]).overrides, row):
@@ -297,12 +291,12 @@ def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path)
     name = f"cell-{row['cell']}-seed-{row['seed']}"
     file = folder / f"{name}.toml"
     write_whole(file, row["scenario"])
-    lasts_s = reproduction_duration_s(results.plan, results.outcome(row))
+    lasts_s = sweep_results.reproduction_duration_s(results.plan, results.outcome(row))
     command = format_command("sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap")
     return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"
 
 
-def _source_unchanged(written: SweepSource, overrides: tuple[str, ...], row: ResultRow) -> bool:
+def _source_unchanged(written: SweepSource, overrides: tuple[str, ...], row: sweep_results.ResultRow) -> bool:
     """Returns True if the source that the row's command names is still the swept one."""
     try:
         text, folder = read_source(written.source)

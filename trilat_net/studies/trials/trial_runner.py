@@ -5,6 +5,7 @@ again and again costs itself and no other.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,6 @@ def _run_trial(trial: Trial) -> TrialResult:
         return trial.run()
     except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
         return TrialResult(trial, error=f"{type(error).__name__}: {error}")
-
-
-def _lost_result(trial: Trial) -> TrialResult:
-    return TrialResult(trial, error=f"its worker process ended, {MAX_LOSSES} times")
 
 
 def run_trials(
@@ -57,9 +54,10 @@ def run_trials(
             if not is_core_cached():
                 next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
             queue = [batch[n] for n in longest_first]
+            lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
             replies = (
                 (longest_first[place], result)
-                for place, result in pool.each(_run_trial, queue, _lost_result, len(queue))
+                for place, result in pool.each(_run_trial, queue, lost, len(queue))
             )
         for n, result in replies:
             results[n] = result._replace(trial=batch[n])

@@ -17,7 +17,7 @@ import numpy as np
 from ...analysis.arm_rows import build_arm_rows
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario
-from ...scenario.fields import MAX_QUANTITY, field_names, is_number, suggest_nearest
+from ...scenario.fields import MAX_QUANTITY, is_number, suggest_nearest
 from ...scenario.imported_law import LawConsent, allowed_laws, import_law_class, read_law_source
 from ...scenario.laws import LAWS
 
@@ -169,13 +169,6 @@ def _known(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -
     return controls
 
 
-def _knowing_gravity(law: str) -> Callable[[Scenario, ModelInformation, GainValues], SiteControls]:
-    def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-        return {name: {"law": law, **gains, "gravity": knowledge.gravity} for name in scenario.names}
-
-    return controls
-
-
 def _p_f(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
     parts = {
         "master": {"K": 0.0, "d": gains["d_master"], "k_f": gains["k_f"]},
@@ -187,9 +180,13 @@ def _p_f(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> 
     }
 
 
-def _plugged(law: str, **masters: bool) -> Callable[[Scenario, ModelInformation, GainValues], SiteControls]:
-    """Returns the writer of a plugged law; `masters`: a key that is this at masters and not so at slaves."""
-    gravity = "gravity" in field_names(LAWS[law])
+def _tell_gains(
+    law: str, *, gravity: bool = True, **masters: bool
+) -> Callable[[Scenario, ModelInformation, GainValues], SiteControls]:
+    """Returns the writer of a law's own gains; `masters`: a key that is this at masters and not so at slaves.
+
+    `gravity`: the law is told its share.
+    """
 
     def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
         told = {"gravity": knowledge.gravity} if gravity else {}
@@ -263,28 +260,28 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
             f"{_AS_FIRST}; the box is around it",
             _adaptive_robust,
         ),
-        SearchSpace("p_d", (_K, _D), "gravity", _knowing_gravity("p_d")),
-        SearchSpace("pd_d", (_K, _KD, _D), "gravity", _knowing_gravity("pd_d")),
+        SearchSpace("p_d", (_K, _D), "gravity", _tell_gains("p_d")),
+        SearchSpace("pd_d", (_K, _KD, _D), "gravity", _tell_gains("pd_d")),
         SearchSpace(
-            "saturated_pd", (_K, GainRange("P", "N m", 0.5, 50.0), _D), "gravity", _plugged("saturated_pd")
+            "saturated_pd", (_K, GainRange("P", "N m", 0.5, 50.0), _D), "gravity", _tell_gains("saturated_pd")
         ),
-        SearchSpace("four_channel", _CHANNELS, "gravity", _plugged("four_channel")),
-        SearchSpace("six_channel", _CHANNELS, "gravity", _plugged("six_channel")),
-        SearchSpace("authority", (_K, _D), "gravity", _plugged("authority", leads=True)),
+        SearchSpace("four_channel", _CHANNELS, "gravity", _tell_gains("four_channel")),
+        SearchSpace("six_channel", _CHANNELS, "gravity", _tell_gains("six_channel")),
+        SearchSpace("authority", (_K, _D), "gravity", _tell_gains("authority", leads=True)),
         SearchSpace(
             "impedance",
             _IMPEDANCE,
             "gravity AND inertia exactly: more than the others",
-            _plugged("impedance", follows=False),
+            _tell_gains("impedance", gravity=False, follows=False),
         ),
         SearchSpace("sync", (_LAMBDA, _KP, _GAMMA), _AS_FIRST, _sync),
         SearchSpace("lee_spong", (_K, _KD, _D._replace(name="d_extra")), "gravity", _lee_spong),
-        SearchSpace("smith", _PREDICTING, "gravity", _plugged("smith", predicts=True)),
+        SearchSpace("smith", _PREDICTING, "gravity", _tell_gains("smith", predicts=True)),
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
         SearchSpace("wave", (_D._replace(name="b"), _FOLLOWING[0]), "gravity", _wave),
         SearchSpace("tdpa", _FOLLOWING, "gravity", _tdpa),
-        SearchSpace("tanks", (_K, _KD), "gravity", _knowing_gravity("tanks")),
+        SearchSpace("tanks", (_K, _KD), "gravity", _tell_gains("tanks")),
     )
 }
 """The laws that can be tuned, by name; `known` is `adaptive` with Gamma = 0 and the true inertia."""
@@ -347,9 +344,5 @@ def build_own_search_space(code: str) -> SearchSpace:
             raise UsageError(f"--law {code}: tune[{name!r}] {problem}, not {entry!r}")
         knobs.append(GainRange(str(name), unit, float(low), float(high)))
     told = "gravity" in inspect.signature(kind).parameters
-
-    def controls(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-        known = {"gravity": knowledge.gravity} if told else {}
-        return {name: {"law": code, **gains, **known} for name in scenario.names}
-
-    return SearchSpace(code, tuple(knobs), "gravity" if told else "what it asks of now", controls)
+    writer = _tell_gains(code, gravity=told)
+    return SearchSpace(code, tuple(knobs), "gravity" if told else "what it asks of now", writer)

@@ -20,6 +20,7 @@ from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_law import name_law_classes
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from . import search_space
 from .candidate import (
     CandidateScore,
     CandidateTask,
@@ -31,15 +32,6 @@ from .candidate import (
 )
 from .final_posture import build_twin, check_comparable
 from .pareto_search import CandidateSearch, Objective, find_pareto_front
-from .search_space import (
-    PAPER_GAINS,
-    SEARCH_SPACES,
-    GainValues,
-    ModelInformation,
-    SearchSpace,
-    build_model_information,
-    select_search_spaces,
-)
 
 DEFAULT_BUDGET = 64
 """Candidates per law: four laws on `free` take some minutes on two cores."""
@@ -64,11 +56,11 @@ class TuningPlan(NamedTuple):
     """
 
     base: TuningScenario
-    spaces: list[SearchSpace]
+    spaces: list[search_space.SearchSpace]
     budget: int
     seed: int
     objective: Objective
-    knowledge: ModelInformation
+    knowledge: search_space.ModelInformation
     others: tuple[TuningScenario, ...] = ()
 
     @property
@@ -84,12 +76,14 @@ class TuningPlan(NamedTuple):
 
     def printed(self, base: TuningScenario) -> dict[str, TuningScenario]:
         """Returns the gains that the paper prints, by name, with the common information and without."""
-        told = SEARCH_SPACES["adaptive"].controls(base.scenario, self.knowledge, PAPER_GAINS)
+        told = search_space.SEARCH_SPACES["adaptive"].controls(
+            base.scenario, self.knowledge, search_space.PAPER_GAINS
+        )
         untold = {name: {**table, "theta_hat0": 0.0} for name, table in told.items()}
         controls = {"as printed": told, "as printed, told nothing": untold}
         return {name: base.with_controls(tables) for name, tables in controls.items()}
 
-    def task(self, space: SearchSpace, gains: GainValues) -> CandidateTask:
+    def task(self, space: search_space.SearchSpace, gains: search_space.GainValues) -> CandidateTask:
         """Returns a candidate to be run, with every seed."""
         bases = (self.base, *self.others)
         return build_candidate_task([base.with_gains(space, self.knowledge, gains) for base in bases])
@@ -247,10 +241,10 @@ def plan_tuning(
         raise UsageError(f"--objective is {' or '.join(Objective)}, not {objective!r}")
     if not 1 <= seeds <= MAX_TUNING_SEEDS:
         raise UsageError(f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}")
-    knowledge = build_model_information(gravity_percent)
+    knowledge = search_space.build_model_information(gravity_percent)
     found = load_tuning_scenario(source, overrides)
     scenario = found.scenario
-    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
+    spaces = search_space.select_search_spaces([name_law_classes(law) for law in laws], scenario)
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
