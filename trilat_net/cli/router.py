@@ -13,10 +13,10 @@ LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 def router_command(
     listen: Annotated[
         list[str] | None,
-        typer.Option(
+        options.value(
             "--listen",
-            metavar="EP",
-            help=f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
+            "EP",
+            f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
         ),
     ] = None,
     connect: options.ConnectOption = None,
@@ -25,11 +25,8 @@ def router_command(
     insecure: options.InsecureOption = False,
     until_idle: Annotated[
         float | None,
-        typer.Option(
-            "--until-idle",
-            metavar="S",
-            help="End once all members have been gone for this long, s; default: never.",
-            callback=options.check_seconds,
+        options.seconds(
+            "--until-idle", "End once all members have been gone for this long, s; default: never."
         ),
     ] = None,
 ) -> None:

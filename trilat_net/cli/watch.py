@@ -9,7 +9,7 @@ from . import options
 
 
 def watch_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to watch.")],
+    session: Annotated[str, options.value("--session", "ID", "Session to watch.")],
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
