@@ -53,16 +53,12 @@ def router_command(
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
         try:
-            terminal.print_line(
-                f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it"
-            )
-            run_router(
-                bus,
-                clock,
-                interrupt.requested,
-                lambda text: terminal.print_line(f"router: {text}"),
-                until_idle,
-            )
+            _say(f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            run_router(bus, clock, interrupt.requested, _say, until_idle)
         finally:
             bus.close()
         raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
+
+
+def _say(text: str) -> None:
+    terminal.print_line(f"router: {text}")

@@ -114,14 +114,8 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     check_finite(order, "")  # a message holds no others
     if session is None:
         raise UsageError("the session is missing: trilat set --session ID ...")
-    reply = request_change(
-        connection,
-        SystemClock(),
-        session,
-        site,
-        ChangeRequest(**order),
-        embedded_names_reader(session),
-    )
+    request, names = ChangeRequest(**order), embedded_names_reader(session)
+    reply = request_change(connection, SystemClock(), session, site, request, names)
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
     terminal.print_text(reply.text)

@@ -79,16 +79,8 @@ def site_command(
     identity = options.check_session_name(session or chosen.name)
     places = default_endpoints(identity, chosen.names, encrypted=keys is not None)
     before = chosen.names[: chosen.names.index(name)]
-    connection = options.resolve_connection(
-        listen,
-        connect,
-        router,
-        zenoh_config,
-        [places[name]],
-        [places[peer] for peer in before],
-        keys,
-        insecure=insecure,
-    ).require(name)
+    ways = listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
+    connection = options.resolve_connection(*ways, keys, insecure=insecure).require(name)
     how = SiteOptions(
         session=identity,
         connection=connection,
