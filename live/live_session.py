@@ -117,15 +117,11 @@ def watch_with_page(
         UsageError: an endpoint or the page's address cannot be used.
     """
     with Interrupt() as interrupt:
-        with connect_to_session(
-            connection,
-            clock,
-            session,
-            embedded_names_reader(session),
-            stopped=interrupt.requested,
-            timeout_s=timeout_s,
-            say=say,
-        ) as bus:
+        names, stopped = embedded_names_reader(session), interrupt.requested
+        reached = connect_to_session(
+            connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
+        )
+        with reached as bus:
             if bus is None:
                 return interrupt.exit_code
             with serve_page(bus, clock, session, options, say, ends=False) as page:

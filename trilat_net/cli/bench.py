@@ -57,31 +57,26 @@ def _run(folder: "BenchFolder", jobs: int | None, on: str | None) -> "BenchResul
 
 def bench_command(
     study: Annotated[
-        str, typer.Option("--study", metavar="full|small|round-trips", help="Part of the suite to run.")
+        str, options.value("--study", "full|small|round-trips", "Part of the suite to run.")
     ] = "full",
     small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,
-    task: Annotated[
-        str | None, typer.Option("--task", metavar="TASK,TASK...", help="Only these tasks.")
-    ] = None,
-    law: Annotated[str | None, typer.Option("--law", metavar="LAW,LAW...", help="Only these laws.")] = None,
+    task: Annotated[str | None, options.value("--task", "TASK,TASK...", "Only these tasks.")] = None,
+    law: Annotated[str | None, options.value("--law", "LAW,LAW...", "Only these laws.")] = None,
     link: Annotated[
-        str | None, typer.Option("--link", metavar="LINK,LINK...", help="Other links, as in rtt68-loss10,4g.")
+        str | None, options.value("--link", "LINK,LINK...", "Other links, as in rtt68-loss10,4g.")
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", metavar="N", help="Number of seeds; default: the study's.")
+        int | None, options.value("--seeds", "N", "Number of seeds; default: the study's.")
     ] = None,
     cell: Annotated[
-        str | None,
-        typer.Option("--cell", metavar="TASK/LAW/LINK", help="Print the commands that make logs of a cell."),
+        str | None, options.value("--cell", "TASK/LAW/LINK", "Print the commands that make logs of a cell.")
     ] = None,
     tune: Annotated[
         bool, _option("--tune", help="Tune the laws again, and store their gains with the suite.")
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder; continues a suite in it. Default: runs/bench-STUDY."
-        ),
+        options.value("--out -o", "DIR", "Folder; continues a suite in it. Default: runs/bench-STUDY."),
     ] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,

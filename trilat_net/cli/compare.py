@@ -53,7 +53,7 @@ def _print_procedure(asked: "TuningPlan", workers: int) -> None:
     )
 
 
-_option = partial(typer.Option, rich_help_panel="Tune laws")
+_option = partial(options.value, rich_help_panel="Tune laws")
 
 
 def compare_command(
@@ -62,41 +62,35 @@ def compare_command(
         list[Path] | None, typer.Argument(help="Two or more MCAP logs.", metavar="FILE FILE...")
     ] = None,
     tune: Annotated[
-        str | None,
-        _option("--tune", metavar="SCENARIO", help="Compare tuned control laws in this scenario instead."),
+        str | None, _option("--tune", "SCENARIO", "Compare tuned control laws in this scenario instead.")
     ] = None,
     law: Annotated[
         str | None,
         _option(
             "--law",
-            metavar="LAW,LAW...",
-            help="Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
+            "LAW,LAW...",
+            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
             "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
             "authority, impedance, smith, and your own, as in mylaws:Law.",
         ),
     ] = None,
-    budget: Annotated[int, _option("--budget", metavar="N", help="Candidates per law.")] = 64,
-    seed: Annotated[int, _option("--seed", metavar="S", help="Seed of the search.")] = 1,
+    budget: Annotated[int, _option("--budget", "N", "Candidates per law.")] = 64,
+    seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
     seeds: Annotated[
-        int,
-        _option("--seeds", metavar="N", help="Seeds of the scenario that each candidate is the mean of."),
+        int, _option("--seeds", "N", "Seeds of the scenario that each candidate is the mean of.")
     ] = 1,
     objective: Annotated[
-        str, _option("--objective", metavar="error|settling", help="The objective besides effort.")
+        str, _option("--objective", "error|settling", "The objective besides effort.")
     ] = "error",
     gravity: Annotated[
-        float,
-        _option("--gravity", metavar="PERCENT", help="Gravity that all laws assume, in % of the truth."),
+        float, _option("--gravity", "PERCENT", "Gravity that all laws assume, in % of the truth.")
     ] = 100.0,
     duration: options.DurationOption = None,
     overrides: options.SetOption = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     output: Annotated[
-        Path | None,
-        _option(
-            "--out", "-o", metavar="DIR", help="Folder of the results; default: the next free runs/tune-..."
-        ),
+        Path | None, _option("--out -o", "DIR", "Folder of the results; default: the next free runs/tune-...")
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,

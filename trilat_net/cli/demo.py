@@ -1,8 +1,5 @@
 """`trilat demo`: runs a scenario live on this machine, a process per site and recorder, and reports."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from ..reporting import terminal_output as terminal
@@ -12,10 +9,7 @@ from . import options
 def demo_command(
     scenario: options.ScenarioArgument = "paper",
     duration: options.DurationOption = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Folder of the results; default: runs/NAME-N."),
-    ] = None,
+    folder: options.ResultsOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,

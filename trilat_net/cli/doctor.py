@@ -18,14 +18,11 @@ def doctor_command(
     keys: options.KeysOption = None,
     insecure: options.InsecureOption = False,
     session: Annotated[
-        str | None,
-        typer.Option(
-            "--session", metavar="ID", help="Also ask the members of this session for their clocks."
-        ),
+        str | None, options.value("--session", "ID", "Also ask the members of this session for their clocks.")
     ] = None,
-    folder: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder where results would go.")
-    ] = Path("runs"),
+    folder: Annotated[Path, options.value("--out -o", "DIR", "Folder where results would go.")] = Path(
+        "runs"
+    ),
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per finding.

@@ -19,9 +19,7 @@ def keys_new_command(
     ],
     hosts: Annotated[
         list[str] | None,
-        typer.Option(
-            "--host", metavar="NAME", help="Host name or address at which a member listens; repeatable."
-        ),
+        options.value("--host", "NAME", "Host name or address at which a member listens; repeatable."),
     ] = None,
     days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
 ) -> None:

@@ -23,20 +23,17 @@ def linear_command(
     overrides: options.SetOption = None,
     pose: Annotated[
         str | None,
-        typer.Option(
-            "--pose", metavar="Q1,Q2,...", help="Pose of all sites, rad, true theta; default: a run's end."
-        ),
+        options.value("--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end."),
     ] = None,
-    roots: Annotated[int, typer.Option("--roots", metavar="N", help="Number of roots to print.")] = 6,
+    roots: Annotated[int, options.value("--roots", "N", "Number of roots to print.")] = 6,
     over: Annotated[
-        list[str] | None,
-        typer.Option("--over", metavar="KEY=LOW:HIGH", help="Find where stability changes; repeatable."),
+        list[str] | None, options.value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
     ] = None,
     ports: Annotated[
         bool, typer.Option("--ports/--no-ports", help="Print what operators feel, and passivity.")
     ] = True,
     picture: Annotated[
-        Path | None, typer.Option("--figure", metavar="FILE", help="Draw a figure: .png, .svg or .pdf.")
+        Path | None, options.value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
     ] = None,
     what: Annotated[
         LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")

@@ -14,8 +14,7 @@ def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
     session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="ID", help="Show this running session instead of starting one."),
+        str | None, options.value("--session", "ID", "Show this running session instead of starting one.")
     ] = None,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
@@ -35,10 +34,7 @@ def live_command(
         bool, typer.Option("--browser/--no-browser", help="Open a browser if there is one.")
     ] = True,
     duration: options.DurationOption = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Folder of the results; default: runs/NAME-N."),
-    ] = None,
+    folder: options.ResultsOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
     force: options.ForceOption = False,

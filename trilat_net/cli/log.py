@@ -25,8 +25,7 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
-        Path | None,
-        typer.Option("--key", metavar="PUB", help="Also check FILE.sig, by this public key."),
+        Path | None, options.value("--key", "PUB", "Also check FILE.sig, by this public key.")
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -56,7 +55,7 @@ def log_check_command(
 
 def log_sign_command(
     file: options.LogArgument,
-    key: Annotated[Path, typer.Option("--key", metavar="KEY", help="Private key, made by trilat keys pair.")],
+    key: Annotated[Path, options.value("--key", "KEY", "Private key, made by trilat keys pair.")],
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -79,13 +78,7 @@ def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            "--output",
-            metavar="OUT",
-            help="Default: FILE without .active, or FILE.recovered.mcap.",
-        ),
+        options.value("-o --out --output", "OUT", "Default: FILE without .active, or FILE.recovered.mcap."),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -111,18 +104,16 @@ def log_export_command(
     files: options.LogsArgument,
     form: Annotated[
         str,
-        typer.Option(
+        options.value(
             "--to",
-            metavar="|".join(_FORMATS),
-            help="ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file "
+            "|".join(_FORMATS),
+            "ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file "
             "per site and kind; npz, mat: one file with an array per column.",
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--out", metavar="OUT", help="File or folder; default: next to FILE, named after it."
-        ),
+        options.value("-o --out", "OUT", "File or folder; default: next to FILE, named after it."),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -155,8 +146,7 @@ def log_view_command(
         bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")
     ] = False,
     save: Annotated[
-        Path | None,
-        typer.Option("--save", metavar="OUT.rrd", help="Write a file for Rerun instead of opening it."),
+        Path | None, options.value("--save", "OUT.rrd", "Write a file for Rerun instead of opening it.")
     ] = None,
     force: options.ForceOption = False,
 ) -> None:

@@ -16,6 +16,31 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
+def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackParam, float | None], Any]:
+    """Returns a check of an option that refuses a number out of a range; `what` names such numbers."""
+
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}")
+        return value
+
+    return check
+
+
+check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
+"""Refuses a waiting time out of range."""
+
+
+def value(names: str, metavar: str, text: str, **more: Any) -> Any:
+    """Returns an option that takes a value, with its help; several names are separated by spaces."""
+    return typer.Option(*names.split(), metavar=metavar, help=text, **more)
+
+
+def seconds(name: str, text: str) -> Any:
+    """Returns an option that takes a waiting time, s, with its help."""
+    return value(name, "S", text, callback=check_seconds)
+
+
 def complete_scenarios(incomplete: str) -> list[str]:
     """Returns what a shell completes to a scenario: shipped names, and TOML files and folders here."""
     shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
@@ -57,39 +82,29 @@ ScenarioArgument = Annotated[
     ),
 ]
 SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as in control.Kd=5; repeatable."),
+    list[str] | None, value("--set", "KEY=VALUE", "Override a key, as in control.Kd=5; repeatable.")
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
-DurationOption = Annotated[
-    float | None, typer.Option("--duration", metavar="S", help="Override the duration of the run, s.")
-]
+DurationOption = Annotated[float | None, value("--duration", "S", "Override the duration of the run, s.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ListenOption = Annotated[
-    list[str] | None,
-    typer.Option("--listen", metavar="EP", help="Endpoint to listen at, as in tcp/192.0.2.1:7447."),
+    list[str] | None, value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447.")
 ]
-ConnectOption = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="EP", help="Endpoint to connect to; repeatable.")
-]
+ConnectOption = Annotated[list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")]
 
 RouterOption = Annotated[
     list[str] | None,
-    typer.Option(
+    value(
         "--router",
-        metavar="EP",
-        help="Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: the first one that "
+        "EP",
+        "Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: the first one that "
         "answers is used.",
     ),
 ]
 ZenohConfigOption = Annotated[
-    Path | None,
-    typer.Option("--zenoh-config", metavar="FILE", help="Your own Zenoh configuration: TLS, QUIC, access."),
+    Path | None, value("--zenoh-config", "FILE", "Your own Zenoh configuration: TLS, QUIC, access.")
 ]
-KeysOption = Annotated[
-    Path | None,
-    typer.Option("--keys", metavar="DIR", help="Folder of this member's keys (trilat keys new)."),
-]
+KeysOption = Annotated[Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")]
 InsecureOption = Annotated[
     bool,
     typer.Option("--insecure", help="Allow --listen on a network whose users you trust, unencrypted."),
@@ -109,51 +124,32 @@ def check_session_name(name: str) -> str:
     return name
 
 
-def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a check of an option that refuses a number out of a range; `what` names such numbers."""
-
-    def check(param: typer.CallbackParam, value: float | None) -> float | None:
-        if value is not None and not low <= value <= high:
-            raise UsageError(f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}")
-        return value
-
-    return check
-
-
-check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
-"""Refuses a waiting time out of range."""
-
-AnswerOption = Annotated[
-    float,
-    typer.Option(
-        "--timeout", metavar="S", help="Longest wait for the first answer, s.", callback=check_seconds
-    ),
-]
+AnswerOption = Annotated[float, seconds("--timeout", "Longest wait for the first answer, s.")]
 ClockOffsetOption = Annotated[
     float,
-    typer.Option(
+    value(
         "--clock-offset-s",
-        metavar="S",
-        help="For tests: use a clock this far ahead of the machine's, s.",
+        "S",
+        "For tests: use a clock this far ahead of the machine's, s.",
         callback=check_range(-1e6, 1e6, "a number of seconds"),
     ),
 ]
 ClockDriftOption = Annotated[
     float,
-    typer.Option(
+    value(
         "--clock-drift-ppm",
-        metavar="PPM",
-        help="For tests: use a clock that runs faster than the machine's by this, ppm.",
+        "PPM",
+        "For tests: use a clock that runs faster than the machine's by this, ppm.",
         callback=check_range(-200.0, 200.0, "a number"),  # slewing takes no more
     ),
 ]
 
 ViewsOption = Annotated[
     str,
-    typer.Option(
+    value(
         "--views",
-        metavar="off|full|HZ",
-        help="Rate of the standard channels for ROS 2 and viewers, Hz; extremes are kept.",
+        "off|full|HZ",
+        "Rate of the standard channels for ROS 2 and viewers, Hz; extremes are kept.",
     ),
 ]
 
@@ -196,10 +192,10 @@ NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wai
 
 MinCoverageOption = Annotated[
     float,
-    typer.Option(
+    value(
         "--min-coverage",
-        metavar="SHARE",
-        help="Least share of every site's ticks that must be judged for a pass.",
+        "SHARE",
+        "Least share of every site's ticks that must be judged for a pass.",
         callback=check_range(0.0, 1.0, "a share"),
     ),
 ]
@@ -293,11 +289,14 @@ def read_keys(folder: Path | None) -> "MemberKeys | None":
     return read_member_keys(folder)
 
 
+ResultsOption = Annotated[
+    Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
+]
 OnOption = Annotated[
     str | None,
-    typer.Option(
+    value(
         "--on",
-        metavar="tcp://HOST:PORT",
-        help="Run on the workers of this Dask scheduler instead of processes of this machine.",
+        "tcp://HOST:PORT",
+        "Run on the workers of this Dask scheduler instead of processes of this machine.",
     ),
 ]

@@ -18,7 +18,7 @@ def _check_count(value: int) -> int:
 
 def ping_command(
     context: typer.Context,
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to measure.")] = "paper",
+    session: Annotated[str, options.value("--session", "ID", "Session to measure.")] = "paper",
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
@@ -47,14 +47,12 @@ def ping_command(
         ),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--figure", metavar="FILE", help="Draw the benchmark: .png, .svg or .pdf.")
+        Path | None, options.value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
     ] = None,
     force: options.ForceOption = False,
     answer: Annotated[
         list[str] | None,
-        typer.Option(
-            "--answer", metavar="EP", help="Answer benchmarks from elsewhere, at this endpoint; repeatable."
-        ),
+        options.value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
     ] = None,
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,

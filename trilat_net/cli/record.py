@@ -12,7 +12,7 @@ from . import options
 
 
 def record_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to record.")],
+    session: Annotated[str, options.value("--session", "ID", "Session to record.")],
     listen: options.ListenOption = None,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
@@ -21,22 +21,15 @@ def record_command(
     insecure: options.InsecureOption = False,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            "--output",
-            metavar="FILE",
-            help="Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
+        options.value(
+            "-o --out --output",
+            "FILE",
+            "Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
         ),
     ] = None,
     join_timeout: Annotated[
         float | None,
-        typer.Option(
-            "--join-timeout",
-            metavar="S",
-            help="Longest wait for the session to begin, s; default: no limit.",
-            callback=options.check_seconds,
-        ),
+        options.seconds("--join-timeout", "Longest wait for the session to begin, s; default: no limit."),
     ] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
@@ -46,25 +39,18 @@ def record_command(
     ] = False,
     include: Annotated[
         list[str] | None,
-        typer.Option(
-            "--include", metavar="KEYS", help="Record only these channels, as in '**/m1/**'; repeatable."
-        ),
+        options.value("--include", "KEYS", "Record only these channels, as in '**/m1/**'; repeatable."),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        typer.Option(
-            "--exclude", metavar="KEYS", help="Leave these channels out, as in '**/link'; repeatable."
-        ),
+        options.value("--exclude", "KEYS", "Leave these channels out, as in '**/link'; repeatable."),
     ] = None,
     split_size: Annotated[
         float | None,
-        typer.Option(
-            "--split-size", metavar="MIB", help="Split the log into parts of at most this size, MiB."
-        ),
+        options.value("--split-size", "MIB", "Split the log into parts of at most this size, MiB."),
     ] = None,
     split_duration: Annotated[
-        float | None,
-        typer.Option("--split-duration", metavar="S", help="Split the log into parts of this duration, s."),
+        float | None, options.value("--split-duration", "S", "Split the log into parts of this duration, s.")
     ] = None,
     carry_on: Annotated[
         bool, typer.Option("--continue", help="If the log exists, write its next part.")

@@ -29,50 +29,38 @@ def replay_command(
         list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
     ],
     rate: Annotated[
-        str,
-        typer.Option(
-            "--rate", metavar="X", help="Speed relative to the recording, or max: as fast as possible."
-        ),
+        str, options.value("--rate", "X", "Speed relative to the recording, or max: as fast as possible.")
     ] = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[
-        float | None, typer.Option("--start", metavar="S", help="Start of the part to play, s since tick 0.")
+        float | None, options.value("--start", "S", "Start of the part to play, s since tick 0.")
     ] = None,
     stop: Annotated[
-        float | None, typer.Option("--stop", metavar="S", help="End of the part to play, s since tick 0.")
+        float | None, options.value("--stop", "S", "End of the part to play, s since tick 0.")
     ] = None,
     duration: Annotated[
-        float | None,
-        typer.Option("--duration", metavar="S", help="Duration of the part to play, s, instead of --stop."),
+        float | None, options.value("--duration", "S", "Duration of the part to play, s, instead of --stop.")
     ] = None,
     include: Annotated[
         list[str] | None,
-        typer.Option(
+        options.value(
             "--include",
-            metavar="KEYEXPR",
-            help="Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
+            "KEYEXPR",
+            "Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
         ),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        typer.Option(
-            "--exclude", metavar="KEYEXPR", help="Leave these channels out, as in '**/link'; repeatable."
-        ),
+        options.value("--exclude", "KEYEXPR", "Leave these channels out, as in '**/link'; repeatable."),
     ] = None,
     prefix: Annotated[
-        str,
-        typer.Option(
-            "--prefix", metavar="WORD", help="Name the session WORD-NAME; with '' NAME, as recorded."
-        ),
+        str, options.value("--prefix", "WORD", "Name the session WORD-NAME; with '' NAME, as recorded.")
     ] = "replay",
     session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Name of the session, without a prefix.")
+        str | None, options.value("--session", "ID", "Name of the session, without a prefix.")
     ] = None,
     time: Annotated[
-        str,
-        typer.Option(
-            "--time", metavar="publish|log", help="Play messages at their times of sending, or of arrival."
-        ),
+        str, options.value("--time", "publish|log", "Play messages at their times of sending, or of arrival.")
     ] = "publish",
     low_cpu: Annotated[
         bool, typer.Option("--low-cpu", help="Sleep until every deadline, which is about 0.1 ms less exact.")
@@ -80,10 +68,10 @@ def replay_command(
     needs_recorder: options.NeedsRecorderOption = False,
     preload: Annotated[
         int,
-        typer.Option(
+        options.value(
             "--preload",
-            metavar="MIB",
-            help="Largest log held in memory; another process reads a larger one during the replay.",
+            "MIB",
+            "Largest log held in memory; another process reads a larger one during the replay.",
         ),
     ] = 256,
     listen: options.ListenOption = None,

@@ -13,10 +13,10 @@ LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 def router_command(
     listen: Annotated[
         list[str] | None,
-        typer.Option(
+        options.value(
             "--listen",
-            metavar="EP",
-            help=f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
+            "EP",
+            f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
         ),
     ] = None,
     connect: options.ConnectOption = None,
@@ -25,11 +25,8 @@ def router_command(
     insecure: options.InsecureOption = False,
     until_idle: Annotated[
         float | None,
-        typer.Option(
-            "--until-idle",
-            metavar="S",
-            help="End once all members have been gone for this long, s; default: never.",
-            callback=options.check_seconds,
+        options.seconds(
+            "--until-idle", "End once all members have been gone for this long, s; default: never."
         ),
     ] = None,
 ) -> None:
@@ -56,16 +53,12 @@ def router_command(
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
         try:
-            terminal.print_line(
-                f"router: listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it"
-            )
-            run_router(
-                bus,
-                clock,
-                interrupt.requested,
-                lambda text: terminal.print_line(f"router: {text}"),
-                until_idle,
-            )
+            _say(f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            run_router(bus, clock, interrupt.requested, _say, until_idle)
         finally:
             bus.close()
         raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
+
+
+def _say(text: str) -> None:
+    terminal.print_line(f"router: {text}")

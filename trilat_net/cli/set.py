@@ -49,9 +49,7 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
 
 def set_command(
     context: typer.Context,
-    session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Session to change; required.")
-    ] = None,
+    session: Annotated[str | None, options.value("--session", "ID", "Session to change; required.")] = None,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
@@ -73,7 +71,7 @@ def set_link_command(
     preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
     to: Annotated[
         list[str] | None,
-        typer.Option("--to", metavar="KEY=VALUE", help="Any key of a link, as in model=gamma; repeatable."),
+        options.value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable."),
     ] = None,
 ) -> None:
     """Changes the given keys of a directed link; a model or a preset replaces all of them."""
@@ -116,14 +114,8 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     check_finite(order, "")  # a message holds no others
     if session is None:
         raise UsageError("the session is missing: trilat set --session ID ...")
-    reply = request_change(
-        connection,
-        SystemClock(),
-        session,
-        site,
-        ChangeRequest(**order),
-        embedded_names_reader(session),
-    )
+    request, names = ChangeRequest(**order), embedded_names_reader(session)
+    reply = request_change(connection, SystemClock(), session, site, request, names)
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
     terminal.print_text(reply.text)

@@ -12,9 +12,7 @@ from . import options
 
 def sim_command(
     scenario: options.ScenarioArgument,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--out", "--output", metavar="FILE", help="Default: NAME.mcap.")
-    ] = None,
+    output: Annotated[Path | None, options.value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,

@@ -26,9 +26,7 @@ def site_command(
             autocompletion=options.complete_scenarios,
         ),
     ],
-    session: Annotated[
-        str | None, typer.Option("--session", metavar="ID", help="Default: the scenario's name.")
-    ] = None,
+    session: Annotated[str | None, options.value("--session", "ID", "Default: the scenario's name.")] = None,
     listen: options.ListenOption = None,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
@@ -36,40 +34,27 @@ def site_command(
     keys: options.KeysOption = None,
     insecure: options.InsecureOption = False,
     join_timeout: Annotated[
-        float,
-        typer.Option(
-            "--join-timeout",
-            metavar="S",
-            help="Longest wait for the others, s.",
-            callback=options.check_seconds,
-        ),
+        float, options.seconds("--join-timeout", "Longest wait for the others, s.")
     ] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
     stay: Annotated[
         float,
-        typer.Option(
-            "--stay",
-            metavar="S",
-            help="At the end, wait until the recorder has left, at most this long, s.",
-            callback=options.check_seconds,
-        ),
+        options.seconds("--stay", "At the end, wait until the recorder has left, at most this long, s."),
     ] = 0.0,
     without: Annotated[
         list[str] | None,
-        typer.Option(
+        options.value(
             "--without",
-            metavar="SITE",
-            help="Option of the first site: begin without SITE, which may join later; repeatable.",
+            "SITE",
+            "Option of the first site: begin without SITE, which may join later; repeatable.",
         ),
     ] = None,
     leave_timeout: Annotated[
         float | None,
-        typer.Option(
+        options.seconds(
             "--leave-timeout",
-            metavar="S",
-            help="Under glide: time to go on without a site that has left, s; default: to the end.",
-            callback=options.check_seconds,
+            "Under glide: time to go on without a site that has left, s; default: to the end.",
         ),
     ] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
@@ -94,16 +79,8 @@ def site_command(
     identity = options.check_session_name(session or chosen.name)
     places = default_endpoints(identity, chosen.names, encrypted=keys is not None)
     before = chosen.names[: chosen.names.index(name)]
-    connection = options.resolve_connection(
-        listen,
-        connect,
-        router,
-        zenoh_config,
-        [places[name]],
-        [places[peer] for peer in before],
-        keys,
-        insecure=insecure,
-    ).require(name)
+    ways = listen, connect, router, zenoh_config, [places[name]], [places[peer] for peer in before]
+    connection = options.resolve_connection(*ways, keys, insecure=insecure).require(name)
     how = SiteOptions(
         session=identity,
         connection=connection,

@@ -12,7 +12,7 @@ from . import options
 if TYPE_CHECKING:
     from sites.running_session import RunningSession
 
-SessionOption = Annotated[str, typer.Option("--session", metavar="ID", help="The session.")]
+SessionOption = Annotated[str, options.value("--session", "ID", "The session.")]
 SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
 
 

@@ -257,50 +257,37 @@ def sweep_command(
     ] = None,
     over: Annotated[
         list[str] | None,
-        typer.Option(
+        options.value(
             "--over",
-            metavar="KEY=VALUES",
-            help="An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.",
+            "KEY=VALUES",
+            "An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.",
         ),
     ] = None,
     seeds: Annotated[
         str | None,
-        typer.Option(
-            "--seeds",
-            metavar="N|LIST",
-            help="How many seeds, or a list, as in 1..20; default: one.",
-        ),
+        options.value("--seeds", "N|LIST", "How many seeds, or a list, as in 1..20; default: one."),
     ] = None,
     law: Annotated[
-        str | None,
-        typer.Option("--law", metavar="LAW,LAW...", help="Sweep laws as well; default: the scenario's."),
+        str | None, options.value("--law", "LAW,LAW...", "Sweep laws as well; default: the scenario's.")
     ] = None,
     duration: options.DurationOption = None,
     longest: Annotated[
         float | None,
-        typer.Option(
-            "--longest",
-            metavar="S",
-            help="Longest run of an undecided cell, s; default: eight times the duration.",
+        options.value(
+            "--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
+        options.value(
+            "-o --out",
+            "DIR",
+            "Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
         ),
     ] = None,
-    resume: Annotated[
-        Path | None, typer.Option("--resume", metavar="DIR", help="Continue an interrupted sweep.")
-    ] = None,
+    resume: Annotated[Path | None, options.value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
     cell: Annotated[
-        int | None,
-        typer.Option(
-            "--cell", metavar="N", help="With results: print the commands that make logs of a cell."
-        ),
+        int | None, options.value("--cell", "N", "With results: print the commands that make logs of a cell.")
     ] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,

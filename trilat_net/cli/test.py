@@ -37,11 +37,10 @@ def test_command(
         ),
     ] = False,
     seeds: Annotated[
-        str | None,
-        typer.Option("--seeds", metavar="LIST", help="Seeds, as in 1..20 or 1,5,9; default: the scenario's."),
+        str | None, options.value("--seeds", "LIST", "Seeds, as in 1..20 or 1,5,9; default: the scenario's.")
     ] = None,
     junit: Annotated[
-        Path | None, typer.Option("--junit", metavar="FILE", help="Write the results as JUnit XML as well.")
+        Path | None, options.value("--junit", "FILE", "Write the results as JUnit XML as well.")
     ] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,

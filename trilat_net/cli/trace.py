@@ -16,23 +16,19 @@ def trace_import_command(
         Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a header.", metavar="FILE")
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="CSV", help="Default: FILE as -trace.csv, here.")
+        Path | None, options.value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")
     ] = None,
     way: Annotated[
         str,
-        typer.Option(
+        options.value(
             "--way",
-            metavar="half|send|receive|whole",
-            help="Half a round trip, one way of irtt (send or receive), or delays as they are. "
+            "half|send|receive|whole",
+            "Half a round trip, one way of irtt (send or receive), or delays as they are. "
             "Default: half of a round trip, a one-way delay as it is.",
         ),
     ] = "",
-    column: Annotated[
-        str, typer.Option("--column", metavar="NAME", help="Column of the delays in a table.")
-    ] = "",
-    every_s: Annotated[
-        float, typer.Option("--every", metavar="S", help="Interval of a ping without -D, s.")
-    ] = 1.0,
+    column: Annotated[str, options.value("--column", "NAME", "Column of the delays in a table.")] = "",
+    every_s: Annotated[float, options.value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:

@@ -9,7 +9,7 @@ from . import options
 
 
 def watch_command(
-    session: Annotated[str, typer.Option("--session", metavar="ID", help="Session to watch.")],
+    session: Annotated[str, options.value("--session", "ID", "Session to watch.")],
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
     zenoh_config: options.ZenohConfigOption = None,
@@ -31,14 +31,9 @@ def watch_command(
     name, clock = options.check_session_name(session), SystemClock()
     connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
     with Interrupt() as interrupt:
-        with connect_to_session(
-            connection,
-            clock,
-            name,
-            embedded_names_reader(name),
-            stopped=interrupt.requested,
-            timeout_s=timeout,
-        ) as bus:
+        names, stopped = embedded_names_reader(name), interrupt.requested
+        reached = connect_to_session(connection, clock, name, names, stopped=stopped, timeout_s=timeout)
+        with reached as bus:
             if bus is not None:
                 watch_session(bus, clock, name, terminal.out, interrupt, timeout)
         if interrupt.requested():
