@@ -122,8 +122,8 @@ class ArmPort(OutsidePort):
         """Returns the torque to apply now, N m per joint; None if the arm must brake.
 
         It must before the first tick, after the run, while no record newer than `FRESH_NS` has arrived, and
-        `BRAKE_NS` after a fault began, or a dead-man switch was let go, when its torque has come down to
-        damping and gravity.
+        `BRAKE_NS` after a fault began, or a dead-man switch was let go: until then its torque brings it to
+        rest.
         """
         record, fresh = self.record, self.fresh
         if not fresh or record is None:
