@@ -313,7 +313,7 @@ def test_a_file_that_is_as_long_as_it_may_be_is_cut_at_a_chunk_and_recovered(tmp
     done = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60)
     assert done.returncode == 5, done
     assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
-    assert "--split-size" in done.stdout
+    assert "split_size" in done.stdout
     assert recover_log(active_path(path)).lossless
     assert [message[1] for message in messages(path)] == list(range(len(messages(path))))
     assert len(messages(path)) > 900

@@ -108,7 +108,7 @@ def test_an_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) 
     with pytest.raises(UsageError) as error:
         refuse_oversized_sweep(sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2)
     assert error.value.exit_code == 2
-    for word in ("2000000 cells (10000 x 200)", "25 h on 2 cores", "larger steps", "--yes"):
+    for word in ("2000000 cells (10000 x 200)", "25 h on 2 cores", "larger steps", "yes runs it"):
         assert word in str(error.value)
     many = DurationEstimate(1_000_001, 60.0, [])
     with pytest.raises(UsageError, match="would take about 60 s"):
