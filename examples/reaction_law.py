@@ -2,7 +2,7 @@
 
     cd examples
     trilat sim paper --set control.law=reaction_law:Reaction --set control.K=30 -o reaction.mcap
-    trilat verify reaction.mcap
+    trilat verify reaction.mcap --law reaction_law.py
     trilat sweep paper --over control.K=10:60:10 --set control.law=reaction_law:Reaction
 
 Between each two sites there are two springs, one computed at either end, and each acts at both ends: at

@@ -1,7 +1,7 @@
 """Wave variables in plain Python, as a law of your own: the built-in `wave` where no sample is late or lost.
 
 In this folder:  trilat sim two_sites --set control.law=wave_law:Wave --set sites.s.control.K=100
-                 --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap
+                 --set sites.s.control.B=10 -o wave.mcap;  trilat verify wave.mcap --law wave_law.py
 
 Sites are joined by lines of impedance b, c = sqrt(2 b). A site without a spring of its own is pushed by -F,
 F = b qd - c v, where v is the wave that comes out of the line, and sends u = c qd - v into it, a tick later,

@@ -9,6 +9,7 @@ from typing import Any
 
 from tests.virtual_runs import Array, Run, sampled, trajectories
 from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario.law_consent import allow_own_laws
 
 ARM = {
     "l1_m": 1.0,
@@ -76,7 +77,7 @@ def unit_scenario(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> Scenario:
     """The scenario of `unit_text`."""
-    return parse_scenario(unit_text(sites, control, **more), "unit")
+    return allow_own_laws(parse_scenario(unit_text(sites, control, **more), "unit"))
 
 
 def pair_run(control: Mapping[str, Any], *, clamped: bool, **more: Any) -> Run:

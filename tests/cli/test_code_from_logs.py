@@ -140,6 +140,21 @@ def test_no_command_imports_what_a_log_names(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("code", ["distutils:Law", "distutils.core:Law", "a.b.c:Law"])
+def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
+    """Python's finder of distutils imports the setuptools that is nearest."""
+    for name in ("setuptools/__init__.py", "distutils/__init__.py", "a/b/c.py"):
+        (place / name).parent.mkdir(parents=True)
+        (place / name).write_text(WITNESS)
+    log = (place / "run.mcap").read_bytes()
+    text = opened(log).scenario_text.replace("mylaws:Spring", code)
+    named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    (place / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
+    done = subprocess.run([*COMMAND, "verify", "run.mcap"], cwd=place, capture_output=True, text=True)
+    assert (done.returncode, imports(place)) == (4, []), done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_the_table_has_all_that_was_asked_for() -> None:
     assert len(CASES) >= 26
     assert {law for _, _, law in CASES} == set(FILES)

@@ -15,7 +15,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, cast
@@ -231,16 +231,20 @@ def _find_file(code: str, path: str) -> Path:
 
 
 def _find_spec(module: str) -> ModuleSpec | None:
-    """Finds a module as an import would, without running the packages that it is in."""
+    """Finds a module as an import would, without running the packages that it is in.
+
+    Finders of other packages are not asked: that of `distutils` imports the nearest setuptools.
+    """
     spec = None
     folders = None
+    finders = [one for one in sys.meta_path if one is PathFinder or one.__module__.startswith("__editable__")]
     parts = module.split(".")
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
         try:
-            found = (finder.find_spec(name, folders) for finder in sys.meta_path)
+            found = (finder.find_spec(name, folders) for finder in finders)
             spec = next((one for one in found if one is not None), None)
-        except (ImportError, ValueError, AttributeError):
+        except (ImportError, ValueError, AttributeError, LookupError):
             return None
         folders = None if spec is None else spec.submodule_search_locations
         if spec is None or (folders is None and name != module):
