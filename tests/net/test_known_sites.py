@@ -79,7 +79,7 @@ def test_places_are_known_where_all_sites_are_and_as_the_member_reaches_them() -
         assert find_known_places("t", Connection(connect=None)) is None
         with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
             assert find_known_places("t", Connection(connect=None)) == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
-            assert find_known_places("t", Connection(connect=None, keyed=True)) is None
+            assert find_known_places("t", Connection(connect=None, keys_of="operator")) is None
             assert find_known_places("t", Connection(connect=None, mode="client")) is None
 
 
@@ -109,7 +109,7 @@ def test_it_says_at_once_that_it_tries(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> None:
-    with make_site_known("t", "s", SITES, 7, replace(HERE, keyed=True, own={"x": 1}), b"order"):
+    with make_site_known("t", "s", SITES, 7, replace(HERE, keys_of="operator", own={"x": 1}), b"order"):
         assert stop_at_once(["--session", "t"]) == 2
     assert "have keys: add --keys DIR" in capsys.readouterr().err
 

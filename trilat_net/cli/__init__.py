@@ -191,7 +191,7 @@ def main() -> None:
     except (MemoryError, ImportError, RuntimeError) as error:
         if not _is_short_of_memory(error):
             raise
-        print_error(_TOO_LITTLE)
+        sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
         sys.exit(1)
     finally:
         TrilatError.in_command = False
