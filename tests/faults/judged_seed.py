@@ -48,7 +48,7 @@ class Judged(NamedTuple):
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
     """Judges the faults of a seed; `again` runs them twice and compares."""
-    faults, arms = draw_faults(seed, timetable), draw_settings(seed)
+    faults, arms = draw_faults(seed, timetable), draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS
     return judge_faults(faults, seed, again=again, timetable=timetable, arms=arms)
 
 
