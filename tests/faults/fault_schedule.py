@@ -37,7 +37,7 @@ class Timetable(NamedTuple):
 
 
 WHOLE = Timetable(5.0, (0.5, 1.6), 1.8, 0.2)
-SHORT = Timetable(1.1, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop", "storm"))
+SHORT = Timetable(1.4, (0.4, 0.52), 0.57, 0.05, ("kill", "end", "stop", "storm"))
 
 
 class ArmSettings(NamedTuple):
