@@ -41,7 +41,6 @@ class Rest(NamedTuple):
         name: of its site.
         setup: of its site, as its scenario says.
         states: its records, the first of which begins it.
-        before: the record before the first, if there is one.
         limited: per record, that the limit of its torque's rate, or of the torque, kept it from what it asks.
         kinetic_j: per record.
         blend: how many records the blend has.
@@ -50,7 +49,6 @@ class Rest(NamedTuple):
     name: str
     setup: SiteSetup
     states: Sequence[State]
-    before: State | None
     limited: np.ndarray
     kinetic_j: np.ndarray
     blend: int
@@ -70,8 +68,8 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
     for name, states in session.published.states.items():
         setup, theta = session.scenario.setup(name), session.scenario.arms[name].theta
         limited = find_limited_ticks(session.scenario, name, states)
-        place, before = 0, None
-        for (boot, resting), group in groupby(states, key=lambda at: (at.boot, at.mode in RESTING)):
+        place = 0
+        for (_, resting), group in groupby(states, key=lambda at: (at.boot, at.mode in RESTING)):
             rows = list(group)
             of = slice(place, place + len(rows))
             place = of.stop
@@ -80,9 +78,7 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
                 kinetic_j = 0.5 * (qd * inertia_product_rows(theta, q, qd)).sum(axis=1)
                 binds = np.append(limited[of], False)
                 blend = max(round(BLEND_S * setup.rate_hz), int(np.argmin(binds)))
-                first = before if before is not None and before.boot == boot else None
-                yield Rest(name, setup, rows, first, limited[of], kinetic_j, blend)
-            before = rows[-1]
+                yield Rest(name, setup, rows, limited[of], kinetic_j, blend)
 
 
 def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -> np.ndarray:
