@@ -47,12 +47,13 @@ $(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/long.lock
 	@touch $@
 
-test: pytest
-	@$(MAKE) --no-print-directory -j2 sessions lint
+test:
+	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp compiled
+	@$(MAKE) --no-print-directory -j2 pytest lint
+	@$(MAKE) --no-print-directory sessions # by itself: real sessions need the time of the cores
 	@$(MAKE) --no-print-directory live
 
-pytest:
-	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp compiled
+pytest: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
 
 compiled: setup

@@ -60,7 +60,7 @@ def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float
 
 def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
     running = live(stage, "play")
-    with browser_page(page_address(running)) as page:
+    with browser_page(page_address(running), gl=False) as page:  # drawing by software takes both cores
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         assert page.locator(".arm").count() == 3
         page.click("#link-presets button:has-text('300 ms')")
