@@ -57,8 +57,10 @@ def own_terminal() -> None:
 
 
 def live(stage: Stage, scenario: str, *options: str) -> Process:
-    """A session with a page."""
-    return stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options)
+    """A session with a page, at a rate that leaves time to its page on a machine that others use too."""
+    rate = ("--set", "rate_hz=250")
+    out = str(stage.folder / "out")
+    return stage.start("live", "live", scenario, "--no-browser", "--out", out, *rate, *options)
 
 
 def run(stage: Stage, *words: str) -> Process:
@@ -101,7 +103,7 @@ def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again
 @needs_browser
 @pytest.mark.long
 def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = live(stage, "play")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
     with browser_page(page_address(running), gl=False) as page:
         shows(page, "trilat.frame && " + modes("run"))
@@ -119,7 +121,7 @@ def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
 @needs_browser
 @pytest.mark.long
 def test_whoever_holds_an_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = live(stage, "play")
     address = page_address(running)
     with browser_page(address, gl=False) as first:
         shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
