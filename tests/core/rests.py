@@ -26,7 +26,7 @@ def rest_torque(gains: RestGains, part: SiteLog, law: Array, first: int) -> tupl
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))
     B, slip = np.array(gains.damping), part.qd[rows] - qd_ref + part.q[rows] - q_ref
-    taken = np.vstack([np.zeros(2), np.cumsum(slip, axis=0)[:-1]]) * B / (8.0 * gains.time_s) / part.rate_hz
+    taken = np.vstack([np.zeros(2), np.cumsum(slip, axis=0)[:-1]]) * B / (4.0 * gains.time_s) / part.rate_hz
     w = part.tau[first - 1] - law[0] - taken
     return law + w - B * slip, w
 

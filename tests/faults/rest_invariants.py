@@ -195,11 +195,11 @@ def find_stopping_distance(rest: Rest) -> float:
     """How far an arm goes until it rests: its reference, and what its torque takes it besides, rad.
 
     The reference goes |v| T / 2. A torque that gives an acceleration a as it begins is taken on by w
-    while s adds up to a M / (k B) = 8 a time_s^2.
+    while s adds up to a M / (k B) = 4 a time_s^2.
     """
     still = rest.setup.rest
     assert still is not None
     v = rest.rows("qd")[: rest.blend + 1]
     stop_s = max(LEAST_STOP_S, float((np.abs(v[0]) / still.deceleration).max()))
     a = np.abs(np.diff(v, axis=0)).max(initial=0.0) * rest.setup.rate_hz
-    return MOST_WAY * float(np.abs(v[0]).max() * stop_s / 2.0 + 8.0 * a * still.time_s**2)
+    return MOST_WAY * float(np.abs(v[0]).max() * stop_s / 2.0 + 4.0 * a * still.time_s**2)

@@ -114,8 +114,8 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains that the core has: k B besides, k one eighth of 1 / time_s."""
-        integral = tuple(float(B) / (8.0 * self.time_s) for B in self.damping)
+        """Returns the gains that the core has: k B besides, k one quarter of 1 / time_s."""
+        integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {"damping": self.damping, "integral": integral, "deceleration": self.deceleration}
 
     def stop_s(self, qd: Array) -> Array:
