@@ -223,7 +223,7 @@ def gravity_gives(scenario: Scenario, site: str) -> tuple[float, float]:
 
 
 def assert_stops(log: Log, count: int) -> None:
-    """A stop bears the bar; an arm that nothing pulls has what its torque at the order gives while B brakes."""
+    """The bar of a stop; what gravity does not pull has what its torque at the order gives while B brakes."""
     gives = {site: gravity_gives(log.scenario, site) for site in log.scenario.names}
     for stop in stop_at_instants(log, count):
         part, still = log[stop.site], log.scenario.setup(stop.site).rest
