@@ -1,6 +1,7 @@
 """`trilat record`: records one session into an MCAP log, in one file or in parts."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -76,10 +77,11 @@ def record_command(
     from ..net.clock import make_system_clock
     from ..net.topics import RECORDER
 
+    options.check_session_name(session)
     connection = options.resolve_connection(
         listen, connect, router, zenoh_config, [], None, keys, insecure=insecure
     ).require(RECORDER)
-    path = _choose_path(output, options.check_session_name(session), concluded=concluded)
+    path = _choose_path(output, session, concluded=concluded)
     place = LogStorage(
         path,
         force=force,
@@ -98,9 +100,12 @@ def record_command(
         refuse_existing(page, force=force)
     clock = make_system_clock(clock_offset, clock_drift)
     then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
-    code = record_session(
-        options.check_session_name(session), place, connection, join_timeout, clock, terminal.print_line, then
-    )
+    try:
+        code = record_session(session, place, connection, join_timeout, clock, terminal.print_line, then)
+    finally:
+        if concluded and output is None:
+            with suppress(OSError):
+                path.parent.rmdir()  # nothing came into it
     raise typer.Exit(code)
 
 

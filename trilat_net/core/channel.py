@@ -101,7 +101,7 @@ def schedule_deliveries(sample: int, link: Row, models: Row, dues: IntArray, poi
 
     `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
     """
-    pages = dues.shape[0]
+    kept = dues.shape[0]
     while link.foreseen < sample:
         m = link.foreseen + 1
         fresh = m == 0
@@ -109,5 +109,5 @@ def schedule_deliveries(sample: int, link: Row, models: Row, dues: IntArray, poi
         while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
             link.model += 1
             fresh = True
-        dues[m & (pages - 1)] = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
+        dues[m % kept] = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
         link.foreseen = m

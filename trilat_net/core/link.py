@@ -128,7 +128,7 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     row: Row = link.state[0]
     dues = link.dues
     schedule_deliveries(tick, row, link.models, dues, link.points)
-    due_ns = dues[tick & (dues.shape[0] - 1)]
+    due_ns = dues[tick % dues.shape[0]]
     if due_ns == LOST or tick <= row.foreseen - dues.shape[0]:
         return LOST
     if due_ns <= _FILED:
@@ -173,7 +173,7 @@ def accept_sample(
     if tick < 0 or (tick > row.foreseen and _far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
-    place = tick & (dues.shape[0] - 1)
+    place = tick % dues.shape[0]
     if row.foreseen - dues.shape[0] < tick <= row.foreseen and dues[place] <= _FILED:
         row.duplicate += 1
         return

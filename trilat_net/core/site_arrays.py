@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .chain import build_chain
 from .channel import LOST
-from .delay import LINK_MODEL_DTYPE, LinkModel, max_delay_us
+from .delay import LINK_MODEL_DTYPE, MAX_DELAY_US, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
 from .link import AHEAD_LIMIT_NS, ChannelArrays, calendar_pages, link_dtype, sample_dtype, span_ticks
@@ -215,7 +215,9 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _kept_dues(setup: SiteSetup) -> int:
-    return max(calendar_pages(max(setup.rate_hz, link.rate_hz)) for link in setup.links)
+    """Returns how many samples' due times a link keeps: those between the latest one and the one most ahead."""
+    fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
+    return span_ticks(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, fastest_hz) + _SLACK
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
