@@ -8,12 +8,12 @@ from hypothesis import HealthCheck, settings
 
 settings.register_profile("desk", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", settings.get_profile("desk"), derandomize=True, print_blob=True)
-settings.register_profile("push", settings.get_profile("ci"), max_examples=20)
+settings.register_profile("push", settings.get_profile("ci"), max_examples=10)
 settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """On a push a property is tried with 20 examples, else with a hundred."""
+    """On a push a property is tried with ten examples, else with a hundred."""
     if "not long" in str(config.option.markexpr):
         settings.load_profile("push")
 

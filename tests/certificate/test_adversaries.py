@@ -28,7 +28,7 @@ from .adversaries import (
 
 SLOW = ("F2", "F2=", "F4", "F4=", "F8", "F8=")
 """Rows at 1 kHz, or that take minutes of their own time."""
-CHEAP = ("a sampled wall of 5 kN/m at 100 Hz", "a sampled wall of 8 kN/m", "a push without end")
+CHEAP = ("a sampled wall of 5 kN/m at 100 Hz", "a push without end")
 
 
 def _named(row: Row) -> str:
@@ -96,11 +96,12 @@ BLOCK = 400
 
 
 @pytest.mark.parametrize(
-    "first", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(BLOCK, SEEDS, BLOCK))]
+    ("first", "count"),
+    [(0, 40), *(pytest.param(n, BLOCK, marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
 )
-def test_random_runs_do_not_fool_it(first: int) -> None:
+def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
     """What certify and a sweep say of four hundred runs, of which a third are near an edge of stability."""
-    judged = list(map(judge_experiment, range(first, first + BLOCK)))
+    judged = list(map(judge_experiment, range(first, first + count)))
     for by in ("certified", "swept"):
         found = tally(judged, by)
         assert found.false_ok == 0

@@ -107,11 +107,7 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def _marks(words: list[str], law: str) -> tuple[Any, ...]:
     brief = words[0] in ("verify", "-c") or "--own-laws" in words or (words, 0) not in READING
-    return (
-        ()
-        if brief and "--json" not in words and law in ("beside the log", "changed")
-        else (pytest.mark.long,)
-    )
+    return () if brief and "--json" not in words and law == "beside the log" else (pytest.mark.long,)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +136,7 @@ def test_no_command_imports_what_a_log_names(
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("code", ["distutils:Law", "distutils.core:Law", "a.b.c:Law"])
+@pytest.mark.parametrize("code", ["distutils.core:Law", pytest.param("a.b.c:Law", marks=pytest.mark.long)])
 def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
     """Python's finder of distutils imports the setuptools that is nearest."""
     for name in ("setuptools/__init__.py", "distutils/__init__.py", "a/b/c.py"):

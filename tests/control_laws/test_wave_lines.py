@@ -86,7 +86,11 @@ def test_a_clamped_line_is_a_spring() -> None:
 
 @pytest.mark.parametrize(
     ("frequency_hz", "clamp_nm_rad", "ratio"),
-    [(0.01, 0.0, 4.0004 * 2.0 * math.pi * 0.01), (0.1, 0.0, 2.538), (0.1, 1e6, 51.88)],
+    [
+        (0.1, 0.0, 2.538),
+        (0.1, 1e6, 51.88),
+        pytest.param(0.01, 0.0, 4.0004 * 2.0 * math.pi * 0.01, marks=pytest.mark.long),
+    ],
 )
 def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio: float) -> None:
     """|torque / velocity| at the master, N m s/rad: of a free slave the masses and b T."""

@@ -15,7 +15,16 @@ from .surface import all_options, keys
 
 HERE = Path(__file__).parent
 BEFORE = json.loads((HERE / "surface.json").read_text())
-LONG = ("report live-4g.mcap", "report v2.mcap", "linear free", "linear training", "certify v2.mcap")
+LONG = (
+    "report live-4g.mcap",
+    "report v2.mcap",
+    "linear free",
+    "linear training",
+    "certify v2.mcap",
+    "linear p_d_margin",
+    "metrics v2.mcap",
+    "log info",
+)
 """Cases beside which another one says nearly the same."""
 
 

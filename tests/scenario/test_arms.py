@@ -32,6 +32,7 @@ def refusal(changes: Overrides) -> ScenarioError:
     return caught.value
 
 
+@pytest.mark.long
 def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
     """UR5: table C.3 of its manual, less than 18 kg with the base; Panda: 0.855 m and about 18 kg."""
     ur5, panda = (load_scenario(name).arms["s"] for name in ("six_joints", "seven_joints"))

@@ -81,6 +81,7 @@ def row(needs, p99_ms: float, lost: int = 0) -> dict:
     return {**own, "lost": lost, "one_way_us": times}
 
 
+@pytest.mark.long
 def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
     """P+d at 200 ms holds up to 229.8 ms, docs/linear.md, and its links hide what is shorter than theirs."""
     needs = find_needs(tn.load_scenario("p_d_margin"))

@@ -52,7 +52,7 @@ def test_gravity_alone_is_learnt() -> None:
     assert theta_hat[2] < 0.0  # inertial estimates are free to be anything
 
 
-@pytest.mark.parametrize("name", ["paper", "paper_rods"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("paper_rods", marks=pytest.mark.long)])
 def test_what_the_derivation_integrates_is_conserved(name: str) -> None:
     """theta_hat_4 + Gamma g (sin q1 + int cos(q1) Lambda e1 dt), whatever the hands do; so with q1 + q2."""
     made = run(name, {"duration_s": 20.0})

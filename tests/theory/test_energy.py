@@ -22,7 +22,7 @@ def order(name: str, scheme: str, rate_hz: int) -> float:
     )
 
 
-@pytest.mark.parametrize("name", ["paper", "asymmetric"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("asymmetric", marks=pytest.mark.long)])
 def test_the_balance_closes_to_2e_5_of_the_largest_v(name: str) -> None:
     assert booked(name).residual <= 2e-5
 
@@ -44,6 +44,7 @@ def test_the_hands_do_work_that_the_balance_needs() -> None:
     assert np.abs(b.given).max() > 0.01 * b.V.max()
 
 
+@pytest.mark.long
 def test_beta_of_ones_does_not_close_it_where_the_columns_do_not_sum_to_one() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): that is the right null vector, not the left one."""
     made = run("asymmetric", {"duration_s": DURATION_S})
@@ -65,6 +66,7 @@ def test_v_rises_while_a_hand_pushes() -> None:
     assert np.diff(b.V).max() > 1e-5
 
 
+@pytest.mark.long
 def test_sites_may_scale_kd_if_beta_is_divided_by_the_scale() -> None:
     """Kd_i = c_i Kbar needs beta_i = pi_i / c_i; the paper's ones let V rise by a third of itself."""
     scale = {"m1": 10.0, "m2": 3.0, "s": 0.3}

@@ -29,6 +29,7 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
         assert growth == pytest.approx(root.s.real, abs=1e-9)
 
 
+@pytest.mark.long
 def test_an_edge_is_where_the_sign_changes() -> None:
     (found,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""

@@ -36,7 +36,9 @@ def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float
 
 
 @pytest.mark.parametrize(("name", "share"), [("p_d_margin", 0.5), ("p_d_margin_two", 1.0)])
-@pytest.mark.parametrize("delay_ms", [20.0, 200.0, 400.0])
+@pytest.mark.parametrize(
+    "delay_ms", [200.0, *(pytest.param(ms, marks=pytest.mark.long) for ms in (20.0, 400.0))]
+)
 def test_p_d_turns_stable_where_its_mode_stands(name: str, share: float, delay_ms: float) -> None:
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
@@ -105,6 +107,7 @@ def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_non
     assert find_linear_edge(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False) is None
 
 
+@pytest.mark.long
 def test_nothing_is_found_where_nothing_changes_and_all_is_found_where_much_does() -> None:
     scenario = load_scenario("p_d_margin")
     assert find_linear_edge(scenario, "control.d", 1.2, 3.0, points=4) is None

@@ -43,7 +43,7 @@ def answered(
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-@pytest.mark.parametrize("hz", [0.5, 2.0])
+@pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) -> None:
     overrides = {"control.d": 4.0, "sites.m.q0_rad": POSE, "sites.s.q0_rad": POSE}
     scenario = load_scenario("p_d_margin_two", overrides)
@@ -55,7 +55,7 @@ def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) ->
     assert (np.abs(found - Y[:, joint - 1]) < 0.01 * np.abs(Y[:, joint - 1])).all()
 
 
-@pytest.mark.parametrize("hz", [0.5, 2.0])
+@pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_the_paper_s_law_answers_a_sinusoid_as_its_admittance_says(hz: float) -> None:
     """Rods that know themselves, a hand that holds m: learning, delay and the hand's spring are in it."""
     hand = {"kind": "spring", "from_rad": POSE, "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 3.0}

@@ -72,6 +72,7 @@ def end_alone(K: float) -> Stability:
     return RunInMemory(windup(K)).find_end().stability
 
 
+@pytest.mark.long
 def test_runs_have_the_edge_of_the_map() -> None:
     """Stable 5 % below it, and not 5 % above, which shows without the map too."""
     found = edge()

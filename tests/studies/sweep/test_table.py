@@ -91,6 +91,7 @@ def test_another_program_reads_it_and_what_it_is(swept: tuple[Path, SweepResults
     assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
 
 
+@pytest.mark.long
 def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
     sweep = plan_sweep("p_d_margin", over=["link.delay_ms=0:1980:20", "control.d=0.2:10.1:0.1"])
     base = sweep.base.text

@@ -83,13 +83,13 @@ TICKS = {name: sum(map(load_scenario(name).ticks, load_scenario(name).names)) fo
 
 
 @pytest.mark.parametrize(
-    ("most", "left_out"), [(60_000, OTHER_LAYOUTS), pytest.param(10**9, set(), marks=pytest.mark.long)]
+    ("most", "left_out"), [(45_000, OTHER_LAYOUTS), pytest.param(10**9, set(), marks=pytest.mark.long)]
 )
 def test_every_shipped_scenario_expects_something_and_it_holds(most: int, left_out: set[str]) -> None:
     assert all(load_scenario(name).expect.asks for name in TICKS)
     names = [name for name, ticks in TICKS.items() if ticks <= most and name not in left_out]
     batch = [trial for name in names for trial in trilat_net.trials(name)]
-    assert len(batch) >= 7
+    assert len(batch) >= 3
     report = run_trials(batch)
     assert report.held, report.summary()
 
@@ -97,6 +97,7 @@ def test_every_shipped_scenario_expects_something_and_it_holds(most: int, left_o
 RECIPE = textwrap.dedent(str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nOr all")[0])
 
 
+@pytest.mark.long
 def test_the_recipe_gives_a_test_per_seed_that_fails_with_figures(quick_file: Path, tmp_path: Path) -> None:
     """The same lines on a scenario that holds, and on one that does not."""
     assert len(RECIPE.strip().splitlines()) <= 10
