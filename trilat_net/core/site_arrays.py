@@ -215,7 +215,7 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _kept_dues(setup: SiteSetup) -> int:
-    """Returns how many samples' due times a link keeps: those between the latest one and the one most ahead."""
+    """Returns how many due times a link keeps: from the latest sample there may be to the one most ahead."""
     fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
     return span_ticks(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, fastest_hz) + _SLACK
 

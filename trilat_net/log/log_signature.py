@@ -65,9 +65,12 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     refuse_existing(public, force=False)
     key = Ed25519PrivateKey.generate()
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
-    with stage_output(private, force=False) as staged:
-        with os.fdopen(os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
-            stream.write(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    with (
+        stage_output(private, force=False) as staged,
+        os.fdopen(os.open(staged, flags, 0o600), "wb") as stream,
+    ):
+        stream.write(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
     form = serialization.PublicFormat.SubjectPublicKeyInfo
     write_whole(public, key.public_key().public_bytes(pem, form), force=False)
     return private, public
