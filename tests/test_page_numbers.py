@@ -410,7 +410,7 @@ LONG = (
     "part of max V",
 )
 """Beginnings of words whose numbers take more than 3 s; other tests have their facts."""
-PUSHED = 6
+PUSHED = 12
 """Of so many numbers of a page one is made on a push, and all of them by the long tests."""
 ROWS = [
     pytest.param(page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ())

@@ -107,6 +107,7 @@ def test_other_texts_name_no_seeds(text: str) -> None:
         parse_seeds(text)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
     (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))

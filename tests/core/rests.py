@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from trilat_net.core.resting import REST_RATE_1_S
 from trilat_net.core.site_setup import LEAST_STOP_S, RestGains
 from trilat_net.core.vectors import Array
 from trilat_net.log.site_log import SiteLog
@@ -22,10 +23,10 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
 
 
 def rest_torque(gains: RestGains, part: SiteLog, law: Array, first: int) -> tuple[Array, Array]:
-    """Law + w - B s from a record on, and w, of an arm whose Lambda is 1/s; rows of its law's torque."""
+    """Law + w - B s from a record on, and w, of a law that does not learn; rows of its law's torque."""
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))
-    B, slip = np.array(gains.damping), part.qd[rows] - qd_ref + part.q[rows] - q_ref
+    B, slip = np.array(gains.damping), part.qd[rows] - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
     taken = np.vstack([np.zeros(2), np.cumsum(slip, axis=0)[:-1]]) * B / (4.0 * gains.time_s) / part.rate_hz
     w = part.tau[first - 1] - law[0] - taken
     return law + w - B * slip, w

@@ -65,6 +65,7 @@ def test_the_reference_does_not_jump_when_a_master_is_lost_and_back() -> None:
     assert np.abs(np.diff(part.qd_des, axis=0)).max() <= 0.03
 
 
+@pytest.mark.long
 def test_it_is_executed_again_and_its_energies_close() -> None:
     log = master_lost()
     assert verify(log).identical == 18_000

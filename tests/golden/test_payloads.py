@@ -26,8 +26,8 @@ pytestmark = pytest.mark.skipif(
 SHORTER_THEN = {"4g": "30", "p_d_margin": "60"}
 """How long these ran then, s."""
 
-PUSHED = ("contact", "paper", "two_sites")
-"""What a push looks at: force reflection at a wall, the paper's hands, two sites."""
+PUSHED = ("paper", "live-paper.mcap")
+"""What a push looks at."""
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,9 @@ def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, 
     assert channel_digests(path) == BEFORE["sim"][scenario]
 
 
-@pytest.mark.parametrize("log", BEFORE["live"])
+@pytest.mark.parametrize(
+    "log", [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in BEFORE["live"]]
+)
 def test_the_payloads_of_a_live_session_executed_again_are_the_same_bytes(log: str, tmp_path: Path) -> None:
     path = tmp_path / "rerun.mcap"
     asked = [*COMMAND, "rerun", str(HERE / log), "--closed-loop", "-o", str(path)]

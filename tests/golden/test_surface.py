@@ -23,6 +23,9 @@ LONG = (
     "certify v2.mcap",
     "linear p_d_margin",
     "metrics v2.mcap",
+    "compare live-4g.mcap",
+    "rerun live-4g.mcap",
+    "verify live-4g.mcap",
     "log info",
 )
 """Cases beside which another one says nearly the same."""

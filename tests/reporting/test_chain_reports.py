@@ -69,7 +69,7 @@ def test_panels_of_joints_fill_their_rows():
         (joint_motion.draw_positions, 18),
         (joint_motion.draw_tracking_errors, 7),
         (joint_motion.draw_control_torques, 6),
-        (joint_motion.draw_parameter_estimates, 60),
+        pytest.param(joint_motion.draw_parameter_estimates, 60, marks=pytest.mark.long),
         (joint_motion.draw_phase_portrait, 6),
         (joint_motion.draw_end_effector_paths, 3),
         (arm_poses.draw_arms, None),

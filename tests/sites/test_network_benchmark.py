@@ -137,6 +137,7 @@ def check_result(found: Result, transports: list[str]) -> None:
     assert len(found.to_frame()) == len(facts["rows"])
 
 
+@pytest.mark.long
 def test_it_measures_loopback() -> None:
     ended = threading.Event()
     (endpoint,) = find_free_endpoints(1)

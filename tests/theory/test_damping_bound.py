@@ -178,6 +178,7 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     return criterion.excess > 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "sharp"), [(0, False), *(pytest.param(n, True, marks=pytest.mark.long) for n in range(8))]
 )

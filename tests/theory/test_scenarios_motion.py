@@ -66,6 +66,7 @@ def test_the_hands_of_the_paper_hardly_move_joint_1_and_leave_nothing_behind() -
     assert np.abs((pushed - alone).sum(-1)).max() == pytest.approx(0.05, abs=0.01)
 
 
+@pytest.mark.long
 def test_without_a_box_the_slave_returns() -> None:
     made = measured("box", NO_BOX)
     assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
@@ -97,6 +98,7 @@ def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
     assert value(uncut, "torque_peak_nm") == printed(18.8, 0.1)
 
 
+@pytest.mark.long
 def test_a_ramped_return_needs_no_more_than_links_that_were_not_cut() -> None:
     held = measured("outage", {"on_stale.action": "hold"}, HEALED)
     uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))

@@ -11,7 +11,8 @@ or learnt; and in both cases
     + w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
 
 where w begins with what the torque of the tick before had besides, so that nothing steps, and takes on what
-nobody knew of gravity. In task space Lambda is `REST_RATE_1_S`, and the estimate stays as it is.
+nobody knew of gravity. Lambda is that of the adaptive law in joint space, and else `REST_RATE_1_S`; in task
+space the estimate stays as it is.
 
 Invariant: once the reference rests, S + 1/2 w' (k B)^-1 w of the adaptive law in joint space never rises, S
 being its storage: B adds to Kp, and w is one more estimate, of a constant torque whose true value is zero.
@@ -30,13 +31,13 @@ from .ticks import LifeReason, Mode
 from .vectors import Array, Row, put
 
 REST_RATE_1_S = 2.0
-"""By how much of the way an arm in task space goes back to the pose in which it rests, in a second."""
+"""By how much of the way an arm goes back to the pose in which it rests, in a second."""
 
 _WAITING, _HOLD = int(Mode.WAITING), int(Mode.HOLD)
 _FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
-_OWN, _KNOWN = int(Law.OWN), int(Law.KNOWN)
+_ADAPTIVE, _OWN, _KNOWN = int(Law.ADAPTIVE), int(Law.OWN), int(Law.KNOWN)
 
 
 @leaf
@@ -105,7 +106,7 @@ def put_rest_reference(t_ns: int, site: Row, q: Array, qd: Array) -> None:
 def _find_slip(t_ns: int, site: Row, i: int) -> float:
     """Returns s of a joint, rad/s."""
     q, qd = _find_reference(t_ns, site, i)
-    rate = REST_RATE_1_S if site.task else site.Lambda[i]
+    rate = site.Lambda[i] if site.law == _ADAPTIVE and not site.task else REST_RATE_1_S
     slip: float = site.qd[i] - qd + rate * (site.q[i] - q)
     return slip
 

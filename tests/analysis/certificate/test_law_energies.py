@@ -45,6 +45,7 @@ def test_a_figure_shows_them_over_time() -> None:
     assert len(given.lines) == 4
 
 
+@pytest.mark.long
 def test_a_controller_at_its_clip_leaves_its_observer_negative_and_the_certificate_says_so() -> None:
     """Sites that start apart jolt the leader by more than it was told to expect."""
     changes = {"control.law": "tdpa", "scheme": "digital", "duration_s": 1.0, "sites.s.control.K": 100.0}

@@ -21,7 +21,6 @@ class Synchronisation:
     """The law of a site with a planar arm of two joints; its gains are per joint, Gamma per parameter."""
 
     remembers: ClassVar[tuple[str, ...]] = ("theta_hat", "Yr")
-    holds = True
 
     def __init__(
         self,
