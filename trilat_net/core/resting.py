@@ -30,7 +30,7 @@ from .site_setup import LEAST_STOP_S, Law, StaleAction
 from .ticks import LifeReason, Mode
 from .vectors import Array, Row, put
 
-REST_RATE_1_S = 2.0
+REST_RATE_1_S = 3.0
 """By how much of the way an arm goes back to the pose in which it rests, in a second."""
 
 _WAITING, _HOLD = int(Mode.WAITING), int(Mode.HOLD)
