@@ -159,7 +159,7 @@ def test_arms_that_hold_a_pose_hold_their_joints_and_follow_again() -> None:
 
 @pytest.mark.long
 def test_a_held_arm_of_seven_joints_comes_back_when_it_is_pushed_where_the_task_leaves_it_free() -> None:
-    """By the motion in which its end effector stays; it goes back by 3/s, to within the lag at the cut."""
+    """By the motion in which its end effector stays; it goes back by 3/s, less what its law damps."""
     text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
     text = text.replace("Gamma = 1.0\n", "").replace("posture_rate_1_s = 0.6", "posture_rate_1_s = 0.0")
@@ -174,7 +174,8 @@ def test_a_held_arm_of_seven_joints_comes_back_when_it_is_pushed_where_the_task_
     assert off.max() >= 0.2
     assert np.abs(part.x[first + 400 : 6000, :3] - part.x[first + 400, :3]).max() <= 0.05  # at rest by then
     falls = off[3700 - first : 4700 - first : 500]
-    assert falls[:-1] / falls[1:] == pytest.approx(np.exp(0.5 * 2.0), rel=0.2)
+    rate_1_s = 2.0 * np.log(falls[:-1] / falls[1:])
+    assert ((rate_1_s >= 2.0) & (rate_1_s <= 3.0)).all()
 
 
 @pytest.mark.long
