@@ -527,6 +527,7 @@ def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
     assert found.value == virtual
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), pytest.param(1600, 2.7, marks=pytest.mark.long)])
 def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
     """As docs/maps/p_d.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""

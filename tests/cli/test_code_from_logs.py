@@ -243,6 +243,7 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
         tn.rerun("run.mcap", ["s"])
 
 
+@pytest.mark.long
 def test_a_compiled_law_and_its_neighbours_run_from_the_file_that_was_named(place: Path) -> None:
     folder = place / "laws"
     folder.mkdir()

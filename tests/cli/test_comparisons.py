@@ -33,6 +33,7 @@ def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
 
 
+@pytest.mark.long
 def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
     printed = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
     assert "one and the same experiment" in printed
@@ -54,6 +55,7 @@ def test_json_is_for_programs(logs: Path) -> None:
     assert all(len(row["values"]) == 2 for row in facts["rows"])
 
 
+@pytest.mark.long
 def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path) -> None:
     options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "12", "--out", "fronts"]
     printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()

@@ -23,6 +23,7 @@ def test_figures_are_written_by_name(folder: Path) -> None:
     assert b"MediaBox [ 0 0 252 " in (folder / "paper" / "phase.pdf").read_bytes()
 
 
+@pytest.mark.long
 def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     done = trilat("figure", "run.mcap", "control_torques", "--width", "7", "--json", cwd=folder)
     paths = json.loads(done.succeeds())

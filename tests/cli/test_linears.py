@@ -16,6 +16,7 @@ def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
     assert "2 roots are zero by structure" in printed
 
 
+@pytest.mark.long
 def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
     printed = trilat("linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path).succeeds()
@@ -24,6 +25,7 @@ def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
     assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in printed
 
 
+@pytest.mark.long
 def test_json_has_all(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.5:2")
     told = json.loads(trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds())

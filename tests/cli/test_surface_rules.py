@@ -64,6 +64,7 @@ def test_a_shell_completes(words: str, found: set[str]) -> None:
     assert {line.split("\t")[0] for line in done.stdout.splitlines()} == found, done.stderr
 
 
+@pytest.mark.long
 def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
     made = json.loads(trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds())
     assert made["files"] == ["two_sites.mcap"]

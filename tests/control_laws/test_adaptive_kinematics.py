@@ -128,6 +128,7 @@ def test_of_unknown_lengths_v_falls_by_what_is_dissipated_and_the_places_meet() 
     assert apart_m[-1] <= 0.1 * apart_m[0]
 
 
+@pytest.mark.long
 def test_without_learning_lengths_v_falls_by_something_else() -> None:
     V, lost = functional(run(UNKNOWN, gain=0.0, **WRONG))
     assert np.abs(V + lost - V[0]).max() > 1e-3 * V[0]

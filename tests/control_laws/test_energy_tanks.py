@@ -15,6 +15,7 @@ from trilat_net.scenario.describe import describe_law_conditions
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}
 
 
+@pytest.mark.long
 def test_free_motion_of_a_layer_that_alone_diverges() -> None:
     run = ticked(pair(TANKS, clamped=False, duration_s=30.0), every=2)
     m, s = run["m"], run["s"]

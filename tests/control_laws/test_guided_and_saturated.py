@@ -46,6 +46,7 @@ def test_the_tangent_is_that_of_the_mathematics_library() -> None:
     assert math.isnan(tanh(math.nan))
 
 
+@pytest.mark.long
 def test_a_saturated_pull_ends_at_its_limit() -> None:
     free = last_rows(two(SATURATED), 30.0)[0]
     assert free["q"][:, 0] == pytest.approx(0.3, abs=1e-6)

@@ -44,6 +44,7 @@ def felt(result: Any) -> float:
     return float(abs(result["m"].tau_x[-1, 0] / result["m"].q[-1, 0]))
 
 
+@pytest.mark.long
 def test_without_controllers_the_channel_is_active() -> None:
     free = watching(50.0, clamped=False)
     assert free["s"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)

@@ -54,6 +54,7 @@ def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, .
     assert "under gravity the arms end at q = 0" in describe_law_conditions(scenario)[0]
 
 
+@pytest.mark.long
 def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
     assert ends("adaptive", (0.6, -0.5), 9.81, 200.0)[0] == pytest.approx(-0.047162, rel=1e-3)
     assert ends("adaptive", (0.6, -0.5), 0.0, 200.0)[0] == pytest.approx(0.05, abs=1e-6)

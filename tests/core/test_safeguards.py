@@ -77,6 +77,7 @@ def stopped_log() -> Log:
     return ordered(guarded(), {"s": {2000: "stop", 3500: "enable"}})
 
 
+@pytest.mark.long
 def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
     log = stopped_log()
     assert verify(log).identical == 12_000

@@ -55,6 +55,7 @@ def test_every_released_version_has_one() -> None:
     assert {path.stem for path in GOLDEN} == {"v1", "v2", "v3", "v3-own-sines"}
 
 
+@pytest.mark.long
 def test_a_log_with_a_users_own_law_is_executed_again() -> None:
     made = subprocess.run(
         [*COMMAND, "verify", "own-law.mcap", "--json", "--law", "spring_law.py", "--other-version"],

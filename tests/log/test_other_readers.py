@@ -201,6 +201,7 @@ def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     assert rerun_faults(files[kind], "--full") == []
 
 
+@pytest.mark.long
 def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_path: Path) -> None:
     """Of a recording as it converts it, the names of the series and their numbers."""
     recording = tmp_path / "run.rrd"

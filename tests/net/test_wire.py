@@ -377,6 +377,7 @@ def test_the_json_schema_knows_units() -> None:
     assert schema["properties"]["tau"]["x-unit"] == "N m"
 
 
+@pytest.mark.long
 def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
     """`python -OO` takes these away; a log has its schemas in it, and in its digests."""
     kinds = (State, LinkStats, Event)

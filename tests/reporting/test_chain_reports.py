@@ -134,6 +134,7 @@ def test_columns_and_messages_name_joints_and_links():
     assert (len(names), names[0], names[29]) == (60, "shoulder.m", "forearm.Izz")
 
 
+@pytest.mark.long
 def test_the_page_draws_chains_from_their_joints():
     log = six()
     bounds = charts.workspace_box_m(log)

@@ -8,6 +8,7 @@ from trilat_net.reporting.figure_size import REPORT_SIZE, FigureSize, make_print
 from trilat_net.reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "form"), [("two_sites", make_print_size(3.5)), ("p_d_margin", REPORT_SIZE)])
 def test_figures_are_drawn_at_the_width_that_is_asked_for(name: str, form: FigureSize) -> None:
     for draw in (draw_port_impedance, draw_port_passivity):

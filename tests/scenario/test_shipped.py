@@ -21,12 +21,14 @@ def ages(run: Run) -> np.ndarray:
     return made
 
 
+@pytest.mark.long
 def test_4g_looks_young_because_newer_samples_overtake() -> None:
     short = {"duration_s": 6.0}
     assert ages(ran("4g", short)).mean() == pytest.approx(21, abs=3)
     assert ages(ran("4g", {**short, "link.order": "in_order"})).mean() > 400
 
 
+@pytest.mark.long
 def test_handover_changes_sides_without_a_step() -> None:
     made = ran("handover", {"duration_s": 13.1})
     m1, m2, s = (made.sites[name].q[:, 0] for name in ("m1", "m2", "s"))

@@ -111,6 +111,7 @@ class Stepping(Relay):
         return super().unix_ns() + (-1) ** self.readings * self.readings * 3600 * S
 
 
+@pytest.mark.long
 def test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was(tmp_path: Path) -> None:
     (tmp_path / "steady").mkdir()
     _, steady = run(tmp_path / "steady", SKEWS, 0.3)

@@ -137,6 +137,7 @@ def whole(log: Log) -> None:
     assert compare_with_virtual(log).fed.identical == verdict.records
 
 
+@pytest.mark.long
 def test_an_arm_of_six_joints_sends_the_torque_that_it_measures(tmp_path: Path) -> None:
     """Its tau_x is the record's to the bit, goes to the peers, and is what the log executes again."""
     changes = {**ARM, "duration_s": 0.3}

@@ -244,6 +244,7 @@ def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) 
     assert verify(log).passed
 
 
+@pytest.mark.long
 def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_path: Path) -> None:
     session = Session.whole(gliding(7.0, "paper"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4 * S

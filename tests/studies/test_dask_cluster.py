@@ -176,6 +176,7 @@ def test_what_differs_is_named_on_both_sides() -> None:
     assert "a.b:Law" in find_unfit(WorkerRequirements(here), here, ["a.b:Law"])
 
 
+@pytest.mark.long
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.3)
     sweep = ("sweep", "free", "--over", "control.Kd=1,2", "--on")

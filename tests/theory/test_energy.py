@@ -33,6 +33,7 @@ def test_its_error_is_of_second_order(name: str, rate_hz: int) -> None:
     assert order(name, "second_order", rate_hz) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.long
 @RATES
 def test_digital_closes_it_to_some_percent_with_order_one(rate_hz: int) -> None:
     assert booked("paper", "digital").residual == pytest.approx(1.5e-2, rel=0.2)
@@ -61,6 +62,7 @@ def test_v_never_rises_while_nobody_pushes(name: str) -> None:
     assert rise.max() <= 5e-8 * b.V.max()
 
 
+@pytest.mark.long
 def test_v_rises_while_a_hand_pushes() -> None:
     b = booked("paper_rods")
     assert np.diff(b.V).max() > 1e-5

@@ -261,6 +261,7 @@ def test_a_pose_has_an_angle_for_each_joint() -> None:
         find_equilibrium(six("p_d").scenario, (0.1, 0.3))
 
 
+@pytest.mark.long
 def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
 

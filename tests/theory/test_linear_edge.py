@@ -96,6 +96,7 @@ def test_two_like_arms_turn_stable_where_d1_over_k2_and_d2_over_k1_make_the_roun
     assert found.value <= d2 * 1.001
 
 
+@pytest.mark.long
 def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_none() -> None:
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})

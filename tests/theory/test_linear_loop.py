@@ -93,6 +93,7 @@ def test_a_run_decays_as_its_rightmost_root_says() -> None:
     assert math.pi / half_s == pytest.approx(root.s.imag, rel=2e-3)
 
 
+@pytest.mark.long
 def test_a_rest_with_wrong_estimates_can_be_unstable_and_the_run_leaves_it_for_another() -> None:
     """The theorem says that every run settles, not that every rest is stable.
 

@@ -35,6 +35,7 @@ def test_p_d_is_passive_from_the_line_of_its_stability_on(name: str, K: float) -
     assert all(one.minima.below for one in below.two_ports if len(below.sites) == 2)
 
 
+@pytest.mark.long
 def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
     """What is passive is absolutely stable, and what is so at all joints is so at each."""
     bare = (("timeline", ()), ("sites.m1.hands", ()), ("sites.m2.hands", ()))

@@ -47,6 +47,7 @@ def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object])
     assert value(made, "wall_deviation_n") < 0.05
 
 
+@pytest.mark.long
 def test_without_learning_gravity_nothing_winds_up() -> None:
     made = measured(
         "windup",

@@ -42,11 +42,13 @@ def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -
     assert measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend is EnvelopeTrend.DECAYS
 
 
+@pytest.mark.long
 def test_half_of_the_margin_grows_to_10_rad() -> None:
     made = measured("p_d_margin", {"control.d": 0.5, "duration_s": 40.0}, (10.0, 12.0, ""), (38.0, 40.0, ""))
     assert [peak(made, 0), peak(made, 1)] == [printed(1.6, 0.1), printed(10.0, 1.0)]
 
 
+@pytest.mark.long
 def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
     made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
     assert peak(made) == printed(3e-3, 1e-3)
@@ -64,6 +66,7 @@ def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
     assert {age.mean_ms for age in constant.ages.values()} == {200.0}
 
 
+@pytest.mark.long
 def test_a_play_out_buffer_makes_jitter_a_constant_delay_and_the_run_leaves_the_physics() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
     free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))

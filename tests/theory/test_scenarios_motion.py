@@ -29,6 +29,7 @@ def test_settling_of_free_motion_is_no_monotone_function_of_the_delay(
     assert made.settled_s == printed(settled_s, 0.1)
 
 
+@pytest.mark.long
 def test_the_error_of_free_motion_grows_with_every_delay_and_each_run_learns_something_else() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
     runs = [sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s) for delay_ms in SETTLED_S]
@@ -72,6 +73,7 @@ def test_without_a_box_the_slave_returns() -> None:
     assert made.end_pose_rad["s"] == (printed(-0.011, 1e-3), printed(0.005, 1e-3))
 
 
+@pytest.mark.long
 def test_a_truth_on_the_edge_of_the_box_lets_them_sag() -> None:
     made = measured("box", {**EDGE, "duration_s": 20.0})
     assert made.end_pose_rad["s"][0] < -0.4
@@ -89,6 +91,7 @@ def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) 
 HEALED = (6.0, 15.0, "s")
 
 
+@pytest.mark.long
 def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
     made = measured("outage", {}, HEALED)
     assert value(made, "speed_peak_rad_s") == printed(0.41, 0.01)

@@ -72,6 +72,7 @@ def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -
     assert line.crossings(0, damping) == [pytest.approx(0.5, rel=0.02)]
 
 
+@pytest.mark.long
 def test_a_coarse_map_has_the_line_of_the_linear_analysis_to_its_digits() -> None:
     """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
     at = PanelScenarios(plan_sweep("p_d_margin").written, (), *KEYS)

@@ -46,6 +46,7 @@ def test_the_folder_has_a_picture_a_vector_and_a_page(chart: StabilityMap, tmp_p
     assert paths[1].read_text().startswith("<?xml")
 
 
+@pytest.mark.long
 def test_the_same_results_give_the_same_bytes(chart: StabilityMap, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()

@@ -209,6 +209,7 @@ def test_the_verdict_changes_at_the_margin_of_theory(three: bool, below: float, 
     assert not held(three, above, stable=False)
 
 
+@pytest.mark.long
 def test_jitter_of_the_same_mean_decays_where_the_constant_delay_grows_and_play_out_diverges() -> None:
     jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
     assert held(True, 0.6, stable=True, **jitter)
