@@ -2,8 +2,9 @@
 
 Invariant: every request gets a reply: refused with a reason, or accepted by the very next tick, whose record
 names it. An accepted change holds for samples and ticks from AHEAD_MS later on, so it alters no decision
-already made. Dominance is ramped over `MIN_RAMP_S` at least, whatever is asked for, so that no reference
-jumps; the record has the ramp that holds.
+already made. In one tick a stop outweighs all other orders, so `enable` and `reset` wait for a tick in which
+nothing was ordered before them, and what came after them waits too. Dominance is ramped over `MIN_RAMP_S` at
+least, whatever is asked for, so that no reference jumps; the record has the ramp that holds.
 """
 
 from collections import Counter, deque
@@ -64,6 +65,7 @@ class ChangeServer:
         self._ticks = scenario.ticks(site)
         self._links = initial_link_tables(scenario)
         self._planned = scheduled_link_tables(scenario)
+        self._held_up: Query | None = None
         self._accepted: Counter[str] = Counter()
         self._waiting: deque[int] = deque()
         self._stop_tick: int | None = None
@@ -76,15 +78,20 @@ class ChangeServer:
             self.stopped = k + 1 >= self._stop_tick
         changes: list[CoreChange] = []
         first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
-        while (query := self._queries.poll()) is not None or (query := self._poll_stop()) is not None:
+        ordered = False
+        while (query := self._poll()) is not None:
             try:
                 request = decode(query.payload, ChangeRequest)
+                if ordered and request.order in _NEEDED_MODES:
+                    self._held_up = query
+                    break
                 if request.stop_s is not None:
                     reply = self._stop(k, request.stop_s)
                 elif request.mark:
                     reply = self._mark(k, request.mark)
                 elif request.order:
                     changes.append(self._order(k, request.order))
+                    ordered = True
                     text = f"{self._site}: {request.order} at tick {k}"
                     reply = ChangeReply(member=self._site, accepted=True, text=text, tick=k)
                 else:
@@ -95,6 +102,11 @@ class ChangeServer:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
             query.answer(encode(reply))
         return changes
+
+    def _poll(self) -> Query | None:
+        if (query := self._poll_stop()) is None:
+            query, self._held_up = self._held_up or self._queries.poll(), None
+        return query
 
     def _poll_stop(self) -> Query | None:
         """Returns the next question of somebody who may ask the site to stop, and nothing else."""

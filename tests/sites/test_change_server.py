@@ -1,7 +1,7 @@
 """Changes that a running site is asked for."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sites.change_server import AHEAD_MS, MARKS_WAITING, MIN_RAMP_S, ChangeServer
 from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS, Site
-from trilat_net.core.ticks import CoreChange, TickInput
+from trilat_net.core.ticks import CoreChange, Mode, TickInput
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork
 from trilat_net.net.requests import ChangeReply, ChangeRequest
@@ -25,12 +25,12 @@ STOP = topics.key(SESSION, "s", topics.STOP)
 class Asked:
     """A site `s` that listens, and somebody who asks it."""
 
-    def __init__(self, scenario: Scenario | None = None) -> None:
+    def __init__(self, scenario: Scenario | None = None, mode: Callable[[], Mode] = lambda: Mode.RUN) -> None:
         network = LocalNetwork()
         self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
         asked, stops = (network.join().questions(key) for key in (KEY, STOP))
-        self.changes = ChangeServer(self.scenario, "s", asked, stops=stops)
+        self.changes = ChangeServer(self.scenario, "s", asked, mode, stops=stops)
 
     def send(self, payload: bytes, key: str = KEY) -> Inbox:
         return self._client.ask(key, payload)
@@ -113,6 +113,28 @@ def test_what_cannot_be_is_refused_with_the_reason(order: Mapping[str, Any], say
     assert taken == []
     assert not reply.accepted
     assert says in reply.text
+
+
+GLIDES = load_scenario("free", {"on_stale.action": "glide"})
+
+
+def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
+    """Which orders a site that waits accepts, and its mode in the end; a batch is asked in one tick."""
+    site, mode, replies = Site(GLIDES.setup("s")), Mode.WAITING, []
+    asked = Asked(GLIDES, lambda: mode)
+    for k in range(20):
+        batch = batches[k] if k < len(batches) else ()
+        replies += [asked.send(encode(ChangeRequest(order=order))) for order in batch]
+        mode = site.step(TickInput(k, commands=list(asked.changes.take(k)))).mode
+    answers = [answer for reply in replies if (answer := reply.poll())]
+    assert len(answers) == len(replies)
+    return [decode(answer[1], ChangeReply).accepted for answer in answers], mode
+
+
+@given(st.lists(st.sampled_from(["stop", "enable", "reset"]), min_size=1, max_size=6))
+def test_orders_that_come_in_one_tick_are_taken_as_if_each_had_a_tick(orders: list[str]) -> None:
+    """`enable` behind a `stop` of the same tick was refused: the site was not stopped yet."""
+    assert obey([orders]) == obey([[order] for order in orders])
 
 
 def test_a_client_of_another_version_is_refused_with_both_versions() -> None:
