@@ -22,12 +22,25 @@ OTHER_LAYOUTS = {"seven_joints", "unlike_arms"}
 """Scenarios for which the core is compiled anew: their runs are long tests."""
 
 
+LIKE_OTHERS = {
+    "asymmetric",
+    "box",
+    "force_sharing",
+    "jitter",
+    "lyapunov",
+    "p_d_margin_two",
+    "paper_rods",
+    "windup",
+}
+"""Scenarios beside which another one runs nearly the same: what all must pass, these pass in long tests."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the tests that run such a scenario."""
     for item in items:
         values = item.callspec.params.values() if hasattr(item, "callspec") else ()
         runs = {"execution", "log", "golden"} & set(item.path.parts)
-        if runs and OTHER_LAYOUTS.intersection(value for value in values if isinstance(value, str)):
+        if runs and (OTHER_LAYOUTS | LIKE_OTHERS).intersection(one for one in values if isinstance(one, str)):
             item.add_marker(pytest.mark.long)
 
 

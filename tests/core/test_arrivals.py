@@ -16,7 +16,10 @@ from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, CoreChange, TickInput, TickRecord, first_tick_at, tick_ns
 
 TICKS = 500
-every_kind = pytest.mark.parametrize("name", KINDS)
+PUSHED = ("uniform", "ar1", "trace", "measured", "bursts", "copies", "in order", "play-out")
+every_kind = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in KINDS]
+)
 quick = settings(max_examples=12)
 
 

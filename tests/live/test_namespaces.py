@@ -62,7 +62,7 @@ def clocks_as_injected(log: Log) -> None:
 @pytest.mark.parametrize(
     "order",
     [
-        pytest.param(ALL, id="in order"),
+        pytest.param(ALL, id="in order", marks=pytest.mark.long),
         pytest.param(("recorder", "s", "m2", "m1"), id="backwards", marks=pytest.mark.long),
         pytest.param(("m2", "recorder", "m1", "s"), id="mixed", marks=pytest.mark.long),
     ],

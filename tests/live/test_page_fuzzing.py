@@ -105,7 +105,7 @@ def answer_to(address: str, request: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("count", "raw"), [(150, 30), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
+    ("count", "raw"), [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
 )
 def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage) -> None:
     rare = ("--set", "rate_hz=250")  # records are few, messages are not

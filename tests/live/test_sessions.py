@@ -129,6 +129,7 @@ def test_a_recorder_that_comes_last_is_waited_for_where_it_is_needed(stage: Stag
     assert set(started[0].boots) == {"recorder", "m", "s"}
 
 
+@pytest.mark.long
 def test_separate_terminals_without_endpoints_and_two_sessions_that_do_not_meet(stage: Stage) -> None:
     seed = SystemClock().monotonic_ns()  # names of this test's own, hence ports of its own
     names = [f"terminals-{seed}", f"others-{seed}"]

@@ -84,7 +84,7 @@ class Meeting:
             member.close()
 
 
-@pytest.fixture(params=[False, True], ids=["peers", "router"])
+@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.long)], ids=["peers", "router"])
 def meeting(request: pytest.FixtureRequest, folder: Path) -> Iterator[Meeting]:
     made = Meeting(folder, routed=request.param)
     yield made

@@ -94,7 +94,11 @@ def drawn(name, width_in):
 @pytest.mark.parametrize(
     ("name", "width_in"),
     [
-        *((name, COLUMN_IN) for name in FIGURES if name != "paths"),
+        *(
+            pytest.param(name, COLUMN_IN, marks=pytest.mark.long if n % 2 else ())
+            for n, name in enumerate(FIGURES)
+            if name != "paths"
+        ),
         ("positions", PAGE_IN),
         ("certificate", PAGE_IN),
     ],
