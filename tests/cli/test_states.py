@@ -88,7 +88,7 @@ MADE: dict[str, Callable[[], bytes]] = {
 
 
 def table_cells() -> Iterator[Any]:
-    """Every cell of the table; on a push some states are passed over, and of a torn log alone a report is made."""
+    """Every cell; on a push some states are passed over, and of a torn log alone a report is made."""
     for state, command in product([*MADE, "part"], COMMANDS):
         slow = state in ("older", "changed", "part") or (command == "report" and state != "torn")
         yield pytest.param(state, command, marks=pytest.mark.long if slow else ())
