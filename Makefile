@@ -54,7 +54,7 @@ test:
 	@$(MAKE) --no-print-directory live
 
 pytest: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live and not long"
+	$(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal -m "not live and not long" # some wait
 
 compiled: setup
 	$(BIN)/python -m tests.compile_core

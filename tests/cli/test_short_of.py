@@ -30,6 +30,7 @@ def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
 )

@@ -47,9 +47,9 @@ def test_the_version_is_that_of_the_package() -> None:
     [
         ("sim tw", {"two_sites"}),
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
-        ("figure run.mcap se", {"settling"}),
+        pytest.param("figure run.mcap se", {"settling"}, marks=pytest.mark.long),
         ("site --scenario two_sites ", {"m", "s"}),
-        (f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}),
+        pytest.param(f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}, marks=pytest.mark.long),
     ],
 )
 def test_a_shell_completes(words: str, found: set[str]) -> None:

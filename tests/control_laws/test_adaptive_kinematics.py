@@ -119,6 +119,7 @@ LENGTH_GAIN = 0.02
 WRONG = {"Gamma": 1.0, "first_m": 0.7, "second_m": 1.4, "slave_m": 1.2, "duration_s": 10.0}
 
 
+@pytest.mark.long
 def test_of_unknown_lengths_v_falls_by_what_is_dissipated_and_the_places_meet() -> None:
     log = run(UNKNOWN, gain=LENGTH_GAIN, **WRONG)
     V, lost = functional(log)

@@ -18,7 +18,9 @@ SEEDS = [
 ]
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "law", ["tanks", *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law != "tanks")]
+)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
     """Free and in contact, over a mobile network and over 0 to 400 ms with 10 % loss."""

@@ -60,6 +60,7 @@ def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
     assert ends("adaptive", (0.6, -0.5), 0.0, 200.0)[0] == pytest.approx(0.05, abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)])
 def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> None:
     assert ends("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)

@@ -134,6 +134,7 @@ def largest_step(log: Log, site: str, first: int = 0) -> float:
     return float((np.abs(steps) - against)[first:].max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))])
 def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) -> None:
     """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""

@@ -34,6 +34,7 @@ def test_behind_a_gap_it_is_the_log_again_and_what_cannot_be_known_stands(
         assert motion(again.after, name) == motion(log, name)
 
 
+@pytest.mark.long
 @settings(max_examples=15)
 @given(replace=site_sets, lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50), data=st.data())
 def test_a_changed_site_goes_through_gaps_as_if_there_were_none(

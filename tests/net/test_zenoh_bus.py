@@ -145,6 +145,7 @@ def routed() -> Iterator[Routed]:
     network.close()
 
 
+@pytest.mark.long
 def test_members_meet_again_through_a_router_that_was_started_again(routed: Routed) -> None:
     one, other = routed.join(), routed.join()
     one.announce("t/one/alive/1")
@@ -163,6 +164,7 @@ def test_members_meet_again_through_a_router_that_was_started_again(routed: Rout
     assert until(lambda: answered(other, "t/*/ping")) == ("t/one/ping", b"?")
 
 
+@pytest.mark.long
 def test_routers_that_connect_to_each_other_are_one() -> None:
     endpoints = find_free_endpoints(2)
     routers = [ZenohBus(endpoints[:1], mode="router"), ZenohBus(endpoints[1:], endpoints[:1], "router")]

@@ -156,6 +156,7 @@ def test_nonsense_is_counted_and_dropped(server: PageServer, text: str, reason: 
         assert "hello" in hears(page)
 
 
+@pytest.mark.long
 def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(server: PageServer) -> None:
     with socket(server) as page:
         page.send("x" * (10 << 20))

@@ -76,6 +76,7 @@ def test_no_delay_at_all_is_the_limit_of_one_tick() -> None:
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
 
 
+@pytest.mark.long
 def test_a_run_decays_as_its_rightmost_root_says() -> None:
     """Late in a run of P+d two sites swing in one mode; its peaks go as exp(re t), its zeros as im t."""
     scenario = load_scenario("p_d_margin_two", {"duration_s": 120.0, "rate_hz": 200})

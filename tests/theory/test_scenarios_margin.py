@@ -23,6 +23,7 @@ def test_the_margin_is_the_smallest_eigenvalue_of_alpha_times_k_t(name: str, mar
     assert -np.linalg.eigvals(alpha).real.min() * 10.0 * delay_ms * 1e-3 == pytest.approx(margin)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "d"), [("p_d_margin", 0.9), ("p_d_margin_two", 1.8)])
 def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""

@@ -80,6 +80,7 @@ def test_a_truth_on_the_edge_of_the_box_lets_them_sag() -> None:
     assert made.end_pose_rad["s"][1] < -0.7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "offset_rad"), [(0.9, 0.203), (0.5, 0.0), (0.1, -0.203)])
 def test_the_slave_stands_where_its_shares_say(share: float, offset_rad: float) -> None:
     row = {"m1": share, "m2": 1.0 - share}

@@ -80,6 +80,7 @@ def test_a_law_in_python_is_judged_as_the_same_law_of_the_kernel() -> None:
     assert judged(theirs) == judged(load_scenario("free", short))
 
 
+@pytest.mark.long
 def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
     """Of a growth of 0.01/s nothing is to be seen in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
