@@ -97,7 +97,7 @@ BLOCK = 400
 
 @pytest.mark.parametrize(
     ("first", "count"),
-    [(0, 25), *(pytest.param(n, BLOCK, marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
+    [(0, 40), *(pytest.param(n, BLOCK, marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
 )
 def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
     """What certify and a sweep say of four hundred runs, of which a third are near an edge of stability."""
