@@ -170,13 +170,24 @@ def check_energy(session: FaultSession) -> Iterator[str]:
 
 
 def check_rest(session: FaultSession) -> Iterator[str]:
-    """I13: 1.5 s after its blend an arm is at rest, and stays so."""
+    """I13: 1.5 s after its blend an arm is at rest, and stays so; or when it is back at its reference.
+
+    What limits kept from it goes back by Lambda, and how far that may be I14 says.
+    """
     for rest in find_rests(session):
-        within = rest.blend + round((REST_WITHIN_S - BLEND_S) * rest.setup.rate_hz)
+        within = max(rest.blend + round((REST_WITHIN_S - BLEND_S) * rest.setup.rate_hz), find_return(rest))
         speeds = np.abs(rest.rows("qd")).max(axis=1)[within:]
         for row in np.flatnonzero(speeds > AT_REST_RAD_S)[:1]:
             at = rest.states[within + row]
             yield f"{rest.name} still moves at {speeds[row]:.3g} rad/s at tick {at.tick} in {at.mode}"
+
+
+def find_return(rest: Rest) -> int:
+    """The record by which an arm is back: from where it is farthest off, in 1.2 times what Lambda takes."""
+    rates = np.asarray(rest.setup.gains.Lambda)
+    speeds = (rates * np.abs(rest.rows("q") - rest.rows("q_des"))).max(axis=1)
+    takes_s = 1.2 * float(np.log(max(speeds.max() / AT_REST_RAD_S, 1.0))) / float(rates.min())
+    return int(np.argmax(speeds)) + round(takes_s * rest.setup.rate_hz)
 
 
 def check_travel(session: FaultSession) -> Iterator[str]:
