@@ -7,7 +7,7 @@ import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
 
 const $ = (id) => document.getElementById(id);
-const page = { hello: null, frame: null, takesPart: false, sent: 0, frames: 0, energies: [] };
+const page = { hello: null, frame: null, takesPart: null, sent: 0, frames: 0, energies: [] };
 window.trilat = page; // for tests, and for whoever opens the console
 
 let socket = null;
