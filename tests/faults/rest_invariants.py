@@ -120,7 +120,8 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
         S, power = compute_storage(session.scenario, rest)
         qd_des = rest.rows("qd_des")[1:]
         free = ~rest.limited[1:-1]
-        still = (qd_des == 0.0).all(axis=1)[:-1]
+        rests = (qd_des == 0.0).all(axis=1)[:-1]
+        still = rests & np.r_[False, rests[:-1]]  # the torque is extrapolated from the tick before, Eq. (8)
         largest_j = max(1.0, S.max())
         rises = np.diff(S) / largest_j
         work = 0.5 * (power[1:] + power[:-1]) / rest.setup.rate_hz / largest_j
