@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -153,7 +154,9 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
         unfinished.rename(path)
 
 
-def write_whole(path: Path, data: bytes | str, *, force: bool = True, remedy: str = "") -> None:
+def write_whole(
+    path: Path, data: bytes | str, *, force: bool = True, remedy: str = "", mode: int = 0o666
+) -> None:
     """Writes a file so that it exists whole or not at all; a device or pipe is written to directly.
 
     Args:
@@ -161,6 +164,7 @@ def write_whole(path: Path, data: bytes | str, *, force: bool = True, remedy: st
         data: its content; text is encoded as UTF-8.
         force: whether it may replace a file.
         remedy: what the error of a full disk advises.
+        mode: rights of a new file, less those that the umask takes.
 
     Raises:
         UsageError: it exists, or cannot be made.
@@ -176,7 +180,8 @@ def write_whole(path: Path, data: bytes | str, *, force: bool = True, remedy: st
         target = path.resolve()  # a link stays a link
         unfinished = target.with_name(f"{target.name}.unfinished")
         try:
-            with unfinished.open("wb") as stream:
+            unfinished.unlink(missing_ok=True)  # of an earlier try: its rights may be others
+            with open(unfinished, "wb", opener=partial(os.open, mode=mode)) as stream:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())

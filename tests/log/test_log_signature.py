@@ -1,9 +1,11 @@
 """Signatures: what was signed holds, whatever else is changed does not; Ed25519 by another program agrees."""
 
 import base64
+import errno
 import io
 import json
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
@@ -17,7 +19,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from tests.cli.running import trilat
 from tests.log_editing import edited, recorded
-from trilat_net.errors import LogError, UsageError
+from trilat_net.errors import LogError, LogRefused, UsageError
 from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
 from trilat_net.log.mcap_reader import McapReader
 from trilat_net.log.recover import recover_log
@@ -117,6 +119,18 @@ def test_keys_that_are_none_or_open_to_others_are_refused(signed: tuple[Path, Pa
         sign_log(path, private, force=True)
     with pytest.raises(UsageError, match="exists"):
         create_signing_keys(tmp_path / "lab")
+
+
+def test_keys_are_their_owners_and_a_full_disk_leaves_none(tmp_path: Path) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        mock.patch("os.fsync", side_effect=full),
+        pytest.raises(LogRefused, match=r"lab\.key: cannot be written"),
+    ):
+        create_signing_keys(tmp_path / "lab")
+    assert not list(tmp_path.iterdir())
+    private, _ = create_signing_keys(tmp_path / "lab")
+    assert private.stat().st_mode & 0o777 == 0o600
 
 
 def test_the_command_says_yes_by_0_and_no_by_1(tmp_path: Path) -> None:

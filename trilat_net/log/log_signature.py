@@ -7,7 +7,6 @@ nothing else. Only a file that agrees with its chain is signed.
 
 import base64
 import json
-import os
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from ..errors import LogError, UsageError
-from ..files import open_regular, refuse_existing, stage_output, write_whole
+from ..files import open_regular, refuse_existing, write_whole
 from .digest_chain import CHAIN, ChainState, Integrity
 from .mcap_check import CheckFinding, ProblemList
 from .mcap_reader import McapReader, Progress
@@ -62,15 +61,12 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     if not path.name:
         raise UsageError(f"{path}: is no name; keys are named as in: trilat keys pair lab")
     private, public = path.with_name(f"{path.name}.key"), path.with_name(f"{path.name}.pub")
-    refuse_existing(public, force=False)
+    for file in (private, public):
+        refuse_existing(file, force=False)
     key = Ed25519PrivateKey.generate()
     pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    with (
-        stage_output(private, force=False) as staged,
-        os.fdopen(os.open(staged, flags, 0o600), "wb") as stream,
-    ):
-        stream.write(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
+    write_whole(private, secret, force=False, mode=0o600)
     form = serialization.PublicFormat.SubjectPublicKeyInfo
     write_whole(public, key.public_key().public_bytes(pem, form), force=False)
     return private, public
