@@ -411,7 +411,7 @@ LONG = (
 )
 """Beginnings of words whose numbers take more than 3 s; other tests have their facts."""
 PUSHED, PUSHED_PAGES = 12, ("docs/linear.md", "docs/ports.md", "docs/errata.md")
-"""Of so many numbers of these pages one is made on a push, and all of all by the long tests."""
+"""Of so many numbers of these pages one is made on a push; the long tests make all numbers of all pages."""
 ROWS = [
     pytest.param(page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ())
     for page, entries in PAGES.items()
@@ -528,7 +528,7 @@ def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), pytest.param(1600, 2.7, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
 def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
     """As docs/maps/p_d.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035

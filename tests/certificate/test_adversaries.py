@@ -100,7 +100,7 @@ BLOCK = 400
     [(0, 40), *(pytest.param(n, BLOCK, marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
 )
 def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
-    """What certify and a sweep say of four hundred runs, of which a third are near an edge of stability."""
+    """What certify and a sweep say of runs of which a third are near an edge of stability."""
     judged = list(map(judge_experiment, range(first, first + count)))
     for by in ("certified", "swept"):
         found = tally(judged, by)

@@ -136,7 +136,13 @@ def test_no_command_imports_what_a_log_names(
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("code", ["distutils.core:Law", pytest.param("a.b.c:Law", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "code",
+    [
+        "distutils.core:Law",
+        *(pytest.param(code, marks=pytest.mark.long) for code in ("distutils:Law", "a.b.c:Law")),
+    ],
+)
 def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
     """Python's finder of distutils imports the setuptools that is nearest."""
     for name in ("setuptools/__init__.py", "distutils/__init__.py", "a/b/c.py"):

@@ -27,7 +27,7 @@ SHORTER_THEN = {"4g": "30", "p_d_margin": "60"}
 """How long these ran then, s."""
 
 PUSHED = ("paper", "live-paper.mcap")
-"""What a push looks at."""
+"""What a push looks at: the paper's hands, simulated and live."""
 
 
 @pytest.mark.parametrize(

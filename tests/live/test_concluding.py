@@ -1,6 +1,7 @@
 """`trilat record --conclude`: the recorder judges its log, draws it, and says so with its exit code."""
 
 import json
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import recorder.record_process
 from tests.cli.running import trilat
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_writer import LogStorage
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.scenario import load_scenario
 
 from .processes import Session, Stage
@@ -46,6 +48,16 @@ def test_a_run_that_diverged_fails_though_its_log_is_sound(
     assert "FAIL" not in done.out
     assert (tmp_path / "runs" / "x-001" / "report.html").is_file()  # a folder of its own
     done.refuses("run.mcap", "diverged at t = ", code=1)
+
+
+def test_a_port_in_use_leaves_no_folder(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        words = ("--conclude", "--listen", place, "--connect", *find_free_endpoints(1))
+        done = trilat("record", "--session", "x", *words, cwd=tmp_path)
+    done.refuses("the port is in use", code=done.code)
+    assert done.code != 0
+    assert not list((tmp_path / "runs").iterdir())
 
 
 def test_the_report_of_another_log_is_not_replaced(tmp_path: Path) -> None:

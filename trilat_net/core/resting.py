@@ -31,7 +31,7 @@ from .ticks import LifeReason, Mode
 from .vectors import Array, Row, put
 
 REST_RATE_1_S = 3.0
-"""By how much of the way an arm goes back to the pose in which it rests, in a second."""
+"""By how much of the way an arm goes back to its rest in a second, where its law has no Lambda of joints."""
 
 _WAITING, _HOLD = int(Mode.WAITING), int(Mode.HOLD)
 _FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
