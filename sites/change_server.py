@@ -11,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS
+from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net.bus import Query, QueryInbox

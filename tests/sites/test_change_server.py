@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.change_server import AHEAD_MS, MARKS_WAITING, MIN_RAMP_S, ChangeServer
-from trilat_net.core.site_step import MAX_CHANGES, MAX_RAMPS, Site
+from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
+from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import CoreChange, Mode, TickInput
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox, LocalNetwork

@@ -73,6 +73,34 @@ def _first_sent(s: Row) -> int:
     return first
 
 
+class RecordedFeed(NamedTuple):
+    """What came to the sites of a recorded run from outside, in place of prompt samples and free hands.
+
+    Attributes:
+        first: by site, peer and tick the place of its first arrival, shape (N, P, K + 1); K = 0: every sample
+            comes at the first tick after its stamp.
+        samples: the ticks of the samples that arrive, in order.
+        hands: by site and tick grip, target, and target plus rate of its live hand, shape (N, K, 1 + 2 size).
+        hand_rows: which of a site's torque sources that is, shape (N,); -1: it has none.
+    """
+
+    first: IntArray
+    samples: IntArray
+    hands: Array
+    hand_rows: IntArray
+
+
+@leaf
+def _accept_made(k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords, link: LinkArrays) -> None:
+    """Accepts a sample that its sender has made."""
+    n, m = peer.joints, peer.shared
+    q, qd, tau_x, sent_at = 0, n, 3 * n + 2 * m, _first_sent(peer)
+    if peer.task:
+        q, qd, tau_x = sent_at - 3 * m, sent_at - 2 * m, sent_at - m
+    row = sent.rows[sample & (sent.t_ns.shape[0] - 1)]
+    accept_sample(k, rate_hz, sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
+
+
 @leaf
 def _receive(
     k: int,
@@ -85,18 +113,23 @@ def _receive(
     link: LinkArrays,
 ) -> int:
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
-    n, m = peer.joints, peer.shared
-    q, qd, tau_x, sent_at = 0, n, 3 * n + 2 * m, _first_sent(peer)
-    if peer.task:
-        q, qd, tau_x = sent_at - 3 * m, sent_at - 2 * m, sent_at - m
-    while next_sample < made:
-        page = next_sample & (sent.t_ns.shape[0] - 1)
-        if sent.t_ns[page] >= t_ns:
-            break
-        row = sent.rows[page]
-        accept_sample(k, rate_hz, next_sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
+    while next_sample < made and sent.t_ns[next_sample & (sent.t_ns.shape[0] - 1)] < t_ns:
+        _accept_made(k, rate_hz, peer, next_sample, sent, link)
         next_sample += 1
     return next_sample
+
+
+@leaf
+def _take_hand(i: int, k: int, actors: TorqueSourceRows, feed: RecordedFeed) -> None:
+    """Lets the live hand of a site do what it did at tick k."""
+    if feed.hand_rows[i] < 0 or k >= feed.hands.shape[1]:
+        return
+    hand: Row = actors[feed.hand_rows[i]]
+    size = (feed.hands.shape[2] - 1) // 2
+    hand.grip = feed.hands[i, k, 0]
+    for n in range(min(size, hand.a.shape[0])):
+        hand.a[n] = feed.hands[i, k, 1 + n]
+        hand.b[n] = feed.hands[i, k, 1 + size + n]
 
 
 @leaf
@@ -235,6 +268,7 @@ def sense_site(
     progress: RowArray,
     taken: IntArray,
     sent: KeptRecords,
+    feed: RecordedFeed,
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
@@ -255,8 +289,13 @@ def sense_site(
         )
         sender: Row = arrays.site[j, 0]
         kept = KeptRecords(sent.t_ns[j], sent.rows[j])
-        taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], kept, link)
+        if k + 1 < feed.first.shape[2]:
+            for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
+                _accept_made(k, rate_hz, sender, feed.samples[n], kept, link)
+        else:
+            taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], kept, link)
         recall_sample(k, rate_hz, link)
+    _take_hand(i, k, arrays.actors[i], feed)
     reference_stages(k, t_ns, site, links, arrays.ramps[i], arrays.actors[i], arrays.table, chain)
 
 
@@ -297,6 +336,7 @@ def run_until(
     progress: RowArray,
     taken: IntArray,
     sent: KeptRecords,
+    feed: RecordedFeed,
     peaks: Array,
     sums: RowArray,
     arrays: SiteArrays,
@@ -311,6 +351,7 @@ def run_until(
         progress: of each site, shape (N,), PROGRESS_DTYPE.
         taken: the next sample of each peer to accept, shape (N, P).
         sent: each site's last records.
+        feed: what came from outside in a run that was recorded.
         peaks: of each bucket per joint the largest |e|, then per joint the largest |qd|, then the last q of
             each; -1 where there is no record; shape (N, buckets, 3 n).
         sums: of each site, shape (N,), see `sums_dtype`.
@@ -331,11 +372,11 @@ def run_until(
             if own.t_ns != t_ns:
                 continue
             if chains is None:
-                sense_site(i, progress, taken, sent, arrays, None)
+                sense_site(i, progress, taken, sent, feed, arrays, None)
                 mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, None, laws)
             else:
                 chain = chains[i, : arrays.site[i, 0].joints]
-                sense_site(i, progress, taken, sent, arrays, chain)
+                sense_site(i, progress, taken, sent, feed, arrays, chain)
                 mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, chain, laws)
             if mode == _DIVERGED:
                 own.diverged_ns = t_ns

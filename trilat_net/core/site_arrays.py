@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from .chain import build_chain
 from .channel import LOST
 from .delay import LINK_MODEL_DTYPE, MAX_DELAY_US, LinkModel, max_delay_us
-from .dominance import RAMP_COLUMNS
+from .dominance import RAMP_COLUMNS, fold_ramps
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
 from .link import AHEAD_LIMIT_NS, ChannelArrays, calendar_pages, link_dtype, sample_dtype, span_ticks
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
-from .ticks import MAX_ARRIVALS, NS_PER_S, DominanceRamp, Mode
+from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
@@ -298,6 +298,39 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
         link.model += 1
 
 
+MAX_CHANGES = 4096
+"""Most changes of one link that a site takes besides its scenario's."""
+MAX_RAMPS = 256
+"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number in a run."""
+
+
+def take_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
+    """Takes a change in; one that is planned for later, by the scenario or an earlier order, still comes.
+
+    Args:
+        arrays: of the site.
+        change: the change.
+        t_ns: a time before which the site makes no more ticks, ns since the epoch.
+
+    Raises:
+        ValueError: the arrays have no more room for it.
+    """
+    s: Row = arrays.site[0]
+    if change.order is LifeOrder.OVERRUN:
+        s.skipped = change.skipped
+    elif change.order is not None:
+        s.order = max(s.order, change.order)
+    if change.model is not None:
+        if arrays.links[change.peer].models >= arrays.models.shape[1]:
+            raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
+        add_model(arrays, change.peer, change.model)
+    if change.ramp is not None:
+        s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
+        if s.ramps >= len(arrays.ramps):
+            raise ValueError(f"at most {MAX_RAMPS} changes of the shares of a site wait to begin")
+        add_ramp(arrays, change.ramp)
+
+
 _NEAR_NS = NS_PER_S // 4
 """By how much senders are ahead of a receiver that is a little late: a calendar has pages for that."""
 MAX_LINKS_BYTES = 64 << 20
@@ -308,18 +341,27 @@ _NEVER_SAMPLED = 2
 """Neither evaluated in every stage (0) nor once a tick (1)."""
 
 
-def stack_site_arrays(setups: Sequence[SiteSetup]) -> SiteArrays:
+def stack_site_arrays(
+    setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
+) -> SiteArrays:
     """Returns the arrays of all sites of a run stacked, with links no longer than their delays need.
 
     An array that is shorter than another site's is filled up with rows that are never read.
+
+    Args:
+        setups: of the sites.
+        spare: room for so many more changes of each link and of each site's dominance factors.
+        longest_us: the longest delay of such a change, us.
+        late_ns: by how much samples may come late, ns.
     """
     longest = max(max_delay_us(link.models, link.traces) for setup in setups for link in setup.links)
     fastest_hz = max(setup.rate_hz for setup in setups)
-    pages = calendar_pages(fastest_hz, longest, _SLACK * NS_PER_S // fastest_hz)
+    margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
+    pages = calendar_pages(fastest_hz, max(longest, longest_us), margin_ns)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
     plugged = any(setup.own is not None for setup in setups)
-    sites = [build_site_arrays(setup, pages=pages, layout=largest, plugged=plugged) for setup in setups]
+    sites = [build_site_arrays(one, (spare,) * 2, pages, largest, plugged=plugged) for one in setups]
     first_point = first_torque = 0
     for site in sites:  # one table of points, and one of torques, for all
         site.models["trace_first"] += first_point

@@ -18,19 +18,24 @@ from ..errors import LawFailed
 from .channel import LOST
 from .compiled_law import plug_law
 from .delay import DelayKind
-from .dominance import fold_ramps
 from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
 from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
 from .live_hand import HandInForce, free_hand
-from .site_arrays import LinkRoom, add_model, add_ramp, build_site_arrays, build_tick_buffers
+from .site_arrays import (
+    MAX_CHANGES,
+    MAX_RAMPS,
+    LinkRoom,
+    build_site_arrays,
+    build_tick_buffers,
+    take_change,
+)
 from .site_setup import SiteSetup, StaleAction
 from .ticks import (
     MAX_ARRIVALS,
     NS_PER_S,
     Arrival,
     CoreChange,
-    LifeOrder,
     LifeReason,
     LinkCounts,
     Mode,
@@ -41,11 +46,6 @@ from .vectors import Row
 
 _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
-
-MAX_CHANGES = 4096
-"""Most changes of one link that a site takes besides its scenario's."""
-MAX_RAMPS = 256
-"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number in a run."""
 
 
 class Site:
@@ -119,23 +119,11 @@ class Site:
             t_ns: a time before which the site makes no more ticks, ns since the epoch.
 
         Raises:
-            ValueError: the site has taken `MAX_CHANGES` of a link, or `MAX_RAMPS` wait to begin.
+            ValueError: the arrays have no more room for it.
         """
-        if command.order is LifeOrder.OVERRUN:
-            self._site[0]["skipped"] = command.skipped
-        elif command.order is not None:
-            self._site[0]["order"] = max(self._site[0]["order"], command.order)
+        take_change(self._arrays, command, t_ns)
         if command.model is not None:
-            if self._links[command.peer].models >= self._arrays.models.shape[1]:
-                raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
-            add_model(self._arrays, command.peer, command.model)
             self._room.lengthen(command.peer, command.model)
-        if command.ramp is not None:
-            s: Row = self._site[0]
-            s.ramps = fold_ramps(t_ns, int(s.ramps), self._arrays.ramps)
-            if s.ramps >= len(self._arrays.ramps):
-                raise ValueError(f"at most {MAX_RAMPS} changes of the shares of a site wait to begin")
-            add_ramp(self._arrays, command.ramp)
 
     def begin_at(self, k: int) -> None:
         """Lets tick k be the first one, of a site that joins a running session; for a site without ticks.

@@ -7,6 +7,7 @@ compiled loop cannot run are refused.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from ..core.fused_run import (
     PROGRESS_DTYPE,
     KeptRecords,
     LawArrays,
+    RecordedFeed,
     finish_site,
     largest_of_joints,
     run_until,
@@ -25,9 +27,9 @@ from ..core.fused_run import (
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
-from ..core.site_arrays import select_site, stack_site_arrays
+from ..core.site_arrays import select_site, stack_site_arrays, take_change
 from ..core.site_setup import SiteSetup
-from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, Mode, tick_ns
+from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
 from ..core.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError
 from ..scenario import Scenario
@@ -73,22 +75,56 @@ class RunTotals(NamedTuple):
     walls_j: float | None
 
 
+class RunInputs(NamedTuple):
+    """What a recorded run got from outside, for a run that is to be the same.
+
+    Attributes:
+        feed: arrivals, and what live hands did.
+        changes: the tick before which a site takes a change in, the site's place, and the change, by time.
+        keep: records of a site that a late sample may still ask for.
+        late_ns: by how much samples came late, at the most, ns.
+        longest_us: the longest delay that a change gave a link, us.
+    """
+
+    feed: RecordedFeed
+    changes: Sequence[tuple[int, int, CoreChange]] = ()
+    keep: int = 0
+    late_ns: int = 0
+    longest_us: int = 0
+
+
+def make_prompt_inputs(sites: int) -> RunInputs:
+    """Returns the inputs of a run in virtual time: every sample comes at once, and no live hand acts."""
+    nothing = RecordedFeed(
+        np.zeros((sites, max(sites - 1, 1), 0), np.int64),
+        np.zeros(0, np.int64),
+        np.zeros((sites, 0, 1)),
+        np.full(sites, -1),
+    )
+    return RunInputs(nothing)
+
+
 class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
     Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
-    `keep` of a site's last records are kept for `take_records`.
+    `keep` of a site's last records are kept for `take_records`. With `inputs` it is a recorded run again.
 
     Raises:
         ScenarioError: see `check_fusable`; or a law cannot be made.
     """
 
-    def __init__(self, scenario: Scenario, apart_rad: float = 0.01, keep: int = 0) -> None:
+    def __init__(
+        self, scenario: Scenario, apart_rad: float = 0.01, keep: int = 0, inputs: RunInputs | None = None
+    ) -> None:
         check_fusable(scenario)
         self._scenario = scenario
         self._apart_rad = apart_rad
+        self._inputs = inputs or make_prompt_inputs(len(scenario.names))
         setups = [scenario.setup(name) for name in scenario.names]
-        self._tables = stack_site_arrays(setups)
+        changes = self._inputs.changes
+        self._tables = stack_site_arrays(setups, len(changes), self._inputs.longest_us, self._inputs.late_ns)
+        self._changes = deque(changes)
         self._layouts = [setup.layout for setup in setups]
         self._plug_laws(setups)
         joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
@@ -97,7 +133,7 @@ class FusedRun:
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
         self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
-        kept = 1 << max(_largest_ratio(scenario) + 1, keep).bit_length()
+        kept = 1 << max(_largest_ratio(scenario) + 1, keep, self._inputs.keep).bit_length()
         floats = max(layout.floats for layout in self._layouts)
         self._sent = KeptRecords(np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats)))
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
@@ -130,12 +166,25 @@ class FusedRun:
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def _run_until(self, last_ns: int) -> None:
-        """Steps every site up to a time, see `run_until`.
+        """Steps every site up to a time, and lets them take in the changes that come before it.
 
         Raises:
             LawFailed: a plugged law failed.
         """
-        rows = (self._progress, self._taken, self._sent, self._peaks, self._sums)
+        rates_hz = [int(progress["rate_hz"]) for progress in self._progress]
+        while self._changes and self.diverged_s is None:
+            tick, i, change = self._changes[0]
+            t_ns = tick_ns(tick, rates_hz[i])
+            if t_ns > last_ns:
+                break
+            self._step_until(t_ns - 1)
+            take_change(select_site(self._tables, i, self._layouts[i]), change, t_ns)
+            self._changes.popleft()
+        if self.diverged_s is None:
+            self._step_until(last_ns)
+
+    def _step_until(self, last_ns: int) -> None:
+        rows = (self._progress, self._taken, self._sent, self._inputs.feed, self._peaks, self._sums)
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
             if len(compiled) < len(self._laws):
@@ -151,7 +200,7 @@ class FusedRun:
     def _run_plain_until(self, last_ns: int) -> None:
         """Does as `run_until`, and asks laws in plain Python between the stages."""
         kept, tables, laws = (self._peaks, self._sums), self._tables, self._law_arrays
-        asked = (self._progress, self._taken, self._sent)
+        asked = (self._progress, self._taken, self._sent, self._inputs.feed)
         progress = self._progress
         while (t_ns := int(progress["t_ns"].min())) <= last_ns and t_ns != NEVER_NS:
             for i in np.flatnonzero(progress["t_ns"] == t_ns).tolist():
