@@ -177,9 +177,9 @@ def certify(log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool =
     Raises:
         LogError: the log cannot be read.
     """
-    from .theory.end_pose import certify_with_roots
+    from .theory.end_pose import certify_run
 
-    return certify_with_roots(_open(log), min_coverage=min_coverage, own_laws=own_laws)
+    return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws)
 
 
 def metrics(log: AnyLog) -> LogMetrics:

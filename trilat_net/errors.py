@@ -100,6 +100,10 @@ class LogRefused(LogError):  # noqa: N818 - it names an outcome
     exit_code = 5
 
 
+class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
+    """A run cannot be executed again from its log; the message says why."""
+
+
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
     """A file without anything that could be recovered."""
 

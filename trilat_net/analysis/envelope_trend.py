@@ -87,26 +87,36 @@ def fit_envelope(t_s: Array, error_rad: Array) -> EnvelopeFit:
     return fit_envelopes(t_s, error_rad[:, np.newaxis])[0]
 
 
-def fit_envelopes(t_s: Array, values: Array) -> list[EnvelopeFit]:
-    """Returns the trends of several envelopes, shape (K, C), see `fit_envelope`."""
+def fit_envelopes(
+    t_s: Array, values: Array, floor: float = FLOOR_RAD, *, falls_first: bool = False
+) -> list[EnvelopeFit]:
+    """Returns the trends of several envelopes, shape (K, C), see `fit_envelope`.
+
+    Args:
+        t_s: ascending times, s.
+        values: the envelopes.
+        floor: takes the place of `FLOOR_RAD`.
+        falls_first: what rises after a fall grows as well: the fall is known to be that of other modes.
+    """
     fits = [EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)] * values.shape[1]
     pending = list(range(values.shape[1]))
     for windows in _T_QUANTILES:
-        maxima = _window_maxima(t_s, values[:, pending], windows)
+        maxima = _window_maxima(t_s, values[:, pending], windows, floor)
         if maxima is None:
             continue
-        for n, fit in zip(pending, _fit_maxima(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows), strict=True):
+        found = _fit_maxima(maxima, 0.5 * (t_s[-1] - t_s[0]) / windows, math.log(floor))
+        for n, fit in zip(pending, found, strict=True):
             fits[n] = fit
         pending = [n for n in pending if fits[n].trend is EnvelopeTrend.UNDECIDED]
-    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
-    first_half = _window_maxima(-t_s[::-1], values[::-1, growing], 4) if growing else None
+    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS and not falls_first]
+    first_half = _window_maxima(-t_s[::-1], values[::-1, growing], 4, floor) if growing else None
     if first_half is not None:  # a fall, then a rise: a V
         for n, fell in zip(growing, np.diff(np.log(first_half), axis=0).min(axis=0) >= _RISE, strict=True):
             fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED) if fell else fits[n]
     return fits
 
 
-def _window_maxima(t_s: Array, values: Array, windows: int) -> Array | None:
+def _window_maxima(t_s: Array, values: Array, windows: int, floor: float) -> Array | None:
     """Returns the maxima of equal windows of the second half; None if one has fewer than two points."""
     if not len(t_s):
         return None
@@ -114,11 +124,14 @@ def _window_maxima(t_s: Array, values: Array, windows: int) -> Array | None:
     starts = np.searchsorted(t_s, edges[:-1])
     if np.any(np.diff(np.append(starts, len(t_s))) < 2):
         return None
-    return np.maximum(np.maximum.reduceat(values, starts, axis=0), FLOOR_RAD)
+    return np.maximum(np.maximum.reduceat(values, starts, axis=0), floor)
 
 
-def _fit_maxima(maxima: Array, window_s: float) -> list[EnvelopeFit]:
-    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their logarithms."""
+def _fit_maxima(maxima: Array, window_s: float, dead: float) -> list[EnvelopeFit]:
+    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their logarithms.
+
+    `dead` is the logarithm below which nothing moves.
+    """
     n, values = len(maxima), np.log(maxima)
     x = np.arange(n) - 0.5 * (n - 1)
     spread = float(x @ x)
@@ -129,7 +142,7 @@ def _fit_maxima(maxima: Array, window_s: float) -> list[EnvelopeFit]:
     fits = []
     for slope, bound, quarter in zip(slopes.tolist(), bounds.tolist(), quarters.T, strict=True):
         steps, last = np.diff(quarter), float(quarter[-1])
-        trend = _name_trend(slope * n, bound * n, steps, dead=last <= math.log(FLOOR_RAD))
+        trend = _name_trend(slope * n, bound * n, steps, dead=last <= dead)
         falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
         calm = (falls or (slope + bound) * n <= _CALM) and float(steps[-1]) <= _CALM_STEP
         fits.append(EnvelopeFit(trend, float(slope / window_s), bool(calm)))

@@ -110,6 +110,7 @@ class RunEnd(NamedTuple):
         frequency_hz: frequency of a bounded oscillation; None without one.
         missing_sites: sites without any record, which leave the run undecided.
         error_unit: of |e|: that of angles, or of places in task space.
+        counts_from_s: since when the run counts; the second half from there on is judged, s.
     """
 
     behaviour: EndBehaviour
@@ -124,6 +125,7 @@ class RunEnd(NamedTuple):
     frequency_hz: float | None = None
     missing_sites: tuple[str, ...] = ()
     error_unit: str = "rad"
+    counts_from_s: float = 0.0
 
     @property
     def stability(self) -> Stability:
@@ -245,7 +247,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     acts = late and _choose_judged_part(t_s, acted_s)[1]
     t_s, columns = t_s[first:], [site[kept[first:]] for site in sites]
     missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
-    end = _find_worst_joint(scenario, t_s, columns, sites)._replace(missing_sites=missing)
+    end = _find_worst_joint(scenario, t_s, columns, sites)
+    end = end._replace(missing_sites=missing, counts_from_s=float(t_s[0]) if len(t_s) else 0.0)
     if scenario.sites[scenario.names[0]].task.space == "position":
         end = end._replace(error_unit="m")
     if trace.diverged_at_s is not None:

@@ -24,13 +24,13 @@ def certify_command(
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
     the reasons. 2: no log.
     """
-    from ..theory.end_pose import certify_with_roots
+    from ..theory.end_pose import certify_run
 
     log = terminal.open_with_progress(*files, law=law, other_version=other_version, remember=remember)
     own_laws = own_laws or bool(law)
     if own_laws:
         terminal.warn_user_laws(log)
-    found = certify_with_roots(log, min_coverage=min_coverage, own_laws=own_laws)
+    found = certify_run(log, min_coverage=min_coverage, own_laws=own_laws)
     terminal.print_result(found, as_json=as_json)
     if not found.accepts(accept or ()):
         raise typer.Exit(1)

@@ -9,6 +9,7 @@ compiled loop cannot run are refused.
 import math
 from collections import deque
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from ..errors import LawFailed, ScenarioError
 from ..scenario import Scenario
 from ..scenario.operators import Wall
 from ..scenario.validate import refuse_external_arms
+from .run_state import RunState
 
 
 def check_fusable(scenario: Scenario) -> None:
@@ -216,18 +218,58 @@ class FusedRun:
         """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays as it is."""
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
+        rates_hz = self._progress["rate_hz"].tolist()
+        self.plan([max(1, round(until_s * rate_hz)) for rate_hz in rates_hz])
+        self._run_until(round(until_s * NS_PER_S))
+        self.ran_s = until_s if self.diverged_s is None else self.diverged_s
+
+    def plan(self, ticks: Sequence[int]) -> None:
+        """Lets each site make so many ticks in all."""
         progress: Row
-        for progress in self._progress:
-            progress.ticks = max(1, round(until_s * progress.rate_hz))
-            if progress.tick < progress.ticks:
+        for progress, count in zip(self._progress, ticks, strict=True):
+            progress.ticks = count
+            if progress.tick < count:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
-        buckets = math.ceil(until_s * BUCKETS_PER_S) + 1
-        grown = np.full((len(self._progress), buckets, self._peaks.shape[2]), -1.0)
+        most_s = max(count / rate for count, rate in zip(ticks, self._progress["rate_hz"], strict=True))
+        grown = np.full((len(ticks), math.ceil(most_s * BUCKETS_PER_S) + 1, self._peaks.shape[2]), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
-        last_ns = round(until_s * NS_PER_S)
-        self._run_until(last_ns)
-        self.ran_s = until_s if self.diverged_s is None else self.diverged_s
+
+    def step_to(self, last_ns: int) -> None:
+        """Makes the planned ticks up to a time, ns since the epoch; a diverged run stays as it is."""
+        if self.diverged_s is None:
+            self._run_until(last_ns)
+
+    @cached_property
+    def _state(self) -> RunState:
+        """All that a planned run changes."""
+        laws, arrays = self._law_arrays, self._tables
+        held = [self._progress, self._taken, *self._sent, self._sums]
+        held += [array for array in arrays if isinstance(array, np.ndarray)]
+        held += [] if arrays.channel is None else [*arrays.channel]
+        return RunState([*held, *([] if laws is None else [laws.rows, laws.sent])])
+
+    def copy_state(self, other: "FusedRun") -> None:
+        """Becomes equal to another run of the same scenario, which is planned alike."""
+        self.approach(other, 0.0)
+        self._state.copy(other._state)
+
+    def approach(self, other: "FusedRun", factor: float) -> None:
+        """Becomes another run plus so much of its difference to that, whose records it has made by now."""
+        self._state.approach(other._state, factor)
+        self._changes, self._taken_ticks = deque(other._changes), list(other._taken_ticks)
+        for i, law in self._laws.items():
+            if isinstance(law, PlainLaw):
+                own, its = np.array(law.memory), np.array(other._laws[i].memory)
+                law.recall((its + factor * (own - its)).tolist())
+
+    def push(self, field: str, by: Array) -> None:
+        """Adds to a field of every site's state, shape (N, n)."""
+        self._tables.site[field][:, 0, : by.shape[1]] += by
+
+    def measure_distance(self, other: "FusedRun", field: str) -> float:
+        """Returns by how much a field of the sites' state differs at the most."""
+        return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
 
     def advance_watching(self, until_s: float, states: int = 100) -> tuple[Array, Array]:
         """Continues the run; returns q, (K, N, 2), rad, and theta_hat, (K, N, 5), of its last quarter."""

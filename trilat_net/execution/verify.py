@@ -17,8 +17,9 @@ import msgspec
 
 from .. import process
 from ..core.fingerprint import compute_fingerprint
+from ..core.site_arrays import MAX_RAMPS
 from ..core.site_setup import StaleAction
-from ..core.site_step import MAX_RAMPS, Site
+from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
 from ..log.accounting import Coverage

@@ -11,7 +11,9 @@ import numpy as np
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.observed_energy import ObservedFinding
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
+from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
+from ..analysis.twin_growth import TwinGrowth
 from .result_text import Block, MarkedText
 from .text_table import TextTable
 
@@ -82,6 +84,8 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     if found.roots is not None:
         doubtful = not found.roots.exact and found.roots.verdict == "stable"
         lines.append(("note" if doubtful else _ROOTS.get(found.roots.verdict, "note"), found.roots.text))
+    if found.twins is not None:
+        lines.append((_mark_twins(found.twins), found.twins.text))
     intact = "open" if found.evidence.reasons else "ok"
     mark = intact if found.evidence.integrity.passed else "FAIL"
     lines.append((mark, f"log: {found.evidence.text}"))
@@ -105,6 +109,15 @@ _OBSERVED = {
     ObservedFinding.NOT_JUDGED: "open",
 }
 _ROOTS = {"stable": "ok", "unstable": "open"}
+
+
+def _mark_twins(twins: TwinGrowth) -> str:
+    """Returns what twins say for a run or against it."""
+    if not twins.pushes:
+        return "note"
+    if twins.grows or twins.left is not None:
+        return "FAIL"
+    return "ok" if twins.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) else "open"
 
 
 def describe_balance(balance: EnergyBalance) -> str:

@@ -21,7 +21,7 @@ from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..results import Result
 from ..scenario.imported_law import allowed_laws
-from ..theory.end_pose import certify_with_roots
+from ..theory.end_pose import certify_run
 from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
 from .result_text import Block, MarkedText
 from .summary_text import format_run_lines
@@ -102,7 +102,7 @@ def conclude(
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_laws))
         twin = _run_without_operators(log)
-        certificate = certify_with_roots(log, min_coverage=min_coverage)
+        certificate = certify_run(log, min_coverage=min_coverage)
         notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
 
         def verdicts() -> Iterator[CheckLine]:

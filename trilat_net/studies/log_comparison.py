@@ -18,7 +18,7 @@ from ..reporting.text_table import TextTable
 from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
-from ..theory.end_pose import certify_with_roots
+from ..theory.end_pose import certify_run
 from .intervals import MeanInterval, mean_interval
 from .tuning.final_posture import check_final_posture
 
@@ -98,7 +98,7 @@ def compare_logs(logs: Sequence[Log]) -> LogComparison:
         raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
     names = name_columns([Path(log.sources[0]) for log in logs])
     remarks = {
-        name: [describe_judgement(certify_with_roots(log)), *check_final_posture(log)]
+        name: [describe_judgement(certify_run(log)), *check_final_posture(log)]
         for name, log in zip(names, logs, strict=True)
     }
     found = compare_metrics(logs, names)

@@ -2,7 +2,7 @@
 
 Invariant: the roots are those at the log's own end pose and estimates, under the conditions at its end; they
 speak of small motions there. Where a delay varies, or was measured, they are those of the mean age that the
-records have. Nothing is executed.
+records have. Only twins are executed.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ import numpy as np
 from ..analysis.certificate.stability_certificate import Certificate, EndPoseRoots, certify
 from ..analysis.run_end import SETTLED_SPEED_RAD_S
 from ..analysis.timeline import recorded_end_s
+from ..analysis.twin_growth import TWINS, measure_twins
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..log.integrity import MIN_COVERAGE
@@ -30,16 +31,19 @@ _ROOTS = 2
 """Roots that are looked for: the rightmost ones."""
 
 
-def certify_with_roots(
-    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False
+def certify_run(
+    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
 ) -> Certificate:
-    """Returns the certificate of a log, with the roots of the loop where the run ended; see `certify`.
+    """Returns the certificate of a log, with the roots of the loop where the run ended, and so many twins.
+
+    See `certify`.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
     found = certify(log, min_coverage=min_coverage, own_laws=own_laws)
-    return replace(found, roots=find_end_pose_roots(log))
+    growth = measure_twins(log, found.end, twins, own_laws=own_laws) if twins else None
+    return replace(found, roots=find_end_pose_roots(log), twins=growth)
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:

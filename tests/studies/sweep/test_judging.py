@@ -21,7 +21,7 @@ from trilat_net.studies.sweep.cell_result import (
     is_conclusive,
 )
 from trilat_net.studies.trials.measure_run import measure_virtual_run
-from trilat_net.theory.end_pose import certify_with_roots
+from trilat_net.theory.end_pose import certify_run
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),
@@ -145,7 +145,7 @@ def test_a_cell_and_a_trial_see_no_roots() -> None:
     scenario = load_scenario("p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0})
     assert classify_cell(scenario.text, 5.0).verdict is CellClass.CONVERGED
     assert measure_virtual_run(scenario).end.stability is Stability.STABLE
-    found = certify_with_roots(trilat_net.simulate(scenario))
+    found = certify_run(trilat_net.simulate(scenario))
     assert found.end.stability is Stability.STABLE
     assert found.stability is Stability.OPEN
     assert [reason[:19] for reason in found.reasons] == ["this rest: unstable"]

@@ -21,6 +21,7 @@ from ...results import Result
 from ..json_values import JsonObject, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
+from ..twin_growth import TwinGrowth, TwinVerdict, judge_end_by_twins
 from . import energy_terms
 from .energy_balance import (
     EXTERNAL_SOURCES,
@@ -130,6 +131,7 @@ class Certificate(Result):
         energies: of every site; {} without a functional.
         roots: of the loop where the run ended; None if nobody looked.
         observed: of the energies that laws declare; None if none does.
+        twins: what became of small pushes; None if nobody looked.
     """
 
     premises: list[Premise]
@@ -142,6 +144,7 @@ class Certificate(Result):
     energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
     roots: EndPoseRoots | None = None
     observed: ObservedEnergy | None = None
+    twins: TwinGrowth | None = None
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
@@ -173,12 +176,27 @@ class Certificate(Result):
             found.append(self.roots.text)
         if self.observed is not None and self.observed.refuted:
             found.append(self.observed.text)
-        return (*self.end.reasons, *found, *self.evidence.reasons)
+        told = self._by_twins.reason
+        return (*self.end.reasons, *([told] if told else []), *found, *self.evidence.reasons)
+
+    @property
+    def _by_twins(self) -> TwinVerdict:
+        """The judgement of the end of the run and of its twins together."""
+        if self.twins is None:
+            return TwinVerdict(self.end.stability)
+        exact = self.roots is not None and self.roots.exact
+        proved = self.verdict.finding is StabilityFinding.COVERED
+        return judge_end_by_twins(
+            self.end,
+            self.twins,
+            settles=proved or (exact and self.roots is not None and self.roots.verdict == "stable"),
+            rises=self.verdict.finding is StabilityFinding.ROSE,
+        )
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run: that of its end; what else is known may only make a stable one open."""
-        own = self.end.stability
+        """The judgement: of its end and its twins; what else is known may leave a stable run open."""
+        own = self._by_twins.stability
         return Stability.OPEN if own is Stability.STABLE and self.reasons else own
 
     @property
@@ -411,6 +429,7 @@ def certificate_to_json(certificate: Certificate) -> JsonObject:
         "evidence": certificate.evidence.to_json(),
         "roots": None if certificate.roots is None else certificate.roots._asdict(),
         "observed": None if certificate.observed is None else certificate.observed.to_json(),
+        "twins": None if certificate.twins is None else certificate.twins.to_json(),
         "functional": None if balance is None else _functional_to_json(certificate, balance),
     }
 

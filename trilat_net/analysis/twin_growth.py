@@ -1,0 +1,362 @@
+"""What became of small pushes in a run: by how much they grew or died, at the end and in between.
+
+Invariant: a push is judged by the velocities of its twin minus those of the run, which a shift of all arms
+to another rest leaves at zero. Sites that no shares connect are judged by themselves: what one does hides no
+other.
+
+The amplitude of a difference d at 20 Hz is A, A^2 = sum over joints of d^2 + (d' / w)^2, with w the frequency
+that makes both parts equal on average: of a single mode it goes as exp(rate t), without its swing. The rate
+is the slope of log A over the judged part, with the bounds and words of `envelope_trend`.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.ticks import BUCKETS_PER_S
+from ..core.vectors import Array
+from ..errors import NotRepeatable
+from ..execution.twins import Push, TwinPath, Twins, choose_pushes, run_twins
+from ..log.log_reader import Log
+from ..scenario import Scenario
+from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .json_values import finite_or_none
+from .run_end import (
+    EndBehaviour,
+    RunEnd,
+    Stability,
+    find_coupled_sites,
+    find_last_change,
+    find_last_operator_action,
+)
+
+TWINS = 8
+"""Twins of a run, unless asked for others."""
+LEAST_LEFT_S = 5.0
+"""A run that leaves a rest by itself does so for this time or longer, s,"""
+LEFT_BY = 2.0
+"""faster by this factor at the end of it than at its beginning."""
+_ORDER = (
+    EnvelopeTrend.DECAYS,
+    EnvelopeTrend.HARDLY,
+    EnvelopeTrend.UNDECIDED,
+    EnvelopeTrend.STEADY,
+    EnvelopeTrend.GROWS,
+)
+_NOTHING = 1e-300
+
+
+class PushGrowth(NamedTuple):
+    """What became of one push in sites that shares connect, over the judged part of a run.
+
+    Attributes:
+        push: the push.
+        trend: of the difference.
+        rate_per_s: it goes as exp(rate t), 1/s; NaN if the part is too short.
+        factor: by how much it changed over the part; 0: it died down to the rounding of the numbers.
+        joint: the joint at which it is largest at the end.
+        group: the place of those sites among the groups.
+    """
+
+    push: Push
+    trend: EnvelopeTrend
+    rate_per_s: float
+    factor: float
+    joint: str
+    group: int
+
+    def __str__(self) -> str:
+        size = float(np.abs(self.push.by).max())
+        return f"{self.push.name}, {size:g}" if self.push.field == "q" else self.push.name
+
+
+class LeftRest(NamedTuple):
+    """A time in which a run went away from a rest, and from its twins, while nobody acted on it."""
+
+    from_s: float
+    to_s: float
+    rate_per_s: float
+    joint: str
+
+
+class TwinGrowth(NamedTuple):
+    """What became of all pushes of a run.
+
+    Attributes:
+        why: why there are no twins; "" if there are.
+        from_s, to_s: the judged part, s.
+        pushes: of each push and group of sites what became of it.
+        left: when it left a rest by itself; None: it did not.
+        same: False if the run was repeated on another platform, whose last bits differ.
+        random: True if anything in the run's links is drawn: slow trends are chance then.
+    """
+
+    why: str
+    from_s: float = 0.0
+    to_s: float = 0.0
+    pushes: tuple[PushGrowth, ...] = ()
+    left: LeftRest | None = None
+    same: bool = True
+    random: bool = False
+
+    @property
+    def worst(self) -> PushGrowth | None:
+        """The push that grew most, or died most slowly."""
+        return max(self.pushes, key=lambda one: (_ORDER.index(one.trend), one.rate_per_s), default=None)
+
+    @property
+    def trend(self) -> EnvelopeTrend:
+        """Of the worst push; undecided without twins."""
+        return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
+
+    @property
+    def grows(self) -> bool:
+        """True if half of the pushes of some sites or more grow; by a factor of two if links are random."""
+        for group in {one.group for one in self.pushes}:
+            own = [one for one in self.pushes if one.group == group]
+            least = LEFT_BY if self.random else 1.0
+            growing = sum(one.trend is EnvelopeTrend.GROWS and one.factor >= least for one in own)
+            if 2 * growing >= len(own):
+                return True
+        return False
+
+    @property
+    def needs_s(self) -> float | None:
+        """How long a run would have to be for a fall at this rate to be clear, s; None if nothing falls."""
+        worst = self.worst
+        if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
+            return None
+        return self.to_s + 4.0 * math.log(2.0) / -worst.rate_per_s
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what is found, ready for JSON."""
+        return {
+            "trend": None if self.worst is None else self.trend.name.lower(),
+            "from_s": self.from_s,
+            "to_s": self.to_s,
+            "pushes": [
+                {
+                    "push": str(one),
+                    "trend": one.trend.name.lower(),
+                    "rate_per_s": finite_or_none(one.rate_per_s),
+                    "factor": one.factor,
+                    "joint": one.joint,
+                }
+                for one in self.pushes
+            ],
+            "left": None if self.left is None else self.left._asdict(),
+            "needs_s": self.needs_s,
+            "same_bits": self.same,
+            "text": self.text,
+        }
+
+    @property
+    def text(self) -> str:
+        """What is found, in one sentence."""
+        worst = self.worst
+        if worst is None:
+            return f"twins: {self.why}"
+        if self.left is not None:
+            left = self.left
+            return (
+                f"twins: from {left.from_s:.4g} to {left.to_s:.4g} s the run and its twins left a rest by "
+                f"themselves, at {left.rate_per_s:+.3g} /s, most at {left.joint}"
+            )
+        over = f"over {self.to_s - self.from_s:.4g} s"
+        if worst.factor == 0.0:
+            return f"twins: every push died down to the rounding of the numbers {over}"
+        how = "grows" if worst.factor >= 1.0 else "falls"
+        changed = f"{how} x {worst.factor:.3g} {over}, {worst.rate_per_s:+.3g} /s, most at {worst.joint}"
+        if self.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
+            return f"twins: every push dies away; the slowest ({worst}) {changed}"
+        more = "" if self.needs_s is None else f"; a run of {self.needs_s:.3g} s would tell"
+        known = "" if self.trend is EnvelopeTrend.GROWS else f", {worst.trend}"
+        return f"twins: a push ({worst}) {changed}{known}{more}"
+
+
+class TwinVerdict(NamedTuple):
+    """The judgement of a run's end and of its twins together; the reason, if twins changed or doubt it."""
+
+    stability: Stability
+    reason: str = ""
+
+
+def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool, rises: bool) -> TwinVerdict:
+    """Returns the judgement of a run by its end and by its twins.
+
+    What grows away from its twins is not stable, wherever it is; what comes together with them is not said to
+    grow. A stable run needs pushes that die away; where small motions are known to settle, none that grows.
+
+    Args:
+        end: the end of the run.
+        twins: what became of small pushes.
+        settles: small motions are known to settle: by roots that are exact, or by the theorem.
+        rises: V rose by what nobody gave.
+    """
+    own, trend = end.stability, twins.trend
+    if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
+        return TwinVerdict(own)
+    if (twins.left is not None or twins.grows) and not end.operator_acts:
+        return TwinVerdict(Stability.NOT_STABLE, twins.text)
+    dies = trend is EnvelopeTrend.DECAYS or (trend is EnvelopeTrend.HARDLY and settles)
+    if own is Stability.STABLE and not (dies or trend is EnvelopeTrend.HARDLY):
+        doubtful = trend is EnvelopeTrend.GROWS or not settles
+        return TwinVerdict(Stability.OPEN, twins.text) if doubtful else TwinVerdict(own)
+    if own is Stability.NOT_STABLE:
+        alone = end.behaviour is EndBehaviour.GROWS and trend is not EnvelopeTrend.GROWS and not rises
+        return TwinVerdict(Stability.OPEN, twins.text) if dies or alone else TwinVerdict(own)
+    trendless = end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED) and not end.missing_sites
+    if trendless and dies and settles and not (end.reasons or end.operator_acts):
+        return TwinVerdict(Stability.STABLE)
+    return TwinVerdict(own)
+
+
+def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool = False) -> TwinGrowth:
+    """Returns what became of small pushes in a run, of which its end is known already.
+
+    Raises:
+        LogError: a record cannot be read.
+    """
+    try:
+        twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
+    except NotRepeatable as why:
+        return TwinGrowth(str(why).removeprefix("no twins: "))
+    return judge_twins(log.scenario, twins, end.counts_from_s, find_quiet_from_s(log))
+
+
+def find_quiet_from_s(log: Log) -> float:
+    """Returns since when nobody acts on a run and its loop does not change, s."""
+    ends_s = [len(log[name]) / log[name].rate_hz for name in log.sites]
+    changed_s = [tick / log[name].rate_hz for name in log.sites for tick in log.changes(name)]
+    acted_s = [
+        float(part.t_s[part.hand[:, 0] > 0.0].max(initial=0.0))
+        for part in map(log.__getitem__, log.sites)
+        if part.layout.hand
+    ]
+    known_s = (
+        find_last_operator_action(log.scenario, max(ends_s)),
+        find_last_change(log.scenario, max(ends_s)),
+    )
+    return max([0.0, *changed_s, *acted_s, *known_s])
+
+
+def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_from_s: float) -> TwinGrowth:
+    """Returns what became of the twins of a run.
+
+    Args:
+        scenario: of the run.
+        twins: its twins.
+        counts_from_s: since when the run counts: the second half from there on is judged, s.
+        quiet_from_s: since when nobody acts on it, and its loop does not change, s.
+    """
+    t_s = twins.paths[0].t_s
+    rows = np.flatnonzero(twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1))
+    end = int(rows[-1]) if len(rows) else 0  # the last interval may be of one tick
+    first = min(int(np.searchsorted(t_s, counts_from_s)), end)
+    pushes, left = [], []
+    for place, group in enumerate(_find_joints_by_group(scenario)):
+        amplitudes = [_measure_amplitude(path, group) for path in twins.paths]
+        for path, amplitude in zip(twins.paths, amplitudes, strict=True):
+            if np.isfinite(amplitude[first:end]).any():
+                judged = _judge_push(path, amplitude, group, slice(first, end))
+                pushes.append(PushGrowth(path.push, *judged[:3], twins.joints[judged[3]], place))
+        quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
+        left += list(_find_departures(twins, amplitudes, group, quiet))
+    return TwinGrowth(
+        "" if pushes else "no push moved anything",
+        from_s=0.5 * float(t_s[first] + t_s[end]),
+        to_s=float(t_s[end]),
+        pushes=tuple(pushes),
+        left=max(left, key=lambda one: one.rate_per_s, default=None),
+        same=twins.same,
+        random=scenario.links_random,
+    )
+
+
+def _find_joints_by_group(scenario: Scenario) -> list[list[int]]:
+    """Returns the places of the joints of sites that shares connect."""
+    counts = [scenario.layout(name).joints for name in scenario.names]
+    first = np.cumsum([0, *counts]).tolist()
+    return [
+        [joint for site in group for joint in range(first[site], first[site + 1])]
+        for group in find_coupled_sites(scenario)
+    ]
+
+
+def _measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
+    """Returns the logarithm of the amplitude of a difference, shape (K,); -inf where there is none."""
+    largest = path.largest[:, group].max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+        peak = np.max(largest, where=np.isfinite(largest), initial=-np.inf)
+        d = path.last[:, group] * np.exp(path.scale - peak)[:, np.newaxis]
+        rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
+        around = np.exp(2.0 * (_running_maximum(largest) - peak))
+        usable = np.isfinite(largest) & (around > 0.0)
+        weights = np.where(usable, 1.0 / around, 0.0)[:, np.newaxis]
+        omega2 = float((weights * rate**2).sum() / (weights * d**2).sum())
+        whole = np.log((d**2 + rate**2 / omega2).sum(axis=1)) / 2.0 + peak
+    amplitude: Array = np.where(np.isfinite(whole), np.maximum(whole, largest), largest)
+    return amplitude
+
+
+def _running_maximum(values: Array) -> Array:
+    """Returns the largest of each second."""
+    padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
+    found: Array = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1).max(axis=1)
+    return found
+
+
+def _fit(t_s: Array, amplitude: Array) -> EnvelopeFit:
+    """Returns the trend of the second half of an amplitude, given by its logarithm."""
+    known = np.isfinite(amplitude)
+    if known.sum() < 2:
+        return EnvelopeFit(EnvelopeTrend.UNDECIDED, float("nan"))
+    values = np.exp(np.where(known, amplitude, -np.inf) - amplitude[known].max())
+    return fit_envelopes(t_s, values[:, np.newaxis], _NOTHING, falls_first=True)[0]
+
+
+def _judge_push(
+    path: TwinPath, amplitude: Array, group: Sequence[int], part: slice
+) -> tuple[EnvelopeTrend, float, float, int]:
+    """Returns trend, rate and factor of a push, and where it is largest at the end.
+
+    One that died down and was pushed anew counts from the last time, if that is long enough ago.
+    """
+    t_s, first, end = path.t_s, part.start, part.stop
+    begun = max([at for at in path.pushed if at < end], default=0)
+    recent = path.largest[max(first, end - BUCKETS_PER_S) : end, group].max(axis=0)
+    joint = group[int(recent.argmax())]
+    since = max(first, begun)
+    fit = _fit(t_s[since:end], amplitude[since:end])
+    died = len(path.pushed) > 1 and begun > (first + end) // 2  # within the judged part
+    if died and (fit.trend is not EnvelopeTrend.GROWS or end - begun < (end - first) // 4):
+        return EnvelopeTrend.DECAYS, fit.rate_per_s, 0.0, joint
+    half_s = 0.5 * float(t_s[end - 1] - t_s[since])
+    return fit.trend, fit.rate_per_s, math.exp(fit.rate_per_s * half_s), joint
+
+
+def _find_departures(
+    twins: Twins, amplitudes: Sequence[Array], group: Sequence[int], quiet: slice
+) -> Iterator[LeftRest]:
+    """Yields the times in which a run that is left alone gets faster, and its twins leave it."""
+    t_s = twins.paths[0].t_s
+    with np.errstate(divide="ignore"):
+        speed = np.log(twins.speed[:, group].max(axis=1))
+    length = quiet.stop - quiet.start
+    for part in (2, 4, 8):
+        size = length // part
+        if size < LEAST_LEFT_S * BUCKETS_PER_S:
+            return
+        for start in range(quiet.start, quiet.stop - 2 * size + 1, max(1, size // 2)):
+            rows = slice(start, start + 2 * size)  # of which the second half is judged
+            own = _fit(t_s[rows], speed[rows])
+            rate_per_s = own.rate_per_s
+            if own.trend is not EnvelopeTrend.GROWS or rate_per_s * size < np.log(LEFT_BY) * BUCKETS_PER_S:
+                continue
+            fits = [_fit(t_s[rows], amplitude[rows]) for amplitude in amplitudes]
+            if 2 * sum(fit.trend is EnvelopeTrend.GROWS for fit in fits) >= len(fits):
+                last = twins.speed[rows.stop - BUCKETS_PER_S : rows.stop, group].max(axis=0)
+                joint = twins.joints[group[int(last.argmax())]]
+                yield LeftRest(float(t_s[start + size]), float(t_s[rows.stop - 1]), rate_per_s, joint)

@@ -1,0 +1,284 @@
+"""Twins of a run: the same run again, pushed by a little at an instant.
+
+Invariant: the run is executed again from its own inputs and compared with its records, bit for bit. A twin
+gets the same arrivals, changes, hands and random delays; so what differs is the push and what became of it,
+and nothing else. Nothing of the difference is a model.
+
+A difference that has grown is made small again along itself (Benettin, Galgani, Giorgilli and Strelcyn,
+Meccanica 15, 1980): all numbers of the twin's state, past samples included, go back to the run's plus a
+fraction of the difference, and what is counted goes on from where it was. One that has died down to the
+rounding of the numbers is pushed anew.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.site_setup import Law
+from ..core.ticks import BUCKETS_PER_S, NS_PER_S
+from ..core.vectors import Array
+from ..errors import NotRepeatable
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..scenario import Scenario
+from .fused import FusedRun, RunInputs
+from .log_inputs import explain_no_repetition, read_run_inputs
+
+PUSH_RAD = 1e-6
+"""The usual push, rad."""
+LARGEST = 1e-4
+"""A difference larger than this, rad or rad/s, is made small again at the end of its window."""
+SMALLEST = 1e-12
+"""One smaller than this is lost in the rounding of the numbers."""
+WINDOWS = 16
+"""Windows of a run, at whose ends differences are looked at."""
+
+
+class Push(NamedTuple):
+    """A push of a twin.
+
+    Attributes:
+        name: what is pushed, in words, as "m1 joint 1".
+        field: "q", rad; "qd", rad/s; or "theta_hat".
+        by: of each site and number the push, shape (N, n).
+        at_s: the instant, s since the epoch; a twin that died down is pushed again, at the end of a window.
+    """
+
+    name: str
+    field: str
+    by: Array
+    at_s: float = 0.0
+
+
+class TwinPath(NamedTuple):
+    """What became of a push.
+
+    Attributes:
+        push: the push.
+        t_s: ends of intervals of 50 ms, shape (K,), s.
+        largest: logarithm of the largest difference of velocities in an interval, rad/s, of every joint of
+            all sites, as if nothing had been made small again, shape (K, J); -inf where there is none.
+        last: the difference at the last tick of an interval, shape (K, J), rad/s, with
+        scale: the logarithm of the factor by which it was made small, shape (K,).
+        pushed: the places in `t_s` at which it was pushed.
+    """
+
+    push: Push
+    t_s: Array
+    largest: Array
+    last: Array
+    scale: Array
+    pushed: tuple[int, ...]
+
+
+class Twins(NamedTuple):
+    """The twins of a run.
+
+    Attributes:
+        paths: of each push.
+        joints: names of the joints, as in "m1 joint 1".
+        speed: the largest speed of every joint of the run itself in an interval, shape (K, J), rad/s.
+        same: True if the run that was executed again has the bits of the records.
+    """
+
+    paths: Sequence[TwinPath]
+    joints: tuple[str, ...]
+    speed: Array
+    same: bool
+
+
+def list_joints(scenario: Scenario) -> tuple[str, ...]:
+    """Returns the names of all joints, site by site."""
+    return tuple(
+        f"{name} joint {joint + 1}"
+        for name in scenario.names
+        for joint in range(scenario.layout(name).joints)
+    )
+
+
+def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> list[Push]:
+    """Returns so many pushes: each joint, as far as they go, the estimates, and random ones of all joints.
+
+    The random ones are by less and by more than `delta`: growth that is not of small motions alone differs.
+    """
+    layouts = [scenario.layout(name) for name in scenario.names]
+    joints, most = list_joints(scenario), max(layout.joints for layout in layouts)
+    owners = [(i, joint) for i, layout in enumerate(layouts) for joint in range(layout.joints)]
+    chance = np.random.Generator(np.random.Philox(0))
+    pushes = []
+    if count > 2 and any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names):
+        shape = len(layouts), max(layout.parameters for layout in layouts)
+        pushes.append(Push("the estimates", "theta_hat", delta * chance.uniform(-1.0, 1.0, shape)))
+    for factor in (1.0, 1e-3, 1e3)[: max(1, min(3, count - len(owners) - len(pushes)))]:
+        by = np.zeros((len(layouts), most))
+        for i, joint in owners:
+            by[i, joint] = factor * delta * chance.uniform(-1.0, 1.0)
+        pushes.append(Push(f"all joints by {factor * delta:g} rad", "q", by))
+    for n, (i, joint) in enumerate(owners[: max(0, count - len(pushes))]):
+        by = np.zeros((len(layouts), most))
+        by[i, joint] = delta
+        pushes.append(Push(joints[n], "q", by))
+    return pushes[:count]
+
+
+def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
+    """Executes a run again, and a twin of it for every push.
+
+    Raises:
+        NotRepeatable: it cannot be executed again, or is another run here.
+        LogError: a record cannot be read.
+    """
+    if why := explain_no_repetition(log, own_laws=own_laws):
+        raise NotRepeatable(f"no twins: {why}")
+    ticks = [len(log[name]) for name in log.scenario.names]
+    return _TwinRuns(log.scenario, pushes, ticks, read_run_inputs(log), log).run()
+
+
+def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
+    """Makes a run of a scenario in virtual time, and a twin of it for every push.
+
+    Raises:
+        ScenarioError: virtual time cannot run it.
+        NotRepeatable: a push is beyond its end.
+    """
+    ticks = [max(1, round(duration_s * scenario.sites[name].rate_hz)) for name in scenario.names]
+    return _TwinRuns(scenario, pushes, ticks).run()
+
+
+class _TwinRuns:
+    """A run of so many ticks of each site and its twins, side by side; of a log, if there is one."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        pushes: Sequence[Push],
+        ticks: Sequence[int],
+        inputs: RunInputs | None = None,
+        log: Log | None = None,
+    ) -> None:
+        self._log, self._pushes = log, pushes
+        self._layouts = [scenario.layout(name) for name in scenario.names]
+        rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+        self._ends = _choose_ends(pushes, max(n / hz for n, hz in zip(ticks, rates_hz, strict=True)))
+        keep = math.ceil(float(np.diff(self._ends, prepend=0.0).max()) * max(rates_hz)) + 2
+        runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
+        for run in runs:
+            run.plan(ticks)
+        self._run, self._twins = runs[0], runs[1:]
+        self._joints = list_joints(scenario)
+        shape = math.ceil(self._ends[-1] * BUCKETS_PER_S) + 1, len(self._joints)
+        self._largest = np.full((len(pushes), *shape), -np.inf)
+        self._last = np.zeros((len(pushes), *shape))
+        self._scales = np.zeros((len(pushes), shape[0]))
+        self._scale = np.zeros(len(pushes))
+        self._speed = np.zeros(shape)
+        self._pushed: list[list[int]] = [[] for _ in pushes]
+        self._same = True
+
+    def run(self) -> Twins:
+        """Makes all windows."""
+        for n, push in enumerate(self._pushes):
+            if push.at_s == 0.0:
+                self._push(n, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for end_s in self._ends.tolist():
+                self._make_window(end_s)
+            return self._collect()
+
+    def _make_window(self, end_s: float) -> None:
+        last_ns = math.ceil(end_s * NS_PER_S) - 1
+        self._run.step_to(last_ns)
+        kept = self._run.take_records()
+        if self._log is not None:
+            self._compare(self._log, kept)
+        for at, starts, qd, _ in self._cut(kept, kept):
+            self._speed[at] = np.maximum(self._speed[at], np.maximum.reduceat(np.abs(qd), starts, axis=0))
+        for n, twin in enumerate(self._twins):
+            if self._pushed[n]:
+                twin.step_to(last_ns)
+                self._measure(n, kept, twin.take_records())
+                self._renew(n, end_s)
+            elif self._pushes[n].at_s <= end_s:
+                twin.copy_state(self._run)
+                self._push(n, end_s)
+
+    def _push(self, n: int, at_s: float) -> None:
+        """Lets a twin, which is as the run is, have its push."""
+        push = self._pushes[n]
+        self._twins[n].push(push.field, push.by)
+        self._pushed[n].append(round(at_s * BUCKETS_PER_S))
+        self._scale[n] = 0.0
+
+    def _compare(self, log: Log, kept: Sequence[tuple[Ints, Array]]) -> None:
+        """Compares records of the run that was executed again with those of the log."""
+        for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, kept, strict=True):
+            part, columns = log[name], layout.columns()
+            first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
+            here = slice(first, first + len(t_ns))
+            for signal, recorded in (("q", part.q[here]), ("qd", part.qd[here]), ("tau", part.tau[here])):
+                apart = np.abs(rows[:, columns[signal]] - recorded).max(initial=0.0)
+                self._same &= bool(apart == 0.0)
+                if not apart <= SAME_RUN:
+                    raise NotRepeatable(
+                        f"no twins: executed again, {signal} of {name} is off by {apart:.2g}: it is not the "
+                        "run of these records (trilat verify)"
+                    )
+
+    def _cut(
+        self, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
+    ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
+        """Yields of every site where its intervals stand, where each begins, and the velocities of both."""
+        place = 0
+        for layout, (t_ns, rows), (own_ns, own_rows) in zip(self._layouts, kept, own, strict=True):
+            qd, made = layout.columns()["qd"], min(len(t_ns), len(own_ns))
+            if made:
+                buckets = t_ns[:made] * BUCKETS_PER_S // NS_PER_S
+                starts = np.flatnonzero(np.diff(buckets, prepend=-1))
+                at = np.ix_(buckets[starts], np.arange(place, place + layout.joints))
+                yield at, starts, rows[:made, qd], own_rows[:made, qd]
+            place += layout.joints
+
+    def _measure(self, n: int, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]) -> None:
+        """Enters how far apart the velocities of a twin and of the run are, interval by interval."""
+        for at, starts, qd, own_qd in self._cut(kept, own):
+            apart = own_qd - qd
+            largest = np.log(np.maximum.reduceat(np.abs(apart), starts, axis=0)) + self._scale[n]
+            self._largest[n][at] = np.maximum(self._largest[n][at], largest)
+            self._last[n][at] = apart[np.append(starts[1:], len(apart)) - 1]
+            self._scales[n, at[0].reshape(-1)] = self._scale[n]
+
+    def _renew(self, n: int, end_s: float) -> None:
+        """Makes a difference that grew small again, and pushes one anew that died down."""
+        twin, last = self._twins[n], round(end_s * BUCKETS_PER_S)
+        q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
+        recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]
+        if not math.isfinite(q + qd) or max(q, qd) > LARGEST:
+            factor = float(np.abs(self._pushes[n].by).max()) / max(q, qd)
+            twin.approach(self._run, factor)
+            self._scale[n] -= math.log(factor)
+        elif recent < math.log(SMALLEST):
+            twin.copy_state(self._run)
+            self._push(n, end_s)
+
+    def _collect(self) -> Twins:
+        t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
+        paths = [
+            TwinPath(push, t_s, self._largest[n], self._last[n], self._scales[n], tuple(self._pushed[n]))
+            for n, push in enumerate(self._pushes)
+        ]
+        return Twins(paths, self._joints, self._speed, self._same)
+
+
+def _choose_ends(pushes: Sequence[Push], end_s: float) -> Array:
+    """Returns the ends of windows, s: equal ones, and each instant of a push."""
+    if any(not 0.0 <= push.at_s < end_s for push in pushes):
+        raise NotRepeatable(f"no twins: a push lies within the run, from 0 s until before {end_s:g} s")
+    pushed = {push.at_s for push in pushes} - {0.0}
+    equal = np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
+    return np.array(sorted({*equal.tolist(), *pushed}))
+
+
+SAME_RUN = 1e-7
+"""Executed on another platform, where the last bits differ, a run may be so far from its records, rad."""
