@@ -226,9 +226,10 @@ def trace(speed: Array, *, one_way: bool = False) -> RunTrace:
         (lambda t: 5e-3 * np.exp(-0.01 * t), EndBehaviour.CONVERGED),
         (lambda t: 5e-3 * np.exp(0.001 * t), EndBehaviour.UNDECIDED),
         (lambda t: 5e-3 + 0.0 * t, EndBehaviour.UNDECIDED),
-        (lambda t: 1e-7 + 0.0 * t, EndBehaviour.CONVERGED),
+        (lambda t: 1e-7 + 0.0 * t, EndBehaviour.UNDECIDED),
+        (lambda t: 1e-13 + 0.0 * t, EndBehaviour.CONVERGED),
     ],
-    ids=["falls", "grows slowly", "goes on", "too slow to see"],
+    ids=["falls", "grows slowly", "goes on", "goes on slowly", "rounding"],
 )
 def test_a_small_speed_is_rest_only_if_it_falls(speed, behaviour: EndBehaviour) -> None:
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})

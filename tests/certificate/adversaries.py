@@ -32,6 +32,7 @@ from trilat_net.analysis.certificate.stability_certificate import (
     StabilityVerdict,
 )
 from trilat_net.analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
+from trilat_net.analysis.twin_growth import measure_virtual_twins
 from trilat_net.core.ticks import BUCKETS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
@@ -539,21 +540,19 @@ class LastOfBuckets(SimpleNamespace):
 def say_of_run(scenario: Scenario) -> str:
     """The word of `trilat certify` on a scenario's run, and no log is made where none is needed.
 
-    A run whose end is not stable keeps that word. Else the roots at the end pose have a say, and V, if
-    the law has one: that takes all records, and so do ages that vary.
+    V, if the law has one, takes all records, and so do ages that vary.
     """
-    run = RunInMemory(scenario)
-    end = run.find_end()
-    if end.stability is not Stability.STABLE:
-        return str(end.stability)
     varies = not all(map(is_constant_link, scenario.links.values()))
     if varies or not any(map(explain_missing_functional, scenario.sites.values())):
         return say_of(trilat_net.simulate(scenario))
+    run = RunInMemory(scenario)
     no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")
     ticks = {site: scenario.ticks(site) for site in scenario.names}
     whole = Evidence(Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(ChainState.INTACT, ""))
     roots = find_end_pose_roots(run)  # type: ignore[arg-type]
-    return str(Certificate([], no_v, end, whole, None, roots=roots).stability)
+    end = run.find_end()
+    twins = measure_virtual_twins(scenario, end, scenario.duration_s)
+    return str(Certificate([], no_v, end, whole, None, roots=roots, twins=twins).stability)
 
 
 def say_of_sweep(scenario: Scenario) -> str:

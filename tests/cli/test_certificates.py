@@ -51,7 +51,9 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
 
 
 def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
-    done = trilat("certify", simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d"), cwd=tmp_path)
+    done = trilat(
+        "certify", simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"), cwd=tmp_path
+    )
     assert done.code == 1
     assert "open e and qd: undecided, record longer at " in done.out
     trilat("certify", "run.mcap", "--accept", "open", cwd=tmp_path).succeeds()

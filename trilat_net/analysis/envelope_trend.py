@@ -29,8 +29,8 @@ import numpy as np
 
 from ..core.vectors import Array
 
-FLOOR_RAD = 1e-6
-"""An envelope below this has converged, rad; of speeds, rad/s."""
+FLOOR_RAD = 1e-12
+"""An envelope below this is the rounding of the numbers, rad; of speeds, rad/s."""
 
 _T_QUANTILES = {16: 2.977, 8: 3.707}
 """Number of windows, and the 99.5 % quantile of Student's t with two degrees of freedom less: to these

@@ -10,7 +10,7 @@ is the slope of log A over the judged part, with the bounds and words of `envelo
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +18,10 @@ import numpy as np
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..errors import NotRepeatable
-from ..execution.twins import Push, TwinPath, Twins, choose_pushes, run_twins
+from ..execution.twins import Push, TwinPath, Twins, choose_pushes, run_twins, run_virtual_twins
 from ..log.log_reader import Log
 from ..scenario import Scenario
-from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .json_values import finite_or_none
 from .run_end import (
     EndBehaviour,
@@ -36,7 +36,7 @@ TWINS = 8
 """Twins of a run, unless asked for others."""
 LEAST_LEFT_S = 5.0
 """A run that leaves a rest by itself does so for this time or longer, s,"""
-LEFT_BY = 2.0
+DOUBLES = 2.0
 """faster by this factor at the end of it than at its beginning."""
 _ORDER = (
     EnvelopeTrend.DECAYS,
@@ -114,13 +114,17 @@ class TwinGrowth(NamedTuple):
     @property
     def grows(self) -> bool:
         """True if half of the pushes of some sites or more grow; by a factor of two if links are random."""
-        for group in {one.group for one in self.pushes}:
-            own = [one for one in self.pushes if one.group == group]
-            least = LEFT_BY if self.random else 1.0
-            growing = sum(one.trend is EnvelopeTrend.GROWS and one.factor >= least for one in own)
-            if 2 * growing >= len(own):
-                return True
-        return False
+        least = DOUBLES if self.random else 1.0
+        return self._find_half(lambda one: one.trend is EnvelopeTrend.GROWS and one.factor >= least)
+
+    @property
+    def doubles(self) -> bool:
+        """True if half of the pushes of some sites or more double, if not all the time."""
+        return self._find_half(lambda one: one.factor >= DOUBLES)
+
+    def _find_half(self, holds: Callable[[PushGrowth], bool]) -> bool:
+        groups = [[one for one in self.pushes if one.group == place] for place in range(len(self.pushes))]
+        return any(group and 2 * sum(map(holds, group)) >= len(group) for group in groups)
 
     @property
     def needs_s(self) -> float | None:
@@ -141,7 +145,7 @@ class TwinGrowth(NamedTuple):
                     "push": str(one),
                     "trend": one.trend.name.lower(),
                     "rate_per_s": finite_or_none(one.rate_per_s),
-                    "factor": one.factor,
+                    "factor": finite_or_none(one.factor),
                     "joint": one.joint,
                 }
                 for one in self.pushes
@@ -183,7 +187,7 @@ class TwinVerdict(NamedTuple):
     reason: str = ""
 
 
-def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool, rises: bool) -> TwinVerdict:
+def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, rises: bool) -> TwinVerdict:
     """Returns the judgement of a run by its end and by its twins.
 
     What grows away from its twins is not stable, wherever it is; what comes together with them is not said to
@@ -192,15 +196,19 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool, rises: 
     Args:
         end: the end of the run.
         twins: what became of small pushes.
-        settles: small motions are known to settle: by roots that are exact, or by the theorem.
+        settles: whether small motions settle, by roots that are exact or by the theorem; None: not known.
         rises: V rose by what nobody gave.
     """
     own, trend = end.stability, twins.trend
     if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
         return TwinVerdict(own)
-    if (twins.left is not None or twins.grows) and not end.operator_acts:
+    falls = (
+        end.speed.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) and end.end_speed_rad_s > FLOOR_RAD
+    )
+    grows = (twins.grows or (settles is False and twins.doubles)) and not falls
+    if (grows or twins.left is not None) and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)
-    dies = trend is EnvelopeTrend.DECAYS or (trend is EnvelopeTrend.HARDLY and settles)
+    dies = trend is EnvelopeTrend.DECAYS or (trend is EnvelopeTrend.HARDLY and bool(settles))
     if own is Stability.STABLE and not (dies or trend is EnvelopeTrend.HARDLY):
         doubtful = trend is EnvelopeTrend.GROWS or not settles
         return TwinVerdict(Stability.OPEN, twins.text) if doubtful else TwinVerdict(own)
@@ -224,6 +232,19 @@ def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool =
     except NotRepeatable as why:
         return TwinGrowth(str(why).removeprefix("no twins: "))
     return judge_twins(log.scenario, twins, end.counts_from_s, find_quiet_from_s(log))
+
+
+def measure_virtual_twins(
+    scenario: Scenario, end: RunEnd, duration_s: float, count: int = TWINS
+) -> TwinGrowth:
+    """Returns the same of a run in virtual time, of so many seconds, without a log.
+
+    Raises:
+        ScenarioError: virtual time cannot run it.
+    """
+    twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
+    known_s = find_last_operator_action(scenario, duration_s), find_last_change(scenario, duration_s)
+    return judge_twins(scenario, twins, end.counts_from_s, max(known_s))
 
 
 def find_quiet_from_s(log: Log) -> float:
@@ -353,7 +374,7 @@ def _find_departures(
             rows = slice(start, start + 2 * size)  # of which the second half is judged
             own = _fit(t_s[rows], speed[rows])
             rate_per_s = own.rate_per_s
-            if own.trend is not EnvelopeTrend.GROWS or rate_per_s * size < np.log(LEFT_BY) * BUCKETS_PER_S:
+            if own.trend is not EnvelopeTrend.GROWS or rate_per_s * size < math.log(DOUBLES) * BUCKETS_PER_S:
                 continue
             fits = [_fit(t_s[rows], amplitude[rows]) for amplitude in amplitudes]
             if 2 * sum(fit.trend is EnvelopeTrend.GROWS for fit in fits) >= len(fits):

@@ -97,7 +97,7 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
 
 def describe_judgement(found: Certificate) -> str:
     """Returns the judgement in one line: the word, how the run ended, and what leaves it open."""
-    return "; ".join([f"{found.stability}: {found.end.behaviour}", *found.reasons])
+    return "; ".join([found.headline(), *found.reasons])
 
 
 _JUDGEMENT = {Stability.STABLE: "ok", Stability.NOT_STABLE: "FAIL", Stability.OPEN: "open"}

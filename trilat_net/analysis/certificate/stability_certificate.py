@@ -184,12 +184,14 @@ class Certificate(Result):
         """The judgement of the end of the run and of its twins together."""
         if self.twins is None:
             return TwinVerdict(self.end.stability)
-        exact = self.roots is not None and self.roots.exact
-        proved = self.verdict.finding is StabilityFinding.COVERED
+        known = {"stable": True, "unstable": False}
+        settles = known.get(self.roots.verdict) if self.roots is not None and self.roots.exact else None
+        if self.verdict.finding is StabilityFinding.COVERED:
+            settles = True
         return judge_end_by_twins(
             self.end,
             self.twins,
-            settles=proved or (exact and self.roots is not None and self.roots.verdict == "stable"),
+            settles=settles,
             rises=self.verdict.finding is StabilityFinding.ROSE,
         )
 
@@ -206,7 +208,8 @@ class Certificate(Result):
 
     def headline(self) -> str:
         """Returns the judgement, and how the run ended."""
-        return f"{self.stability}: {self.end.behaviour}"
+        by_twins = self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE
+        return f"{self.stability}: {self.end.behaviour}{', yet every push dies away' if by_twins else ''}"
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
