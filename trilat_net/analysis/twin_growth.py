@@ -67,10 +67,6 @@ class PushGrowth(NamedTuple):
     joint: str
     group: int
 
-    def __str__(self) -> str:
-        size = float(np.abs(self.push.by).max())
-        return f"{self.push.name}, {size:g}" if self.push.field == "q" else self.push.name
-
 
 class LeftRest(NamedTuple):
     """A time in which a run went away from a rest, and from its twins, while nobody acted on it."""
@@ -142,7 +138,7 @@ class TwinGrowth(NamedTuple):
             "to_s": self.to_s,
             "pushes": [
                 {
-                    "push": str(one),
+                    "push": one.push.name,
                     "trend": one.trend.name.lower(),
                     "rate_per_s": finite_or_none(one.rate_per_s),
                     "factor": finite_or_none(one.factor),
@@ -168,16 +164,19 @@ class TwinGrowth(NamedTuple):
                 f"twins: from {left.from_s:.4g} to {left.to_s:.4g} s the run and its twins left a rest by "
                 f"themselves, at {left.rate_per_s:+.3g} /s, most at {left.joint}"
             )
-        over = f"over {self.to_s - self.from_s:.4g} s"
+        in_s = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
         if worst.factor == 0.0:
-            return f"twins: every push died down to the rounding of the numbers {over}"
-        how = "grows" if worst.factor >= 1.0 else "falls"
-        changed = f"{how} x {worst.factor:.3g} {over}, {worst.rate_per_s:+.3g} /s, most at {worst.joint}"
+            return "twins: every push died down to the rounding of the numbers"
         if self.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
-            return f"twins: every push dies away; the slowest ({worst}) {changed}"
+            slowest = f"the slowest, {worst.push.name}, to {worst.factor:.3g} of its size {in_s}"
+            return f"twins: every push dies away; {slowest}"
+        if self.trend is EnvelopeTrend.GROWS:
+            return (
+                f"twins: a push of {worst.push.name} grows x {worst.factor:.3g} {in_s}, most at {worst.joint}"
+            )
         more = "" if self.needs_s is None else f"; a run of {self.needs_s:.3g} s would tell"
-        known = "" if self.trend is EnvelopeTrend.GROWS else f", {worst.trend}"
-        return f"twins: a push ({worst}) {changed}{known}{more}"
+        changed = f"it changes x {worst.factor:.3g} {in_s}"
+        return f"twins: a push of {worst.push.name} shows no clear trend: {changed}{more}"
 
 
 class TwinVerdict(NamedTuple):

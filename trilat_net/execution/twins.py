@@ -40,7 +40,7 @@ class Push(NamedTuple):
     """A push of a twin.
 
     Attributes:
-        name: what is pushed, in words, as "m1 joint 1".
+        name: what it is, in words, as "1e-06 rad at m1 joint 1".
         field: "q", rad; "qd", rad/s; or "theta_hat".
         by: of each site and number the push, shape (N, n).
         at_s: the instant, s since the epoch; a twin that died down is pushed again, at the end of a window.
@@ -110,16 +110,18 @@ def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> li
     pushes = []
     if count > 2 and any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names):
         shape = len(layouts), max(layout.parameters for layout in layouts)
-        pushes.append(Push("the estimates", "theta_hat", delta * chance.uniform(-1.0, 1.0, shape)))
+        pushes.append(
+            Push(f"{delta:g} of the estimates", "theta_hat", delta * chance.uniform(-1.0, 1.0, shape))
+        )
     for factor in (1.0, 1e-3, 1e3)[: max(1, min(3, count - len(owners) - len(pushes)))]:
         by = np.zeros((len(layouts), most))
         for i, joint in owners:
             by[i, joint] = factor * delta * chance.uniform(-1.0, 1.0)
-        pushes.append(Push(f"all joints by {factor * delta:g} rad", "q", by))
+        pushes.append(Push(f"{factor * delta:g} rad at all joints", "q", by))
     for n, (i, joint) in enumerate(owners[: max(0, count - len(pushes))]):
         by = np.zeros((len(layouts), most))
         by[i, joint] = delta
-        pushes.append(Push(joints[n], "q", by))
+        pushes.append(Push(f"{delta:g} rad at {joints[n]}", "q", by))
     return pushes[:count]
 
 
