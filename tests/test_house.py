@@ -32,8 +32,8 @@ def test_a_module_name_is_used_once() -> None:
 
 def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
-    assert len(lines) <= 352
-    assert sum(lines) <= 67_700
+    assert len(lines) <= 356
+    assert sum(lines) <= 69_300
 
 
 def test_no_body_is_longer_than_forty_lines() -> None:
@@ -47,7 +47,7 @@ def test_every_import_between_rooms_has_its_reason() -> None:
     rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", DESIGN, re.MULTILINE)
     told = {(above, below) for above, cell in rows for below in re.findall(r"`(\w+)`: ", cell)}
     assert told == house.room_imports()
-    assert len(told) <= 66
+    assert len(told) <= 67
 
 
 def test_the_tour_names_what_exists() -> None:
