@@ -307,18 +307,25 @@ def _find_joints_by_group(scenario: Scenario) -> list[list[int]]:
 
 def _measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
     """Returns the logarithm of the amplitude of a difference, shape (K,); -inf where there is none."""
-    largest = path.largest[:, group].max(axis=1)
+    amplitude: Array = path.largest[:, group].max(axis=1)
+    for leg in map(slice, path.pushed, [*path.pushed[1:], len(amplitude)]):
+        if leg.stop - leg.start > 2:
+            whole = _measure_leg(path.last[leg][:, group], path.scale[leg], amplitude[leg])
+            amplitude[leg] = np.where(np.isfinite(whole), np.maximum(whole, amplitude[leg]), amplitude[leg])
+    return amplitude
+
+
+def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
+    """Returns the same from one push to the next."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
         peak = np.max(largest, where=np.isfinite(largest), initial=-np.inf)
-        d = path.last[:, group] * np.exp(path.scale - peak)[:, np.newaxis]
+        d = last * np.exp(scale - peak)[:, np.newaxis]
         rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
         around = np.exp(2.0 * (_running_maximum(largest) - peak))
-        usable = np.isfinite(largest) & (around > 0.0)
-        weights = np.where(usable, 1.0 / around, 0.0)[:, np.newaxis]
+        weights = np.where(np.isfinite(largest) & (around > 0.0), 1.0 / around, 0.0)[:, np.newaxis]
         omega2 = float((weights * rate**2).sum() / (weights * d**2).sum())
-        whole = np.log((d**2 + rate**2 / omega2).sum(axis=1)) / 2.0 + peak
-    amplitude: Array = np.where(np.isfinite(whole), np.maximum(whole, largest), largest)
-    return amplitude
+        whole: Array = np.log((d**2 + rate**2 / omega2).sum(axis=1)) / 2.0 + peak
+    return whole
 
 
 def _running_maximum(values: Array) -> Array:
@@ -345,14 +352,15 @@ def _judge_push(
     One that died down and was pushed anew counts from the last time, if that is long enough ago.
     """
     t_s, first, end = path.t_s, part.start, part.stop
-    begun = max([at for at in path.pushed if at < end], default=0)
+    legs = [*(at for at in path.pushed if at < end), end]
     recent = path.largest[max(first, end - BUCKETS_PER_S) : end, group].max(axis=0)
     joint = group[int(recent.argmax())]
-    since = max(first, begun)
+    since = max(first, legs[-2])
     fit = _fit(t_s[since:end], amplitude[since:end])
-    died = len(path.pushed) > 1 and begun > (first + end) // 2  # within the judged part
-    if died and (fit.trend is not EnvelopeTrend.GROWS or end - begun < (end - first) // 4):
-        return EnvelopeTrend.DECAYS, fit.rate_per_s, 0.0, joint
+    died = len(legs) > 2 and legs[-2] > (first + end) // 2  # within the judged part
+    if died and (fit.trend is not EnvelopeTrend.GROWS or end - legs[-2] < (end - first) // 4):
+        before = slice(legs[-3], legs[-2])  # when it died: since then there is too little of it
+        return EnvelopeTrend.DECAYS, _fit(t_s[before], amplitude[before]).rate_per_s, 0.0, joint
     half_s = 0.5 * float(t_s[end - 1] - t_s[since])
     return fit.trend, fit.rate_per_s, math.exp(fit.rate_per_s * half_s), joint
 
