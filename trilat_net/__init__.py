@@ -21,6 +21,7 @@ if _TYPE_CHECKING:
     from sites.network_benchmark import ping_benchmark
     from sites.running_session import doctor, session, start
 
+    from .analysis.twin_growth import twin
     from .api import (
         bench,
         certify,
@@ -92,6 +93,7 @@ __all__ = [
     "sweep",
     "trials",
     "tune",
+    "twin",
     "verify",
     "view",
 ]
@@ -118,6 +120,7 @@ _MODULES = {
     "session": "sites.running_session",
     "sign_log": "trilat_net.log.log_signature",
     "start": "sites.running_session",
+    "twin": "trilat_net.analysis.twin_growth",
     "trials": "trilat_net.studies.trials.trial",
 }
 """Where names are; the others are in `api`."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from .analysis.certificate.stability_certificate import Certificate
 from .analysis.file_overview import FileOverview, describe_files
 from .analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from .analysis.twin_growth import TWINS
 from .errors import UsageError
 from .execution.log_checks import LogCheckReport, run_log_checks
 from .execution.virtual import SimulatedLog, simulate_scenario
@@ -163,7 +164,9 @@ def verify(
     return run_log_checks(_open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every)
 
 
-def certify(log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False) -> Certificate:
+def certify(
+    log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
+) -> Certificate:
     """Judges a run: stable, not stable or open, and why; the command is `trilat certify`.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
@@ -172,14 +175,15 @@ def certify(log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool =
     Args:
         log: the log, or its path.
         min_coverage: the least share of every site's ticks that must be judged for a stable run.
-        own_laws: whether code of laws from outside may run, for the energies that they declare.
+        own_laws: whether code of laws from outside may run, for the energies that they declare, and twins.
+        twins: how many twins of the run get a small push; 0: none.
 
     Raises:
         LogError: the log cannot be read.
     """
     from .theory.end_pose import certify_run
 
-    return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws)
+    return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 
 
 def metrics(log: AnyLog) -> LogMetrics:

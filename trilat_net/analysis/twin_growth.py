@@ -10,16 +10,33 @@ is the slope of log A over the judged part, with the bounds and words of `envelo
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core.exogenous import TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
-from ..errors import NotRepeatable
-from ..execution.twins import Push, TwinPath, Twins, choose_pushes, run_twins, run_virtual_twins
-from ..log.log_reader import Log
+from ..errors import NotRepeatable, UsageError
+from ..execution.twins import (
+    LEAST_PUSH,
+    MOST_PUSH,
+    PUSH_RAD,
+    SMALLEST,
+    Push,
+    TwinPath,
+    Twins,
+    aim_push,
+    choose_pushes,
+    run_twins,
+    run_virtual_twins,
+)
+from ..log.log_reader import Log, open_log
+from ..results import Result
 from ..scenario import Scenario
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .json_values import finite_or_none
@@ -46,6 +63,10 @@ _ORDER = (
     EnvelopeTrend.GROWS,
 )
 _NOTHING = 1e-300
+SAME_SCALED = math.log(1.1)
+"""Twins are the same but for their scale if they differ by less than 10 %."""
+MOST_LOG = 700.0
+"""A number with a larger logarithm is beyond all that there are."""
 
 
 class PushGrowth(NamedTuple):
@@ -58,6 +79,8 @@ class PushGrowth(NamedTuple):
         factor: by how much it changed over the part; 0: it died down to the rounding of the numbers.
         joint: the joint at which it is largest at the end.
         group: the place of those sites among the groups.
+        becomes_rad_s: the largest difference of the last second, rad/s, as if nothing was made small again.
+        died_s: when it died down to the rounding of the numbers, s, if it is not pushed anew then.
     """
 
     push: Push
@@ -66,6 +89,8 @@ class PushGrowth(NamedTuple):
     factor: float
     joint: str
     group: int
+    becomes_rad_s: float
+    died_s: float | None = None
 
 
 class LeftRest(NamedTuple):
@@ -87,6 +112,7 @@ class TwinGrowth(NamedTuple):
         left: when it left a rest by itself; None: it did not.
         same: False if the run was repeated on another platform, whose last bits differ.
         random: True if anything in the run's links is drawn: slow trends are chance then.
+        twins: the twins themselves, to be drawn.
     """
 
     why: str
@@ -96,6 +122,7 @@ class TwinGrowth(NamedTuple):
     left: LeftRest | None = None
     same: bool = True
     random: bool = False
+    twins: Twins | None = None
 
     @property
     def worst(self) -> PushGrowth | None:
@@ -143,6 +170,8 @@ class TwinGrowth(NamedTuple):
                     "rate_per_s": finite_or_none(one.rate_per_s),
                     "factor": finite_or_none(one.factor),
                     "joint": one.joint,
+                    "becomes_rad_s": finite_or_none(one.becomes_rad_s),
+                    "died_s": one.died_s,
                 }
                 for one in self.pushes
             ],
@@ -277,11 +306,11 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     pushes, left = [], []
     for place, group in enumerate(_find_joints_by_group(scenario)):
-        amplitudes = [_measure_amplitude(path, group) for path in twins.paths]
+        amplitudes = [measure_amplitude(path, group) for path in twins.paths]
         for path, amplitude in zip(twins.paths, amplitudes, strict=True):
             if np.isfinite(amplitude[first:end]).any():
-                judged = _judge_push(path, amplitude, group, slice(first, end))
-                pushes.append(PushGrowth(path.push, *judged[:3], twins.joints[judged[3]], place))
+                judged = _judge_push(path, amplitude, group, slice(first, end), twins.joints)
+                pushes.append(judged._replace(group=place))
         quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
         left += list(_find_departures(twins, amplitudes, group, quiet))
     return TwinGrowth(
@@ -292,6 +321,7 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
         left=max(left, key=lambda one: one.rate_per_s, default=None),
         same=twins.same,
         random=scenario.links_random,
+        twins=twins,
     )
 
 
@@ -305,8 +335,8 @@ def _find_joints_by_group(scenario: Scenario) -> list[list[int]]:
     ]
 
 
-def _measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
-    """Returns the logarithm of the amplitude of a difference, shape (K,); -inf where there is none."""
+def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
+    """Returns the logarithm of the amplitude of a difference at some joints, shape (K,); -inf: none."""
     amplitude: Array = path.largest[:, group].max(axis=1)
     for leg in map(slice, path.pushed, [*path.pushed[1:], len(amplitude)]):
         if leg.stop - leg.start > 2:
@@ -345,24 +375,35 @@ def _fit(t_s: Array, amplitude: Array) -> EnvelopeFit:
 
 
 def _judge_push(
-    path: TwinPath, amplitude: Array, group: Sequence[int], part: slice
-) -> tuple[EnvelopeTrend, float, float, int]:
-    """Returns trend, rate and factor of a push, and where it is largest at the end.
+    path: TwinPath, amplitude: Array, group: Sequence[int], part: slice, joints: Sequence[str]
+) -> PushGrowth:
+    """Returns what became of a push.
 
     One that died down and was pushed anew counts from the last time, if that is long enough ago.
     """
     t_s, first, end = path.t_s, part.start, part.stop
+    if not path.push.again:  # it may have died, or left its limits
+        end = min(end, int(np.flatnonzero(np.isfinite(amplitude))[-1]) + 1)
     legs = [*(at for at in path.pushed if at < end), end]
-    recent = path.largest[max(first, end - BUCKETS_PER_S) : end, group].max(axis=0)
-    joint = group[int(recent.argmax())]
+    largest = path.largest[max(first, end - BUCKETS_PER_S) : end, group].max(axis=0)
+    joint = joints[group[int(largest.argmax())]]
     since = max(first, legs[-2])
     fit = _fit(t_s[since:end], amplitude[since:end])
+    found = PushGrowth(path.push, fit.trend, fit.rate_per_s, 0.0, joint, 0, _exp(float(largest.max())))
+    if path.died is not None:
+        return found._replace(trend=EnvelopeTrend.DECAYS, died_s=float(t_s[end - 1]))
     died = len(legs) > 2 and legs[-2] > (first + end) // 2  # within the judged part
     if died and (fit.trend is not EnvelopeTrend.GROWS or end - legs[-2] < (end - first) // 4):
         before = slice(legs[-3], legs[-2])  # when it died: since then there is too little of it
-        return EnvelopeTrend.DECAYS, _fit(t_s[before], amplitude[before]).rate_per_s, 0.0, joint
+        rate_per_s = _fit(t_s[before], amplitude[before]).rate_per_s
+        return found._replace(trend=EnvelopeTrend.DECAYS, rate_per_s=rate_per_s)
     half_s = 0.5 * float(t_s[end - 1] - t_s[since])
-    return fit.trend, fit.rate_per_s, math.exp(fit.rate_per_s * half_s), joint
+    return found._replace(factor=_exp(fit.rate_per_s * half_s))
+
+
+def _exp(logarithm: float) -> float:
+    """Returns what has a logarithm; infinity beyond all numbers."""
+    return math.exp(logarithm) if not logarithm > MOST_LOG else math.inf
 
 
 def _find_departures(
@@ -388,3 +429,143 @@ def _find_departures(
                 last = twins.speed[rows.stop - BUCKETS_PER_S : rows.stop, group].max(axis=0)
                 joint = twins.joints[group[int(last.argmax())]]
                 yield LeftRest(float(t_s[start + size]), float(t_s[rows.stop - 1]), rate_per_s, joint)
+
+
+class LinearSizes(NamedTuple):
+    """Sizes of a push between which twins are the same but for their scale, and what is beyond, in words."""
+
+    smallest: float
+    largest: float
+    text: str
+
+
+@dataclass(frozen=True, repr=False)
+class PushedTwins(Result):
+    """Twins of a log that were pushed at an instant, s; what became of them; for which sizes it is linear."""
+
+    log: Log
+    at_s: float
+    growth: TwinGrowth
+    linear: LinearSizes | None = None
+
+    def describe(self, one: PushGrowth) -> str:
+        """Returns what became of a push, in one sentence."""
+        rate = "" if math.isnan(one.rate_per_s) else f" ({one.rate_per_s:+.3g} /s)"
+        pushed, to_s = f"a push of {one.push.name} at {self.at_s:.4g} s", self.growth.to_s
+        if one.died_s is not None:
+            return (
+                f"{pushed} dies down to the rounding of the numbers in {one.died_s - self.at_s:.3g} s{rate}"
+            )
+        if one.trend is EnvelopeTrend.GROWS:
+            in_s = f"{to_s - self.growth.from_s:.4g} s"
+            return f"{pushed} grows x {one.factor:.3g} in {in_s}{rate}, most at {one.joint}"
+        falls = one.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+        becomes = (
+            f"becomes {one.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}, most at {one.joint}"
+        )
+        return f"{pushed} {becomes}{'' if falls else '; it shows no clear trend'}"
+
+    def headline(self) -> str:
+        """Returns for which sizes a push is linear, or what became of the worst one."""
+        worst = self.growth.worst
+        return self.linear.text if self.linear else self.describe(worst) if worst else self.growth.text
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per push."""
+        both = zip(self.growth.to_json()["pushes"], self.growth.pushes, strict=True)
+        return [{**row, "text": self.describe(one)} for row, one in both]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat twin --json`."""
+        part = {key: self.growth.to_json()[key] for key in ("from_s", "to_s", "same_bits")}
+        linear = self.linear and self.linear._asdict()
+        found = {"pushes": self.to_rows(), "linear": linear, "text": self.headline()}
+        return {"log": self.log.source, "at_s": self.at_s, **part, **found}
+
+
+def twin(
+    log: str | Path | Log, at_s: float = 0.0, push: Mapping[str, float] | Sequence[str] = (), delta: str = ""
+) -> PushedTwins:
+    """Executes a run again, beside twins that are pushed at an instant; the command is `trilat twin`.
+
+    >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
+    >>> found.growth.pushes[0].rate_per_s < 0.0
+    True
+
+    Args:
+        log: the log, or its path.
+        at_s: when, s.
+        push: sizes by what is pushed: a joint's angle, `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate,
+            `m1.theta1`, or many in a drawn direction, `m1.q`, `q`; a twin each. By default as `certify` does.
+        delta: sizes of one push, as in "1e-9:1e-3", of which each decade has a twin.
+
+    Raises:
+        UsageError: there is no such push, instant or range.
+        LogError: the log cannot be read, or not be executed again.
+        LawWithheld: a law of it may not run.
+    """
+    log = log if isinstance(log, Log) else open_log(log)
+    scenario, asked = log.scenario, dict(push) if isinstance(push, Mapping) else dict(map(_read_push, push))
+    end_s = max(len(log[name]) / log[name].rate_hz for name in log.sites)
+    if not 0.0 <= at_s < end_s:
+        raise UsageError(f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s")
+    if delta and len(asked) > 1:
+        raise UsageError(f"--delta sweeps the size of one push, not of {', '.join(asked)}")
+    if delta:
+        what, sizes = next(iter(asked), "q"), _read_sizes(delta)
+        pushes = [aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes]
+    else:
+        usual = [one._replace(at_s=at_s, again=False) for one in choose_pushes(scenario, TWINS)]
+        pushes = [aim_push(scenario, what, size, at_s) for what, size in asked.items()] or usual
+    growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
+    return PushedTwins(log, at_s, growth, _find_linear_sizes(scenario, growth, sizes) if delta else None)
+
+
+def _read_push(text: str) -> tuple[str, float]:
+    what, stated, size = text.partition("=")
+    try:
+        return what.strip(), float(size) if stated else PUSH_RAD
+    except ValueError:
+        raise UsageError(f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}") from None
+
+
+def _read_sizes(text: str) -> list[float]:
+    """Returns a size per decade."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not LEAST_PUSH <= low < high / 9.99 <= MOST_PUSH / 9.99:
+        allowed = f"from {LEAST_PUSH:g} to {MOST_PUSH:g}, a decade apart or more"
+        raise UsageError(f"--delta is two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")
+    return [float(f"{low * 10.0**n:.6g}") for n in range(math.floor(math.log10(high / low) + 1e-3) + 1)]
+
+
+def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]) -> LinearSizes:
+    """Returns up to which size neighbours differ by their scale alone, where they are above the rounding."""
+    assert growth.twins is not None
+    paths, every = growth.twins.paths, range(len(growth.twins.joints))
+    largest = [_running_maximum(measure_amplitude(path, every)) for path in paths]
+    unit, beyond = paths[0].push.name.partition(" ")[2], ""
+    for n, (small, big) in enumerate(pairwise(largest)):
+        ratio = np.full(len(big), math.log(sizes[n + 1] / sizes[n]))
+        known = (small > math.log(10.0 * SMALLEST)) & np.isfinite(big)
+        apart = np.subtract(big, small, out=ratio.copy(), where=known) - ratio
+        at = int(np.abs(apart).argmax())
+        if abs(apart[at]) > SAME_SCALED:
+            grows = any(
+                one.trend is EnvelopeTrend.GROWS for one in growth.pushes if one.push is paths[n].push
+            )
+            own = {one.actor.acts for site in scenario.sites.values() for one in site.environment}
+            does = "saturates" if grows and apart[at] < 0.0 else "goes another way"
+            does += " (there is a wall)" if TorqueKind.WALL in own else ""
+            at_s, times = paths[0].t_s[at], _exp(float(apart[at]))
+            beyond = f"a push of {sizes[n + 1]:g} {does}: x {times:.3g} of that at {at_s:.4g} s"
+            break
+    last = sizes[n] if beyond else sizes[-1]
+    text = (
+        f"not linear from {last:g} {unit} on"
+        if last == sizes[0]
+        else f"linear from {sizes[0]:g} to {last:g} {unit}"
+    )
+    return LinearSizes(sizes[0], last, f"{text}; {beyond}" if beyond else text)

@@ -84,6 +84,7 @@ _SINGLE = {
     "sim": ["free -o free.mcap --set link.delay_ms=400"],
     "verify": ["run.mcap"],
     "certify": ["run.mcap"],
+    "twin": ["run.mcap --at 12 --push m1.q1=1e-6 -o twin.png", "run.mcap --delta 1e-9:1e-3"],
     "metrics": ["run.mcap"],
     "compare": ["a.mcap b.mcap", "--tune free --law adaptive,p_d"],
     "figure": ["run.mcap positions settling --width 3.5 --format pdf --out paper"],

@@ -173,6 +173,9 @@ OwnLawsOption = Annotated[
     bool,
     typer.Option("--own-laws", help="Run code of imported laws for the energies that they declare."),
 ]
+TwinsOption = Annotated[
+    int, typer.Option("--twins", metavar="N", min=0, max=99, help="Twins that get a small push; 0: none.")
+]
 LawFilesOption = Annotated[
     list[Path] | None,
     typer.Option("--law", metavar="FILE", help="Let this file run as a law that the log names; repeatable."),

@@ -11,6 +11,7 @@ rounding of the numbers is pushed anew.
 """
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from ..core.site_setup import Law
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S
 from ..core.vectors import Array
-from ..errors import NotRepeatable
+from ..errors import NotRepeatable, UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
@@ -43,13 +44,17 @@ class Push(NamedTuple):
         name: what it is, in words, as "1e-06 rad at m1 joint 1".
         field: "q", rad; "qd", rad/s; or "theta_hat".
         by: of each site and number the push, shape (N, n).
-        at_s: the instant, s since the epoch; a twin that died down is pushed again, at the end of a window.
+        at_s: the instant, s since the epoch.
+        again: a twin that died down is pushed again, at the end of a window; else it ends there.
+        largest: a difference larger than this is made small again; math.inf: none is.
     """
 
     name: str
     field: str
     by: Array
     at_s: float = 0.0
+    again: bool = True
+    largest: float = LARGEST
 
 
 class TwinPath(NamedTuple):
@@ -63,6 +68,7 @@ class TwinPath(NamedTuple):
         last: the difference at the last tick of an interval, shape (K, J), rad/s, with
         scale: the logarithm of the factor by which it was made small, shape (K,).
         pushed: the places in `t_s` at which it was pushed.
+        died: the place from which on there is nothing but rounding; None: it is pushed anew, or lives.
     """
 
     push: Push
@@ -71,6 +77,7 @@ class TwinPath(NamedTuple):
     last: Array
     scale: Array
     pushed: tuple[int, ...]
+    died: int | None = None
 
 
 class Twins(NamedTuple):
@@ -125,6 +132,45 @@ def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> li
     return pushes[:count]
 
 
+LEAST_PUSH, MOST_PUSH = 1e-11, 1.0
+"""A smaller push is lost in the rounding of the numbers; a larger one is another run."""
+_TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
+
+
+def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0) -> Push:
+    """Returns the push of a number, "m1.q1", "s.qd2", "m2.theta3", or of many in a drawn direction, "m1.q".
+
+    Its twin is pushed once. One that is not small is never made small again.
+
+    Raises:
+        UsageError: there is no such number, or no such size.
+    """
+    site, kind, number = found.groups() if (found := _TARGET.fullmatch(target)) else (None, "", "1")
+    layouts, adaptive = {name: scenario.layout(name) for name in scenario.names}, Law.ADAPTIVE
+    joints = [one.joints for one in layouts.values()]
+    estimates = [one.parameters * (scenario.gains(name).law is adaptive) for name, one in layouts.items()]
+    part, counts = ("estimate", estimates) if kind == "theta" else ("joint", joints)
+    owners = [n for n, name in enumerate(layouts) if site in (None, name) and counts[n] >= int(number or 1)]
+    if not owners or (number and not site):
+        each = zip(layouts, joints, estimates, strict=True)
+        there = ", ".join(f"{name} ({n} joints, {m} estimates)" for name, n, m in each)
+        raise UsageError(
+            f"--push {target}: no such number; as in m1.q1, m1.qd1, m1.theta1, m1.q or q, of {there}"
+        )
+    if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
+        raise UsageError(
+            f"--push {target}={size:g}: the size of a push is from {LEAST_PUSH:g} to {MOST_PUSH:g}"
+        )
+    chance, by = np.random.Generator(np.random.Philox(0)), np.zeros((len(counts), max(counts)))
+    for n in owners:
+        one = np.arange(counts[n]) == int(number or 0) - 1
+        by[n, : counts[n]] = size * (one if number else chance.uniform(-1.0, 1.0, counts[n]))
+    unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
+    of = f"{site} {part} {number}" if number else f"all {part}s{f' of {site}' if site else ''}"
+    field, largest = "theta_hat" if kind == "theta" else kind, LARGEST if abs(size) < LARGEST else math.inf
+    return Push(f"{size:g} {unit} {of}", field, by, at_s, False, largest)
+
+
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
     """Executes a run again, and a twin of it for every push.
 
@@ -177,6 +223,7 @@ class _TwinRuns:
         self._scale = np.zeros(len(pushes))
         self._speed = np.zeros(shape)
         self._pushed: list[list[int]] = [[] for _ in pushes]
+        self._died: list[int | None] = [None for _ in pushes]
         self._same = True
 
     def run(self) -> Twins:
@@ -198,11 +245,11 @@ class _TwinRuns:
         for at, starts, qd, _ in self._cut(kept, kept):
             self._speed[at] = np.maximum(self._speed[at], np.maximum.reduceat(np.abs(qd), starts, axis=0))
         for n, twin in enumerate(self._twins):
-            if self._pushed[n]:
+            if self._pushed[n] and self._died[n] is None:
                 twin.step_to(last_ns)
                 self._measure(n, kept, twin.take_records())
                 self._renew(n, end_s)
-            elif self._pushes[n].at_s <= end_s:
+            elif not self._pushed[n] and self._pushes[n].at_s <= end_s:
                 twin.copy_state(self._run)
                 self._push(n, end_s)
 
@@ -253,21 +300,33 @@ class _TwinRuns:
 
     def _renew(self, n: int, end_s: float) -> None:
         """Makes a difference that grew small again, and pushes one anew that died down."""
-        twin, last = self._twins[n], round(end_s * BUCKETS_PER_S)
+        twin, last, push = self._twins[n], round(end_s * BUCKETS_PER_S), self._pushes[n]
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
         recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]
-        if not math.isfinite(q + qd) or max(q, qd) > LARGEST:
-            factor = float(np.abs(self._pushes[n].by).max()) / max(q, qd)
+        if push.largest < math.inf and (not math.isfinite(q + qd) or max(q, qd) > push.largest):
+            factor = float(np.abs(push.by).max()) / max(q, qd)
             twin.approach(self._run, factor)
             self._scale[n] -= math.log(factor)
-        elif recent < math.log(SMALLEST):
+        elif recent < math.log(SMALLEST) and push.again:
             twin.copy_state(self._run)
             self._push(n, end_s)
+        elif recent < math.log(SMALLEST) and twin.diverged_s is None:
+            alive = self._largest[n].max(axis=1) - self._scales[n] >= math.log(SMALLEST)
+            self._died[n] = int(np.flatnonzero(alive)[-1]) + 1 if alive.any() else self._pushed[n][0]
+            self._largest[n, self._died[n] :] = -np.inf
 
     def _collect(self) -> Twins:
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
         paths = [
-            TwinPath(push, t_s, self._largest[n], self._last[n], self._scales[n], tuple(self._pushed[n]))
+            TwinPath(
+                push,
+                t_s,
+                self._largest[n],
+                self._last[n],
+                self._scales[n],
+                tuple(self._pushed[n]),
+                self._died[n],
+            )
             for n, push in enumerate(self._pushes)
         ]
         return Twins(paths, self._joints, self._speed, self._same)

@@ -13,7 +13,7 @@ from ..analysis.certificate.observed_energy import ObservedFinding
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
-from ..analysis.twin_growth import TwinGrowth
+from ..analysis.twin_growth import PushedTwins, TwinGrowth
 from .result_text import Block, MarkedText
 from .text_table import TextTable
 
@@ -55,6 +55,15 @@ def compose_certificate(found: Certificate) -> Iterator[Block]:
     energies = [(name, f"{amount:.4g}") for name, amount in list_energies(found.balance)]
     yield ""
     yield TextTable(("energy", "J"), energies, align="lr")
+
+
+def compose_twins(found: PushedTwins) -> Iterator[Block]:
+    """Yields for which sizes a push is linear, and what became of each push."""
+    if found.linear is not None or not found.growth.pushes:
+        yield found.headline()
+    yield from map(found.describe, found.growth.pushes)
+    if not found.growth.same:
+        yield "note: executed on another platform, whose last bits differ from those of the records"
 
 
 class CertificateLine(NamedTuple):

@@ -112,7 +112,7 @@ def conclude(
                 raise RunFailed("the process that executes the log again was ended; try again") from None
             yield from lines
 
-        figures = write_report_figures(log, folder, twin, progress) if png else []
+        figures = write_report_figures(log, folder, twin, progress, certificate.twins) if png else []
         made = write_report(log, folder, twin=twin, certificate=certificate, verdicts=verdicts())
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")

@@ -16,6 +16,7 @@ from typing import Any
 from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
 from ..analysis.json_values import JsonObject
 from ..analysis.run_summary import summarise_run
+from ..analysis.twin_growth import PushedTwins
 from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
 from ..log.log_reader import Log
@@ -24,6 +25,7 @@ from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.loop_timing import explain_missing_loop_times
 from .figures.registry import explain_absent_operator
+from .figures.twin_differences import draw_twins
 from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 
 _PAGE_DPI = 110
@@ -86,6 +88,10 @@ def write_report(
         if certificate.observed is not None and certificate.observed.curves:
             drawn = draw_observed_energy(log, certificate.observed)
             pictures.append(("energies that the laws declare", drawn))
+        if certificate.twins is not None and certificate.twins.pushes:
+            pictures.append(
+                ("what became of small pushes", draw_twins(PushedTwins(log, 0.0, certificate.twins)))
+            )
         for words, drawn in pictures:
             stream = io.BytesIO()
             drawn.savefig(stream, format="png", dpi=_PAGE_DPI)

@@ -49,6 +49,7 @@ _COMPOSERS = {
     "NetworkBenchmark": "session_text:compose_benchmark",
     "PingReport": "session_text:compose_ping",
     "Recovery": "checks_text:compose_recovery",
+    "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "rerun_text:compose_rerun",
 }
 """By type what composes its text."""

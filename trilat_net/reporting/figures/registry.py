@@ -17,8 +17,11 @@ from matplotlib.figure import Figure
 from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
 from ...analysis.certificate.premises import check_scenario_premises
 from ...analysis.certificate.stability_certificate import certify
+from ...analysis.run_end import classify_log_end
 from ...analysis.site_signals import sites_with_operator
+from ...analysis.twin_growth import PushedTwins, TwinGrowth, measure_twins
 from ...errors import UsageError
+from ...execution.log_inputs import explain_no_repetition
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
@@ -33,6 +36,7 @@ from .contact_force import draw_contact, sites_with_walls
 from .loop_timing import draw_loop_timing, explain_missing_loop_times
 from .run_overview import draw_overlay, draw_overview
 from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_delay
+from .twin_differences import draw_twins
 
 NO_OPERATOR = "no site has an operator in this run"
 
@@ -130,6 +134,11 @@ FIGURES = {
         "energies that the control laws declare: lines, observers, tanks",
         _draw_observed,
         _unless(_observed_energy, "the laws of this run declare no energies"),
+    ),
+    "twins": _ReportEntry(
+        "what became of small pushes of the run",
+        lambda log, form: draw_twins(PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form),
+        explain_no_repetition,
     ),
     "arms": _ReportEntry("the arms at a few instants", draw_arms),
     "paths": _ReportEntry(
@@ -231,18 +240,24 @@ def _check_formats(formats: Sequence[str]) -> list[str]:
 
 
 def write_report_figures(
-    log: Log, folder: Path, twin: Log | None, progress: Progress | None = None
+    log: Log,
+    folder: Path,
+    twin: Log | None,
+    progress: Progress | None = None,
+    pushed: TwinGrowth | None = None,
 ) -> list[Path]:
     """Writes the figures of the report for which a log has something to show, and returns the paths.
 
     Earlier figures in the folder are replaced. Without `twin`, the same experiment without operators,
-    `hands_moved` is left out.
+    `hands_moved` is left out. Twins that are given are not made again.
     """
     chosen = {name: FIGURES[name].draw for name in list_drawable_figures(log) if FIGURES[name].in_report}
     if twin is None:
         chosen.pop("hands_moved", None)
     else:
         chosen["hands_moved"] = partial(joint_motion.draw_operator_displacement, twin=twin)
+    if pushed is not None and "twins" in chosen:
+        chosen["twins"] = lambda log, form: draw_twins(PushedTwins(log, 0.0, pushed), form)
     return _write(log, folder, chosen, REPORT_SIZE, ["png"], progress)
 
 
