@@ -1,0 +1,97 @@
+"""`trilat twin`: one line for every mistake, words for every push, a figure."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import trilat_net as tn
+from tests.cli.running import simulated, trilat
+from tests.execution.logs import without_records
+from trilat_net.errors import NotRepeatable
+from trilat_net.execution.log_inputs import explain_no_repetition
+
+OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("twin")
+    simulated(folder, "two_sites", seconds="4")
+    return folder
+
+
+def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
+    asked = ("twin", "run.mcap", "--at", "1", "--push", "m.q1=1e-6", "--push", "s.qd2", "-o", "twin.png")
+    words = trilat(*asked, cwd=folder).succeeds().splitlines()
+    assert words[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
+    assert words[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
+    assert words[2].strip() == "twin.png"
+    first = (folder / "twin.png").read_bytes()
+    assert first.startswith(b"\x89PNG")
+    trilat(*asked, cwd=folder).refuses("twin.png", "--force")
+    trilat(*asked, "--force", cwd=folder).succeeds()
+    assert (folder / "twin.png").read_bytes() == first
+
+
+def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
+    found = json.loads(trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds())
+    assert found["linear"]["smallest"] == 1e-9
+    assert found["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
+    assert [one["push"].split()[0] for one in found["pushes"]] == [f"{10.0**n:g}" for n in range(-9, -2)]
+
+
+@pytest.mark.parametrize(
+    ("asked", "facts"),
+    [
+        (("--push", "m9.q1"), ("m9.q1", "m (2 joints, 5 estimates)")),
+        (("--push", "m.q3"), ("m.q3", "2 joints")),
+        (("--push", "m.q1=0"), ("m.q1=0", "1e-11 to 1")),
+        (("--push", "m.q1=nan"), ("m.q1=nan",)),
+        (("--push", "m.q1=a"), ("m.q1=a", "a number")),
+        (("--at", "4"), ("--at 4", "before 4 s")),
+        (("--at", "nan"), ("--at nan",)),
+        (("--delta", "1e-9"), ("two sizes", "1e-9:1e-3", "'1e-9'")),
+        (("--delta", "1e-3:1e-9"), ("two sizes",)),
+        (("--delta", "1e-9:1e-3", "--push", "m.q1", "--push", "m.q2"), ("one push", "m.q1, m.q2")),
+        (("-o", "twin.txt"), ("twin.txt", ".png")),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(
+    folder: Path, asked: tuple[str, ...], facts: tuple[str, ...]
+) -> None:
+    trilat("twin", "run.mcap", *asked, cwd=folder).refuses(*facts)
+
+
+def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / simulated(tmp_path, "two_sites", "seed=2", seconds="1")
+    trilat("twin", "run.mcap", other, cwd=folder).refuses("no part of the session")
+
+
+def test_a_law_that_may_not_run_has_no_twin(folder: Path) -> None:
+    done = trilat("twin", OWN_LAW, cwd=folder)
+    assert done.code == 4
+    assert done.err.splitlines()[-1].startswith("error: ")
+
+
+def test_what_cannot_be_executed_again_has_no_twin() -> None:
+    lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
+    with pytest.raises(NotRepeatable, match="records of m1 are missing"):
+        tn.twin(lost)
+    with pytest.raises(NotRepeatable, match="sites that a rerun took over did not react"):
+        tn.twin(tn.rerun(log, ["s"], {"control.Kd": 5}).after)
+    external = SimpleNamespace(scenario=tn.load_scenario("free", {"sites.m1.plant": "external"}))
+    assert "arm of m1, outside of the program" in explain_no_repetition(external)
+
+
+@pytest.mark.parametrize("command", ["certify", "twin"])
+def test_help_tells_of_twins(command: str, folder: Path) -> None:
+    assert "twin" in trilat(command, "--help", cwd=folder).succeeds()
+
+
+def test_a_certificate_without_twins_has_none(folder: Path) -> None:
+    without = json.loads(trilat("certify", "run.mcap", "--twins", "0", "--json", cwd=folder).out)
+    three = json.loads(trilat("certify", "run.mcap", "--twins", "3", "--json", cwd=folder).out)
+    assert without["twins"] is None
+    assert len(three["twins"]["pushes"]) == 3

@@ -1,0 +1,134 @@
+"""A twin is the run, and differs from it by what became of its push alone."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.certificate.adversaries import p_d, two_pairs
+from trilat_net.analysis.twin_growth import judge_twins
+from trilat_net.errors import NotRepeatable, UsageError
+from trilat_net.execution.twins import (
+    LARGEST,
+    Push,
+    Twins,
+    aim_push,
+    choose_pushes,
+    run_twins,
+    run_virtual_twins,
+)
+from trilat_net.scenario import Scenario, load_scenario
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+REST = {f"sites.{site}.q0_rad": [0.3, 0.5] for site in ("m1", "m2", "s")}
+"""Arms that are at rest from the beginning: what is left is linear."""
+
+
+def at_rest(d: float) -> Scenario:
+    return load_scenario("p_d_margin", {"control.d": d, **REST})
+
+
+def rate_per_s(scenario: Scenario, twins: Twins) -> float:
+    return judge_twins(scenario, twins, 0.0, math.inf).pushes[0].rate_per_s
+
+
+@pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])
+def test_the_difference_of_a_linear_loop_obeys_its_root(d: float, seconds: float) -> None:
+    scenario = at_rest(d)
+    twins = run_virtual_twins(scenario, [aim_push(scenario, "m1.q1", 1e-7)], seconds)
+    roots = tn.linear("p_d_margin", {"control.d": d}, pose=(0.3, 0.5), ports=False).to_dict()
+    root_per_s = roots["as_computed"]["roots"][0]["re_per_s"]
+    assert rate_per_s(scenario, twins) == pytest.approx(root_per_s, rel=0.02)
+
+
+def test_a_push_of_nothing_changes_no_bit() -> None:
+    scenario = load_scenario("paper")
+    by = np.zeros((3, 2))
+    twins = run_virtual_twins(scenario, [Push("nothing", "q", by), Push("nothing later", "qd", by, 1.3)], 3.0)
+    assert not np.isfinite([path.largest for path in twins.paths]).any()
+    assert twins.speed.max() > 0.1
+
+
+@pytest.mark.parametrize("name", ["live-4g", "live-paper"])
+def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
+    """With the arrivals that it had: late ones, lost ones, and those before their time."""
+    log = tn.open_log(GOLDEN / f"{name}.mcap")
+    twins = run_twins(log, choose_pushes(log.scenario, 1))
+    assert twins.same
+    assert np.isfinite(twins.paths[0].largest[1:-1]).all()
+
+
+def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
+    scenario = two_pairs((p_d(2.0), p_d(2.0)), (0.1, 0.3, 0.2, 0.6))
+    twins = run_virtual_twins(scenario, [aim_push(scenario, "a.q1")], 4.0)
+    reached = np.isfinite(twins.paths[0].largest).any(axis=0)
+    assert reached.tolist() == [True] * 4 + [False] * 4
+
+
+def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
+    scenario = at_rest(0.5)
+    free = aim_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
+    often = free._replace(largest=2e-9)
+    twins = run_virtual_twins(scenario, [free, often], 40.0)
+    assert not twins.paths[0].scale.any()
+    assert np.count_nonzero(np.diff(twins.paths[1].scale)) >= 3
+    first, second = (path.largest[100:-2].max(axis=1) for path in twins.paths)
+    assert first == pytest.approx(second, abs=1e-3)
+
+
+def test_what_dies_down_ends_there_or_is_pushed_anew() -> None:
+    scenario = at_rest(3.0)
+    once = aim_push(scenario, "m1.qd2", 1e-9)
+    twins = run_virtual_twins(scenario, [once, once._replace(again=True)], 60.0)
+    ended, anew = twins.paths
+    assert ended.died is not None
+    assert not np.isfinite(ended.largest[ended.died :]).any()
+    assert ended.largest[ended.died - 1].max() >= math.log(1e-12)
+    assert anew.died is None
+    assert len(anew.pushed) > 1
+
+
+def test_a_push_is_at_its_instant() -> None:
+    scenario = load_scenario("two_sites")
+    twins = run_virtual_twins(scenario, [aim_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
+    path = twins.paths[0]
+    assert path.pushed == (25,)
+    assert not np.isfinite(path.largest[:25]).any()
+    assert np.isfinite(path.largest[25]).tolist() == [False, False, True, True]  # m has not heard of it yet
+    assert path.push.largest == math.inf > LARGEST
+    with pytest.raises(NotRepeatable, match="within the run"):
+        run_virtual_twins(scenario, [path.push._replace(at_s=2.0)], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "pushed"),
+    [
+        ("m1.q2", "1e-06 rad at m1 joint 2", [(0, 1)]),
+        ("s.qd1", "1e-06 rad/s at s joint 1", [(2, 0)]),
+        ("m2.theta3", "1e-06 of m2 estimate 3", [(1, 2)]),
+        ("m2.q", "1e-06 rad at all joints of m2", [(1, 0), (1, 1)]),
+        ("qd", "1e-06 rad/s at all joints", [(i, j) for i in range(3) for j in range(2)]),
+        ("theta", "1e-06 of all estimates", [(i, j) for i in range(3) for j in range(5)]),
+    ],
+)
+def test_a_push_is_aimed_by_words(target: str, name: str, pushed: list[tuple[int, int]]) -> None:
+    push = aim_push(load_scenario("paper"), target)
+    assert push.name == name
+    assert [tuple(at) for at in np.argwhere(push.by).tolist()] == pushed
+    assert np.abs(push.by).max() <= 1e-6
+
+
+@pytest.mark.parametrize(
+    "target", ["", "m1", "m1.q0", "m1.q3", "m1.theta6", "m4.q1", "q1", "m1.q1.q1", "m1.tau1"]
+)
+def test_what_cannot_be_pushed_is_refused_with_what_can(target: str) -> None:
+    with pytest.raises(UsageError, match=r"no such number; .* m1 \(2 joints, 5 estimates\)"):
+        aim_push(load_scenario("paper"), target)
+
+
+@pytest.mark.parametrize("size", [0.0, math.nan, math.inf, 1e-12, -2.0])
+def test_a_size_that_is_none_is_refused(size: float) -> None:
+    with pytest.raises(UsageError, match="from 1e-11 to 1"):
+        aim_push(load_scenario("paper"), "m1.q1", size)
