@@ -30,6 +30,7 @@ EXTERNAL = GOLDEN.parents[1] / "examples" / "external_arm.toml"
 """A scenario of which theory knows no delay margin."""
 OTHERS: dict[str, Callable[[Path], list[Result]]] = {
     "linear": lambda _: [tn.linear("p_d_margin", over=["control.d=0.3:1"])],
+    "twin": lambda _: [tn.twin(LOGS[1]), tn.twin(LOGS[1], delta="1e-9:1e-3")],
     "test": lambda _: [tn.check("free", jobs=1)],
     "sweep": lambda folder: [
         tn.sweep("contact", ["link.delay_ms=20,200"], laws=["p_f"], out=folder / "contact", jobs=1),

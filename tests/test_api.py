@@ -50,7 +50,10 @@ COUNTERPARTS = {
     "create_keys": ["keys new"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],
-    **{name: [name] for name in ("doctor", "verify", "certify", "metrics", "figure", "report", "rerun")},
+    **{
+        name: [name]
+        for name in ("doctor", "verify", "certify", "metrics", "figure", "report", "rerun", "twin")
+    },
     **{name: [name] for name in ("sweep", "bench", "linear")},
 }
 """By name in Python the commands that do the same."""
@@ -104,6 +107,7 @@ class _Texts(HTMLParser):
 
 RESULTS: dict[str, Callable[[Path], Result]] = {
     "certify": tn.certify,
+    "twin": tn.twin,
     "metrics": tn.metrics,
     "verify": tn.verify,
     "log info": tn.info,

@@ -55,7 +55,7 @@ def test_the_words_follow_the_trend() -> None:
 def test_a_number_beyond_all_numbers_is_null() -> None:
     row = grown(80.0).to_json()["pushes"][0]
     assert (row["becomes_rad_s"], row["factor"]) == (None, None)
-    assert row["rate_per_s"] == pytest.approx(80.0, rel=1e-3)
+    assert row["rate_per_s"] == pytest.approx(80.0, rel=0.05)
 
 
 def test_a_run_is_not_stable_where_its_twins_grow() -> None:
