@@ -453,17 +453,14 @@ class PushedTwins(Result):
         rate = "" if math.isnan(one.rate_per_s) else f" ({one.rate_per_s:+.3g} /s)"
         pushed, to_s = f"a push of {one.push.name} at {self.at_s:.4g} s", self.growth.to_s
         if one.died_s is not None:
-            return (
-                f"{pushed} dies down to the rounding of the numbers in {one.died_s - self.at_s:.3g} s{rate}"
-            )
+            died = "dies down to the rounding of the numbers"
+            return f"{pushed} {died} in {one.died_s - self.at_s:.3g} s{rate}"
         if one.trend is EnvelopeTrend.GROWS:
-            in_s = f"{to_s - self.growth.from_s:.4g} s"
-            return f"{pushed} grows x {one.factor:.3g} in {in_s}{rate}, most at {one.joint}"
+            grows = f"grows x {one.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
+            return f"{pushed} {grows}{rate}, most at {one.joint}"
         falls = one.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-        becomes = (
-            f"becomes {one.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}, most at {one.joint}"
-        )
-        return f"{pushed} {becomes}{'' if falls else '; it shows no clear trend'}"
+        becomes = f"becomes {one.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}"
+        return f"{pushed} {becomes}, most at {one.joint}{'' if falls else '; it shows no clear trend'}"
 
     def headline(self) -> str:
         """Returns for which sizes a push is linear, or what became of the worst one."""
@@ -554,18 +551,16 @@ def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[f
         at = int(np.abs(apart).argmax())
         if abs(apart[at]) > SAME_SCALED:
             grows = any(
-                one.trend is EnvelopeTrend.GROWS for one in growth.pushes if one.push is paths[n].push
+                one.trend is EnvelopeTrend.GROWS and one.push is paths[n].push for one in growth.pushes
             )
-            own = {one.actor.acts for site in scenario.sites.values() for one in site.environment}
+            acts = {one.actor.acts for site in scenario.sites.values() for one in site.environment}
             does = "saturates" if grows and apart[at] < 0.0 else "goes another way"
-            does += " (there is a wall)" if TorqueKind.WALL in own else ""
-            at_s, times = paths[0].t_s[at], _exp(float(apart[at]))
-            beyond = f"a push of {sizes[n + 1]:g} {does}: x {times:.3g} of that at {at_s:.4g} s"
+            does += " (there is a wall)" if TorqueKind.WALL in acts else ""
+            times = f"x {_exp(float(apart[at])):.3g} of that at {paths[0].t_s[at]:.4g} s"
+            beyond = f"; a push of {sizes[n + 1]:g} {does}: {times}"
             break
     last = sizes[n] if beyond else sizes[-1]
-    text = (
-        f"not linear from {last:g} {unit} on"
-        if last == sizes[0]
-        else f"linear from {sizes[0]:g} to {last:g} {unit}"
+    linear = f"linear from {sizes[0]:g} to {last:g} {unit}"
+    return LinearSizes(
+        sizes[0], last, (linear if last > sizes[0] else f"not linear, from {last:g} {unit} on") + beyond
     )
-    return LinearSizes(sizes[0], last, f"{text}; {beyond}" if beyond else text)

@@ -154,12 +154,11 @@ def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: floa
     if not owners or (number and not site):
         each = zip(layouts, joints, estimates, strict=True)
         there = ", ".join(f"{name} ({n} joints, {m} estimates)" for name, n, m in each)
-        raise UsageError(
-            f"--push {target}: no such number; as in m1.q1, m1.qd1, m1.theta1, m1.q or q, of {there}"
-        )
+        names = ", ".join(f"{scenario.names[0]}.{one}" for one in ("q1", "qd1", "theta1", "q"))
+        raise UsageError(f"--push {target}: no such number; as in {names}, or q, of {there}")
     if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
         raise UsageError(
-            f"--push {target}={size:g}: the size of a push is from {LEAST_PUSH:g} to {MOST_PUSH:g}"
+            f"--push {target}={size:g}: a push is of a size from {LEAST_PUSH:g} to {MOST_PUSH:g}"
         )
     chance, by = np.random.Generator(np.random.Philox(0)), np.zeros((len(counts), max(counts)))
     for n in owners:
@@ -317,17 +316,12 @@ class _TwinRuns:
 
     def _collect(self) -> Twins:
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
+        kept = zip(
+            self._pushes, self._largest, self._last, self._scales, self._pushed, self._died, strict=True
+        )
         paths = [
-            TwinPath(
-                push,
-                t_s,
-                self._largest[n],
-                self._last[n],
-                self._scales[n],
-                tuple(self._pushed[n]),
-                self._died[n],
-            )
-            for n, push in enumerate(self._pushes)
+            TwinPath(push, t_s, largest, last, scale, tuple(pushed), died)
+            for push, largest, last, scale, pushed, died in kept
         ]
         return Twins(paths, self._joints, self._speed, self._same)
 

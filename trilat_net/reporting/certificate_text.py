@@ -63,7 +63,7 @@ def compose_twins(found: PushedTwins) -> Iterator[Block]:
         yield found.headline()
     yield from map(found.describe, found.growth.pushes)
     if not found.growth.same:
-        yield "note: executed on another platform, whose last bits differ from those of the records"
+        yield "note: executed again, its last bits are not those of the records: another platform, or version"
 
 
 class CertificateLine(NamedTuple):

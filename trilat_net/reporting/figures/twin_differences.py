@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude
 from ...core.ticks import BUCKETS_PER_S
@@ -39,7 +40,7 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     log, growth, twins, worst = found.log, found.growth, found.growth.twins, found.growth.worst
     if twins is None or worst is None:
         return style.empty_figure(growth.text, form)
-    with time_figure(log, form, 4.4) as plot:
+    with time_figure(log, form, 5.4 if form.narrow else 4.4) as plot:
         above, below = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))[:, 0]
         lines = list(_list_lines(found))
         step = max(1, int((growth.to_s - found.at_s) * BUCKETS_PER_S / _POINTS))
@@ -57,7 +58,7 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
             speed = twins.speed[:, place : (place := place + log.scenario.layout(site).joints)].max(axis=1)
             below.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
         below.set_ylim(0.0, 1.1 * float(twins.speed[t_s >= from_s].max(initial=SMALLEST)))
-        below.set_ylabel("speed of the\nrun (rad/s)")
+        below.set_ylabel("run (rad/s)")
         plot.mark(above, log.sites)
         words = textwrap.fill(found.headline(), 62 if form.narrow else 110)
         plot.finish([below], [(name, line) for name, _, _, line in lines], title=style.typeset(words))
@@ -124,7 +125,8 @@ def _mark(axes: Axes, found: PushedTwins, form: FigureSize) -> None:
         axes.annotate(
             "rounding", top, (3.0, -9.0), axes.get_yaxis_transform(), fontsize=form.small_pt, **_WORDS
         )
-    axes.set_ylim(low, high)
+    axes.set_ylim(min(low, high / 30.0), high)
+    axes.yaxis.set_minor_formatter(NullFormatter())
     top = (found.at_s, 1.0)
-    axes.axvline(found.at_s, color=style.REFERENCE, linewidth=0.8, zorder=0.6)
+    axes.axvline(found.at_s, color=style.REFERENCE, linewidth=0.8)
     axes.annotate("push", top, (3.0, -8.0), axes.get_xaxis_transform(), fontsize=form.small_pt, **_WORDS)
