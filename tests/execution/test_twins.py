@@ -90,6 +90,18 @@ def test_what_dies_down_ends_there_or_is_pushed_anew() -> None:
     assert len(anew.pushed) > 1
 
 
+def test_a_twin_that_leaves_its_limits_is_told() -> None:
+    """The run itself stays within them; a twin that was pushed far enough does not."""
+    log = tn.simulate("paper", {"limits.qd_limit_rad_s": 1.2}, duration_s=10)
+    found = tn.twin(log, 1, {"m1.q1": 0.9, "q": 1e-3})
+    far, near = found.growth.pushes
+    assert log.diverged_s is None
+    assert far.ended_s is not None
+    assert 1.0 < far.ended_s < 2.0
+    assert "makes the run diverge in " in found.describe(far)
+    assert near.ended_s is None
+
+
 def test_a_push_is_at_its_instant() -> None:
     scenario = load_scenario("two_sites")
     twins = run_virtual_twins(scenario, [aim_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)

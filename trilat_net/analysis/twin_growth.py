@@ -80,7 +80,7 @@ class PushGrowth(NamedTuple):
         joint: the joint at which it is largest at the end.
         group: the place of those sites among the groups.
         becomes_rad_s: the largest difference of the last second, rad/s, as if nothing was made small again.
-        died_s: when it died down to the rounding of the numbers, s, if it is not pushed anew then.
+        ended_s: when its twin ended before the run, s: it died down to the rounding, or it grew and diverged.
     """
 
     push: Push
@@ -90,7 +90,7 @@ class PushGrowth(NamedTuple):
     joint: str
     group: int
     becomes_rad_s: float
-    died_s: float | None = None
+    ended_s: float | None = None
 
 
 class LeftRest(NamedTuple):
@@ -171,7 +171,7 @@ class TwinGrowth(NamedTuple):
                     "factor": finite_or_none(one.factor),
                     "joint": one.joint,
                     "becomes_rad_s": finite_or_none(one.becomes_rad_s),
-                    "died_s": one.died_s,
+                    "ended_s": one.ended_s,
                 }
                 for one in self.pushes
             ],
@@ -390,8 +390,9 @@ def _judge_push(
     since = max(first, legs[-2])
     fit = _fit(t_s[since:end], amplitude[since:end])
     found = PushGrowth(path.push, fit.trend, fit.rate_per_s, 0.0, joint, 0, _exp(float(largest.max())))
-    if path.died is not None:
-        return found._replace(trend=EnvelopeTrend.DECAYS, died_s=float(t_s[end - 1]))
+    if path.died is not None or end < part.stop - BUCKETS_PER_S:
+        trend = EnvelopeTrend.GROWS if path.died is None else EnvelopeTrend.DECAYS
+        return found._replace(trend=trend, ended_s=float(t_s[end - 1]))
     died = len(legs) > 2 and legs[-2] > (first + end) // 2  # within the judged part
     if died and (fit.trend is not EnvelopeTrend.GROWS or end - legs[-2] < (end - first) // 4):
         before = slice(legs[-3], legs[-2])  # when it died: since then there is too little of it
@@ -452,9 +453,10 @@ class PushedTwins(Result):
         """Returns what became of a push, in one sentence."""
         rate = "" if math.isnan(one.rate_per_s) else f" ({one.rate_per_s:+.3g} /s)"
         pushed, to_s = f"a push of {one.push.name} at {self.at_s:.4g} s", self.growth.to_s
-        if one.died_s is not None:
+        if one.ended_s is not None:
             died = "dies down to the rounding of the numbers"
-            return f"{pushed} {died} in {one.died_s - self.at_s:.3g} s{rate}"
+            ends = died if one.trend is EnvelopeTrend.DECAYS else "makes the run diverge"
+            return f"{pushed} {ends} in {one.ended_s - self.at_s:.3g} s{rate}"
         if one.trend is EnvelopeTrend.GROWS:
             grows = f"grows x {one.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
             return f"{pushed} {grows}{rate}, most at {one.joint}"

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from ...analysis.envelope_trend import EnvelopeTrend
 from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
@@ -57,7 +58,7 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
         for site in log.sites:
             speed = twins.speed[:, place : (place := place + log.scenario.layout(site).joints)].max(axis=1)
             below.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
-        below.set_ylim(0.0, 1.1 * float(twins.speed[t_s >= from_s].max(initial=SMALLEST)))
+        below.set_ylim(0.0, 1.1 * float(twins.speed[t_s >= from_s].max(initial=0.0)) or 1.0)
         below.set_ylabel("run (rad/s)")
         plot.mark(above, log.sites)
         words = textwrap.fill(found.headline(), 62 if form.narrow else 110)
@@ -102,10 +103,10 @@ def _trace(path: TwinPath, joints: list[int], to_s: float, step: int) -> tuple[A
 
 def _draw_rate(axes: Axes, found: PushedTwins, one: PushGrowth, t_s: Array, values: Array) -> None:
     """Draws the fitted rate of a push as a dashed line above its values, with its words."""
-    end_s = found.growth.to_s if one.died_s is None else one.died_s
-    from_s = found.growth.from_s if one.died_s is None else 0.5 * (found.at_s + end_s)
+    end_s = found.growth.to_s if one.ended_s is None else one.ended_s
+    from_s = found.growth.from_s if one.ended_s is None else 0.5 * (found.at_s + end_s)
     rows = (t_s >= from_s) & (t_s <= end_s) & (values > 0.0)
-    if not rows.any() or not np.isfinite(one.rate_per_s):
+    if not rows.any() or not np.isfinite(one.rate_per_s) or one.trend is EnvelopeTrend.UNDECIDED:
         return
     t_s, falls = t_s[rows], one.rate_per_s < 0.0
     level = float(np.max(np.log(1.15 * values[rows]) - one.rate_per_s * t_s))
