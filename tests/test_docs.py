@@ -12,12 +12,12 @@ import pytest
 from recorder import backfill, record_process, session_recording
 from recorder.play import pace
 from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
-from trilat_net.analysis import arm_rows, run_end, site_signals
+from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
-from trilat_net.execution import difference
+from trilat_net.execution import difference, twins
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
@@ -49,6 +49,11 @@ MOST_RANDOM_ERROR = math.sqrt((impedance.MIN_COHERENCE**-2 - 1.0) / (2.0 * imped
 STATED: list[tuple[str, str, float, float]] = [
     ("bench.md", "32 candidates each", 32, bench_gains.TUNING_BUDGET),
     ("bench.md", "round trips of 68, 272 and 1088 ms", 1088, bench_tasks.TUNED_ROUND_TRIPS_MS[-1]),
+    ("certificate.md", "end of each of 16 windows", 16, twins.WINDOWS),
+    ("certificate.md", "a difference above 1e-4 is made small again", 1e-4, twins.LARGEST),
+    ("certificate.md", "a run within 1e-7 of its records has twins", 1e-7, twins.SAME_RUN),
+    ("certificate.md", "A difference below 1e-12 is rounding", 1e-12, twins.SMALLEST),
+    ("definitions.md", "(`FLOOR_RAD`, 1e-12)", 1e-12, envelope_trend.FLOOR_RAD),
     ("definitions.md", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
     ("design.md", "at most 200 ppm", 200.0, timing.SLEW_LIMIT / 1e3),
     ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),

@@ -50,6 +50,7 @@ def test_the_version_is_that_of_the_package() -> None:
         pytest.param("figure run.mcap se", {"settling"}, marks=pytest.mark.long),
         ("site --scenario two_sites ", {"m", "s"}),
         pytest.param(f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}, marks=pytest.mark.long),
+        pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
 def test_a_shell_completes(words: str, found: set[str]) -> None:

@@ -1,6 +1,7 @@
 """`trilat twin`: one line for every mistake, words for every push, a figure."""
 
 import json
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,8 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import simulated, trilat
 from tests.execution.logs import without_records
+from trilat_net.analysis.twin_growth import TWINS
+from trilat_net.cli.certify import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.log_inputs import explain_no_repetition
 
@@ -94,4 +97,5 @@ def test_a_certificate_without_twins_has_none(folder: Path) -> None:
     without = json.loads(trilat("certify", "run.mcap", "--twins", "0", "--json", cwd=folder).out)
     three = json.loads(trilat("certify", "run.mcap", "--twins", "3", "--json", cwd=folder).out)
     assert without["twins"] is None
+    assert signature(certify_command).parameters["twins"].default == TWINS
     assert len(three["twins"]["pushes"]) == 3
