@@ -38,6 +38,12 @@ def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
     assert (folder / "twin.png").read_bytes() == first
 
 
+def test_one_joint_is_pushed_by_two_sizes(folder: Path) -> None:
+    asked = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
+    words = trilat(*asked, cwd=folder).succeeds().splitlines()
+    assert [line.split()[3] for line in words] == ["1e-06", "-0.001"]
+
+
 def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
     found = json.loads(trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds())
     assert found["linear"]["smallest"] == 1e-9

@@ -504,18 +504,20 @@ def twin(
         LawWithheld: a law of it may not run.
     """
     log = log if isinstance(log, Log) else open_log(log)
-    scenario, asked = log.scenario, dict(push) if isinstance(push, Mapping) else dict(map(_read_push, push))
+    scenario, asked = log.scenario, push.items() if isinstance(push, Mapping) else [*map(_read_push, push)]
     end_s = max(len(log[name]) / log[name].rate_hz for name in log.sites)
-    if not 0.0 <= at_s < end_s:
+    if not 0.0 <= at_s < end_s and end_s > 0.0:
         raise UsageError(f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s")
     if delta and len(asked) > 1:
-        raise UsageError(f"--delta sweeps the size of one push, not of {', '.join(asked)}")
+        raise UsageError(
+            f"--delta sweeps the size of one push, not of {', '.join(what for what, _ in asked)}"
+        )
     if delta:
-        what, sizes = next(iter(asked), "q"), _read_sizes(delta)
+        (what, _), sizes = next(iter(asked), ("q", 0.0)), _read_sizes(delta)
         pushes = [aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes]
     else:
         usual = [one._replace(at_s=at_s, again=False) for one in choose_pushes(scenario, TWINS)]
-        pushes = [aim_push(scenario, what, size, at_s) for what, size in asked.items()] or usual
+        pushes = [aim_push(scenario, what, size, at_s) for what, size in asked] or usual
     growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
     return PushedTwins(log, at_s, growth, _find_linear_sizes(scenario, growth, sizes) if delta else None)
 
