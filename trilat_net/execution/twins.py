@@ -29,7 +29,8 @@ from .log_inputs import explain_no_repetition, read_run_inputs
 PUSH_RAD = 1e-6
 """The usual push, rad."""
 LARGEST = 1e-4
-"""A difference larger than this, rad or rad/s, is made small again at the end of its window."""
+"""A difference larger than this, rad or rad/s, and than ten times its push, is made small again at the end of
+its window."""
 SMALLEST = 1e-12
 """One smaller than this is lost in the rounding of the numbers."""
 WINDOWS = 16
@@ -255,14 +256,15 @@ class _TwinRuns:
         """Makes a difference that grew small again, and pushes one anew that died down."""
         twin, last = self._twins[n], round(end_s * BUCKETS_PER_S)
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
+        pushed = float(np.abs(self._pushes[n].by).max())  # nothing is made larger than it is
         recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]
-        if not math.isfinite(q + qd) or max(q, qd) > LARGEST:
-            factor = float(np.abs(self._pushes[n].by).max()) / max(q, qd)
-            twin.approach(self._run, factor)
-            self._scale[n] -= math.log(factor)
-        elif recent < math.log(SMALLEST):
+        if recent < math.log(SMALLEST):  # whatever is left of it as a shift to another rest
             twin.copy_state(self._run)
             self._push(n, end_s)
+        elif not math.isfinite(q + qd) or max(q, qd) > max(LARGEST, 10.0 * pushed):
+            factor = pushed / max(q, qd)
+            twin.approach(self._run, factor)
+            self._scale[n] -= math.log(factor)
 
     def _collect(self) -> Twins:
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
