@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import LIVE_KINDS
+from ..core.exogenous import LIVE_KINDS, TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -403,7 +403,7 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
 def _find_disagreement(
     scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
 ) -> Iterable[str]:
-    """Yields what is said of sites that do not agree, do not come closer, and are held apart by no force."""
+    """Yields what is said of sites that do not agree, do not come closer, and are not held apart."""
     for group in find_coupled_sites(scenario):
         if len(group) < 2 or any(scenario.arms[scenario.names[n]].shares_pose for n in group):
             continue  # e says if they agree
@@ -413,9 +413,25 @@ def _find_disagreement(
         nearer = fit_envelope(t_s, apart.max(axis=1)).trend is EnvelopeTrend.DECAYS
         pulled = max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM
         held = pulled and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
+        at = q[[_is_held(scenario, trace, n, joint, float(t_s[-1])) for n in group], -1, joint]
+        held |= len(at) > 0 and apart[-1, joint] - np.ptp(at) < AGREEMENT_RAD
         if apart[-1, joint] > AGREEMENT_RAD and not (nearer or held):
             ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
             yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
+
+
+def _is_held(scenario: Scenario, trace: RunTrace, n: int, joint: int, end_s: float) -> bool:
+    """Returns if a joint is held at the end, by the stiffness of a hand, or of what it touches.
+
+    A hand at the place that it wants needs no torque, and holds all the same.
+    """
+    spec = scenario.sites[scenario.names[n]]
+    touched = spec.environment if np.abs(trace.tau_x[n]).max() > FORCE_NM else ()
+    for actor in (one.actor for one in (*spec.hands, *touched)):
+        stiffness = actor.K[joint : joint + 1] if actor.acts == TorqueKind.HAND else actor.K
+        if actor.start_s <= end_s < actor.end_s and any(stiffness):
+            return True
+    return False
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:

@@ -55,6 +55,8 @@ LEAST_LEFT_S = 5.0
 """A run that leaves a rest by itself does so for this time or longer, s,"""
 DOUBLES = 2.0
 """faster by this factor at the end of it than at its beginning."""
+CLEAR_GROWTH = 100.0
+"""What grows by this factor is seen in a push of any direction that dies away otherwise."""
 _ORDER = (
     EnvelopeTrend.DECAYS,
     EnvelopeTrend.HARDLY,
@@ -156,6 +158,11 @@ class TwinGrowth(NamedTuple):
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
             return None
         return self.to_s + 4.0 * math.log(2.0) / -worst.rate_per_s
+
+    def excludes(self, rate_per_s: float) -> bool:
+        """True if every push dies away in a time in which one at this rate had grown by `CLEAR_GROWTH`."""
+        clear = rate_per_s * (self.to_s - self.from_s) > math.log(CLEAR_GROWTH)
+        return clear and self.trend is EnvelopeTrend.DECAYS
 
     def to_json(self) -> dict[str, Any]:
         """Returns what is found, ready for JSON."""

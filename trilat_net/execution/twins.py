@@ -30,7 +30,8 @@ from .log_inputs import explain_no_repetition, read_run_inputs
 PUSH_RAD = 1e-6
 """The usual push, rad."""
 LARGEST = 1e-4
-"""A difference larger than this, rad or rad/s, is made small again at the end of its window."""
+"""A difference larger than this, rad or rad/s, and than ten times its push, is made small again at the end of
+its window."""
 SMALLEST = 1e-12
 """One smaller than this is lost in the rounding of the numbers."""
 WINDOWS = 16
@@ -301,18 +302,20 @@ class _TwinRuns:
         """Makes a difference that grew small again, and pushes one anew that died down."""
         twin, last, push = self._twins[n], round(end_s * BUCKETS_PER_S), self._pushes[n]
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
+        pushed = float(np.abs(push.by).max())  # nothing is made larger than it is
         recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]
-        if push.largest < math.inf and (not math.isfinite(q + qd) or max(q, qd) > push.largest):
-            factor = float(np.abs(push.by).max()) / max(q, qd)
-            twin.approach(self._run, factor)
-            self._scale[n] -= math.log(factor)
-        elif recent < math.log(SMALLEST) and push.again:
+        dead = recent < math.log(SMALLEST)  # whatever is left of it as a shift to another rest
+        if dead and push.again:
             twin.copy_state(self._run)
             self._push(n, end_s)
-        elif recent < math.log(SMALLEST) and twin.diverged_s is None:
+        elif dead and twin.diverged_s is None:
             alive = self._largest[n].max(axis=1) - self._scales[n] >= math.log(SMALLEST)
             self._died[n] = int(np.flatnonzero(alive)[-1]) + 1 if alive.any() else self._pushed[n][0]
             self._largest[n, self._died[n] :] = -np.inf
+        elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * pushed):
+            factor = pushed / max(q, qd)
+            twin.approach(self._run, factor)
+            self._scale[n] -= math.log(factor)
 
     def _collect(self) -> Twins:
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S

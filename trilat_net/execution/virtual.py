@@ -252,7 +252,7 @@ def simulate_scenario(scenario: Scenario, *, hands: HandTracks = {}) -> Simulate
     stream = io.BytesIO()
     make(stream, 0.0)
     stream.seek(0)
-    return SimulatedLog(read_contents(stream, "log"), make)
+    return SimulatedLog(read_contents(stream, "log", own=True), make)
 
 
 def open_in_memory(write: Callable[[io.BytesIO], object]) -> Log:

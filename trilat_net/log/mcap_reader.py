@@ -326,13 +326,18 @@ class LogContents:
         return self.sources[0] + (f" and {more} more {'parts' if more > 1 else 'part'}" if more else "")
 
 
-def read_contents(stream: BinaryIO, name: str, progress: Progress | None = None) -> LogContents:
+def read_contents(
+    stream: BinaryIO, name: str, progress: Progress | None = None, *, own: bool = False
+) -> LogContents:
     """Returns the contents of a file, called `name` in errors.
+
+    One that this program wrote just now is its `own`: however well a run that hardly moves is packed, it
+    holds no more than the run did.
 
     Raises:
         LogError: it is no MCAP file, or no log of trilat-net.
     """
-    reader = McapReader(stream, name, progress)
+    reader = McapReader(stream, name, progress, kept=not own)
     channels: dict[str, ChannelMessages] = {}
     adders: dict[str, Callable[[bytes, int, int], None]] = {}
     for topic, payload, log_ns, publish_ns, _ in reader.messages():

@@ -172,12 +172,20 @@ class Certificate(Result):
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
-        if self.roots is not None and self.roots.verdict == "unstable":
+        if self.roots is not None and self.roots.verdict == "unstable" and not self._roots_refuted:
             found.append(self.roots.text)
         if self.observed is not None and self.observed.refuted:
             found.append(self.observed.text)
         told = self._by_twins.reason
         return (*self.end.reasons, *([told] if told else []), *found, *self.evidence.reasons)
+
+    @property
+    def _roots_refuted(self) -> bool:
+        """True if roots of mean ages are unstable, and pushes die away that had the very ages of the run."""
+        roots, twins = self.roots, self.twins
+        if roots is None or roots.exact or twins is None or roots.rate_per_s is None:
+            return False
+        return twins.excludes(roots.rate_per_s)
 
     @property
     def _by_twins(self) -> TwinVerdict:
