@@ -56,7 +56,7 @@ _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},  # measured, below the others
 )
 _VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
-_EXPONENTS = LinearSegmentedColormap.from_list("exponents", ["#004488", "#ffffff", "#a23b53"])
+_EXPONENTS = LinearSegmentedColormap.from_list("exponents", ["#004488", "#ffffff", "#a23b53"], 257)
 _HALO_PT = 2.6
 _COUNT_PT = 5.0
 _LETTERS_PER_IN = 13
