@@ -264,8 +264,8 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
             if count and one is not CellClass.UNDECIDED
         ]
     if any(_undecided(plane, panel).any() for panel in plane.panels):
-        word = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
-        word = "no exponent" if plane.judged_by_twins else word
+        many = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
+        word = "no exponent" if plane.judged_by_twins else many
         handles.append(Patch(label=word, **{**_HATCHED, "linewidth": 0.5}))
     named = {line.label: line for some in lines for line in some}
     handles += [

@@ -355,9 +355,8 @@ def build_stability_map(
     if not drawn.y.key or len(drawn.y.values) < 2:
         return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
-    lines = [[trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
-    for some, panel in zip(lines, drawn.panels, strict=True):
-        some.insert(0, trace_zero_exponent(panel))
+    zeros = map(trace_zero_exponent, drawn.panels)
+    lines = [[next(zeros), trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
     remarks: dict[str, None] = {}
     if linearly:
         for some, columns in zip(lines, _columns(drawn, at, jobs, on, progress), strict=True):
