@@ -92,6 +92,7 @@ ELSEWHERE = {
 
 NOT_RUN = {
     "docs/maps/contact.md: trilat sweep contact": "1 640 runs: minutes; it draws the page itself",
+    "docs/maps/exponents.md: trilat sweep": "306 runs with four twins: minutes; it draws the page itself",
     "docs/maps/jitter.md: trilat sweep jitter": "2 200 runs: minutes; it draws the page itself",
     "docs/maps/p_d.md: trilat sweep p_d_margin --duration 20 --over": "1 640 runs: minutes; it draws it",
     "docs/maps/p_d.md: trilat sweep p_d_margin --duration 20 --longest": "of 320 s; see test_page_numbers.py",

@@ -34,6 +34,7 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
     "test": lambda _: [tn.check("free", jobs=1)],
     "sweep": lambda folder: [
         tn.sweep("contact", ["link.delay_ms=20,200"], laws=["p_f"], out=folder / "contact", jobs=1),
+        tn.sweep("p_d_margin", ["control.d=1,2"], judge="twins", out=folder / "twins", jobs=1),
         tn.sweep("jitter", ["control.d=0,3"], seeds=2, duration_s=20, out=folder / "jitter", jobs=1),
     ],
     "sweep --margin": lambda _: [

@@ -287,6 +287,7 @@ def sweep(
     laws: Sequence[str | type] = (),
     duration_s: float | None = None,
     longest_s: float | None = None,
+    judge: str = "verdict",
     out: str | Path | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -305,7 +306,8 @@ def sweep(
         seeds: how many, or which.
         laws: names of laws, or classes, to sweep besides.
         duration_s: how long a cell runs at first, s.
-        longest_s: how long at most, s; by default eight times that.
+        longest_s: how long at most, s; by default eight times that, or just that if twins judge.
+        judge: "twins" measures the growth exponent of every cell besides its verdict.
         out: folder of the results; a sweep in it is continued. By default the next free runs/sweep-NAME-N.
         jobs: how many processes; None for one per core.
         on: what runs the cells instead: a Dask scheduler's address or an executor.
@@ -319,7 +321,7 @@ def sweep(
 
     require_polars()
     texts = _texts(set, duration_s)
-    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, laws=laws, longest_s=longest_s)
+    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, laws=laws, longest_s=longest_s, judge=judge)
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results
 

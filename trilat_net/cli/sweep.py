@@ -41,6 +41,8 @@ def _check_modes(given: Sequence[str]) -> Sequence[str]:
         raise UsageError("--width is of a map: use it with --map")
     if "--tolerance" in given and "--margin" not in given:
         raise UsageError("--tolerance is of an edge: use it with --margin")
+    if "--judge" in given and "--margin" in given:
+        raise UsageError("--judge is of a sweep and its map: leave --margin out")
     return given
 
 
@@ -277,6 +279,14 @@ def sweep_command(
             "--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."
         ),
     ] = None,
+    judge: Annotated[
+        str,
+        options.value(
+            "--judge",
+            "verdict|twins",
+            "What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.",
+        ),
+    ] = "verdict",
     output: Annotated[
         Path | None,
         options.value(
@@ -354,7 +364,7 @@ def sweep_command(
         axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
         laws, texts = options.split_names(law), options.list_overrides(overrides, duration)
         count = parse_seed_count(seeds)
-        asked = plan_sweep(scenario, texts, over=axes, seeds=count, laws=laws, longest_s=longest)
+        asked = plan_sweep(scenario, texts, over=axes, seeds=count, laws=laws, longest_s=longest, judge=judge)
         if within is not None:
             return _search_margins(asked, within, output, jobs, on, as_json=as_json)
         with terminal.lines_aside(as_json):
@@ -394,7 +404,7 @@ def _show_results(
 
 def _refuse_beside_results(given: Sequence[str]) -> None:
     """Refuses options that a sweep was planned with where it is finished or continued."""
-    for name in ("--over", "--seeds", "--law", "-o", "--longest", "--set", "--duration"):
+    for name in ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--set", "--duration"):
         if name in given:
             raise UsageError(f"{name} is of the sweep already: leave it out")
     if "--margin" in given:

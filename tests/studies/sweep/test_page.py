@@ -22,13 +22,13 @@ from trilat_net.studies.sweep.map_page import (
     write_map,
 )
 from trilat_net.studies.sweep.map_plane import CELL_CLASSES, MapPlane
-from trilat_net.studies.sweep.stability_map import StabilityMap, TheoryLine
+from trilat_net.studies.sweep.stability_map import MapLine, StabilityMap
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
-EXACT = TheoryLine("$d$", "d = 5 T", "the condition", SPARE, 0)
-HALF = TheoryLine("half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1)
+EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
+HALF = MapLine("half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1)
 
 
 @pytest.fixture
@@ -96,10 +96,10 @@ def test_a_map_without_an_edge_has_no_table() -> None:
     assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
 
 
-LINE = TheoryLine("$d$", "d", "", SPARE, 0)
+LINE = MapLine("$d$", "d", "", SPARE, 0)
 
 
-def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[TheoryLine, ...] = ()) -> Figure:
+def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
     return draw_stability_map(plane, [lines] * len(plane.panels), make_print_size(width_in))
 
 

@@ -16,6 +16,7 @@ from ...analysis.envelope_trend import FLOOR_RAD
 from ...analysis.json_values import finite_or_none
 from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.twin_growth import measure_virtual_twins
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
@@ -61,6 +62,8 @@ class CellResult(msgspec.Struct, frozen=True):
         diverged_s: when the first site left its limits, or None.
         rms_error_rad: this and the others down to `walls_j` are those of `RunTotals`, over the duration of
             the scenario, extensions left out.
+        exponent_per_s: the growth exponent of its twins over the duration of the scenario, 1/s, see
+            `measure_exponent`; None where no twins were asked for, or none moved.
     """
 
     verdict: CellClass
@@ -79,8 +82,11 @@ class CellResult(msgspec.Struct, frozen=True):
     force_peak_n: float | None = None
     walls_j: float | None = None
     reasons: str = ""
+    exponent_per_s: float | None = None
 
 
+TWINS_OF_A_CELL = 4
+"""All joints at once, and some of them alone; of the adaptive law the estimates too."""
 FLAT_LOG_CHANGE = 0.02
 """An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
 
@@ -130,6 +136,18 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     if outcome.verdict is CellClass.CONVERGED and _moves_on(run):
         return _doubt_unstable_rest(outcome, scenario, run)
     return outcome
+
+
+def measure_exponent(scenario: Scenario) -> float | None:
+    """Returns the growth exponent of a run, 1/s: the largest rate of its twins over the judged part.
+
+    A small push goes there as exp(exponent t); None if no push moved anything. See `analysis.twin_growth`.
+    """
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance(scenario.duration_s)
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    found = measure_virtual_twins(scenario, end, scenario.duration_s, TWINS_OF_A_CELL)
+    return max((one.rate_per_s for one in found.pushes if math.isfinite(one.rate_per_s)), default=None)
 
 
 def _moves_on(run: FusedRun) -> bool:

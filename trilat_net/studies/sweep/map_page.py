@@ -2,11 +2,13 @@
 
 Invariant: the page holds only results, lines and commands, and equal results give equal bytes. A cell of the
 figure is coloured by its classes alone: with several seeds by the stable share of the decided runs, hatched
-where half or more are undecided. Cells stay pixels in vector output, since viewers show seams between
-touching shapes; the classes differ in lightness for grey print and colour-blind readers.
+where half or more are undecided; or, judged by twins, by its growth exponent, white at zero. Cells stay
+pixels in vector output, since viewers show seams between touching shapes; the classes differ in lightness
+for grey print and colour-blind readers.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +39,7 @@ from .map_plane import (
     find_map_edges,
     label_axis,
 )
-from .stability_map import StabilityMap, TheoryLine
+from .stability_map import MapLine, StabilityMap
 
 CLASS_COLOURS = {
     CellClass.CONVERGED: "#d3e4f3",
@@ -51,8 +53,10 @@ _HATCHED: Any = {"facecolor": "none", "edgecolor": "#8a8a8a", "linewidth": 0.0, 
 _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
     {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
-    {"color": "#000000", "linestyle": (0, (1, 1.2)), "linewidth": 1.4},
+    {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},  # measured, below the others
 )
+_VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
+_EXPONENTS = LinearSegmentedColormap.from_list("exponents", ["#004488", "#ffffff", "#a23b53"], 257)
 _HALO_PT = 2.6
 _COUNT_PT = 5.0
 _LETTERS_PER_IN = 13
@@ -65,11 +69,12 @@ _BESIDE_IN = 1.75
 _STRIP_IN = 0.7
 
 
-def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], form: FigureSize) -> Figure:
+def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[MapLine]], form: FigureSize) -> Figure:
     """Returns the figure of a plane."""
     columns = _columns(len(plane.panels), form)
     rows = -(-len(plane.panels) // columns)
     each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
+    barred = plane.judged_by_twins or plane.seeds > 1
     with style.figure_style(form):
         figure = style.new_figure(0.95 + rows * each_in, form.width_in)
         grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
@@ -77,7 +82,7 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], f
             axes.set_axis_off()
         for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
             _draw_panel(axes, plane, panel, drawn)
-            letters = round((form.width_in - 0.6 * (plane.seeds > 1)) * _LETTERS_PER_IN / columns)
+            letters = round((form.width_in - 0.6 * barred) * _LETTERS_PER_IN / columns)
             broken = len(panel.title) > letters
             axes.set_title(panel.title.replace(", ", ",\n") if broken else panel.title)
         for n, axes in enumerate(grid[: len(plane.panels)]):
@@ -90,11 +95,11 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[TheoryLine]], f
         else:
             figure.supxlabel(plane.x.label, fontsize=8.0)
             figure.supylabel(plane.y.label, fontsize=8.0)
-        if plane.seeds > 1:
-            _draw_scale(figure, grid)
+        if barred:
+            _draw_scale(figure, grid, plane)
         _draw_legend(figure, plane, lines)
         figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
-        if plane.seeds > 1:  # only now it is known how much room there is
+        if plane.seeds > 1 and not plane.judged_by_twins:  # only now it is known how much room there is
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
     return figure
@@ -108,12 +113,19 @@ def _columns(panels: int, form: FigureSize) -> int:
     return panels if panels <= 3 else 4 if panels in (4, 7, 8) else 3
 
 
-def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> None:
+def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
     """Draws one panel: cells, hatches, lines."""
     x, y = _bounds(plane.x), _bounds(plane.y)
     axes.grid(visible=False)
     axes.set_facecolor("#f4f4f4")  # where nothing has run
-    if plane.seeds > 1:
+    if plane.judged_by_twins:
+        limit = _find_exponent_limit(plane)
+        shown = np.ma.masked_invalid(panel.exponents_per_s)
+        axes.pcolormesh(x, y, shown, cmap=_EXPONENTS, vmin=-limit, vmax=limit, rasterized=True)
+        for at, edge in find_map_edges(plane, panel) if plane.y.key else []:
+            ends = np.interp([edge.low, edge.high], plane.y.values, plane.y.places)
+            axes.vlines(np.interp(at, plane.x.values, plane.x.places), *ends, **_VERDICT_EDGE)
+    elif plane.seeds > 1:
         shown = np.ma.masked_invalid(panel.share)
         axes.pcolormesh(x, y, shown, cmap=_shares(), vmin=0.0, vmax=1.0, rasterized=True)
     else:
@@ -121,12 +133,12 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Th
         norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
         palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
         axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
-    _hatch(axes, x, y, _undecided(panel))
+    _hatch(axes, x, y, _undecided(plane, panel))
     for line in lines:
         _draw_line(axes, plane, line)
 
 
-def _draw_line(axes: Axes, plane: MapPlane, line: TheoryLine) -> None:
+def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
     """Draws where a line is zero, out to the borders of the outermost cells."""
     x, y = (np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y))
     spare = _extended(_extended(line.spare, y).T, x).T
@@ -150,8 +162,10 @@ def _extended(rows: Array, places: Array) -> Array:
     return extended
 
 
-def _undecided(panel: MapPanel) -> Any:
-    """Returns where half of the runs or more are undecided, shape (y, x)."""
+def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
+    """Returns where half of the runs or more are undecided, or have no exponent, shape (y, x)."""
+    if plane.judged_by_twins:
+        return (panel.runs > 0) & np.isnan(panel.exponents_per_s)
     return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
 
 
@@ -199,12 +213,25 @@ def _shares() -> LinearSegmentedColormap:
     return LinearSegmentedColormap.from_list("share", [CLASS_COLOURS[one] for one in classes])
 
 
-def _draw_scale(figure: Figure, grid: Sequence[Axes]) -> None:
-    """Draws what the colours of shares mean."""
-    colours = ScalarMappable(cmap=_shares())
-    colours.set_clim(0.0, 1.0)
-    bar = figure.colorbar(colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30)
-    bar.set_label("share of stable runs")
+def _find_exponent_limit(plane: MapPlane) -> float:
+    """Returns the exponent of the darkest colours, 1/s, a round number that four fifths are below."""
+    found = np.abs(np.concatenate([panel.exponents_per_s.ravel() for panel in plane.panels]))
+    least = max(float(np.nanquantile(found, 0.8)), 1e-6)
+    decade = 10.0 ** math.floor(math.log10(least))
+    return next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least * (1.0 - 1e-9))
+
+
+def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
+    """Draws what the colours of shares or of exponents mean; a pointed end has all beyond it."""
+    twins = plane.judged_by_twins
+    limit = _find_exponent_limit(plane) if twins else 1.0
+    colours = ScalarMappable(cmap=_EXPONENTS if twins else _shares())
+    colours.set_clim(-limit if twins else 0.0, limit)
+    ends = "both" if twins else "neither"
+    bar = figure.colorbar(colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=ends)
+    if twins:
+        bar.set_ticks([-limit, -0.5 * limit, 0.0, 0.5 * limit, limit])
+    bar.set_label("growth exponent of a push (1/s)" if twins else "share of stable runs")
     bar.outline.set_linewidth(0.6)
 
 
@@ -223,18 +250,22 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         axes.text(*where, text, ha="center", va="center", fontsize=_COUNT_PT, color="#000000")
 
 
-def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[TheoryLine]]) -> None:
+def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
     """Draws the legend above the panels: the classes that occur, then the lines."""
     counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
     handles: list[Any] = []
-    if plane.seeds == 1:
+    if plane.judged_by_twins:
+        if any(find_map_edges(plane, panel) for panel in plane.panels):
+            handles.append(Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE))
+    elif plane.seeds == 1:
         handles += [
             Patch(label=one.value, facecolor=CLASS_COLOURS[one], edgecolor="#6b6b6b", linewidth=0.5)
             for one, count in zip(CELL_CLASSES, counts, strict=True)
             if count and one is not CellClass.UNDECIDED
         ]
-    if any(_undecided(panel).any() for panel in plane.panels):
-        word = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
+    if any(_undecided(plane, panel).any() for panel in plane.panels):
+        many = "half or more undecided" if plane.seeds > 1 else CellClass.UNDECIDED.value
+        word = "no exponent" if plane.judged_by_twins else many
         handles.append(Patch(label=word, **{**_HATCHED, "linewidth": 0.5}))
     named = {line.label: line for some in lines for line in some}
     handles += [
@@ -288,22 +319,42 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
     return TextTable(("runs", *CELL_CLASSES), rows)
 
 
-def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[TheoryLine]) -> TextTable:
+def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
     """Returns the measured edges next to the lines, a row each; none if only one axis was swept.
 
+    Judged by twins an edge is where the exponent is zero, next to that of the verdicts.
     The difference is that of a line from the middle of the measured edge; "within" where the line lies in the
     measured edge, as well as its grid can tell.
     """
+    measured, theory = ([line for line in lines if (line.rank < 0) is own] for own in (True, False))
     heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
-    for line in lines:
+    heads += ["edge of the verdicts"] * plane.judged_by_twins
+    for line in theory:
         heads += [line.text, "difference"]
     rows = []
-    for x, edge in find_map_edges(plane, panel) if plane.y.key else []:
-        row = [f"{x:g}", f"{edge.low:g} to {edge.high:g}", "below" if edge.stable_below else "above"]
-        for line in lines:
+    verdicts = find_map_edges(plane, panel) if plane.y.key else []
+    zeros = [(x, edge) for line in measured for x, edge in _list_crossings(line, plane)]
+    for x, edge in zeros if plane.judged_by_twins else verdicts:
+        row = [f"{x:g}", _format_edge(edge), "below" if edge.stable_below else "above"]
+        if plane.judged_by_twins:
+            near = [one for at, one in verdicts if at == x]
+            near.sort(key=lambda one, zero=edge.low: abs(one.middle - zero))  # type: ignore[misc]
+            row.append(_format_edge(near[0]) if near else "-")
+        for line in theory:
             row += _compare_with_line(edge, line.crossings(plane.x.values.index(x), plane.y))
         rows.append(tuple(row))
     return TextTable(tuple(heads), rows)
+
+
+def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StableInterval]]:
+    for n, x in enumerate(plane.x.values):
+        for value in line.crossings(n, plane.y):
+            below = max(int(np.searchsorted(plane.y.values, value)) - 1, 0)
+            yield x, StableInterval(value, value, bool(line.spare[below, n] > 0.0))
+
+
+def _format_edge(edge: StableInterval) -> str:
+    return f"{edge.low:.4g}" if edge.low == edge.high else f"{edge.low:g} to {edge.high:g}"
 
 
 def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[str]:

@@ -130,11 +130,13 @@ class MapPanel(NamedTuple):
         title: where it lies along the axes that are not drawn; "" where there are none.
         settings: the same as overrides, key by key; "law" among them where laws were swept.
         counts: runs per place and class, shape (y, x, 4), in the order of `CELL_CLASSES`.
+        exponents_per_s: growth exponents, 1/s, means of the seeds, shape (y, x); NaN where there is none.
     """
 
     title: str
     settings: tuple[tuple[str, Any], ...]
     counts: RunCounts
+    exponents_per_s: Array
 
     @property
     def runs(self) -> RunCounts:
@@ -176,6 +178,11 @@ class MapPlane(NamedTuple):
     panels: tuple[MapPanel, ...]
 
     @property
+    def judged_by_twins(self) -> bool:
+        """True if there are growth exponents to be drawn."""
+        return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
+
+    @property
     def seeds(self) -> int:
         """The largest number of runs of a place."""
         return max(int(panel.runs.max()) for panel in self.panels)
@@ -208,7 +215,10 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
         found = f"at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}"
         raise UsageError(f"a map has {found}: sweep fewer values of what is not drawn")
     shape = len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)
-    panels = [MapPanel(_title(one, scenario), one, np.zeros(shape, dtype=np.int64)) for one in settings]
+    panels = [
+        MapPanel(_title(one, scenario), one, np.zeros(shape, dtype=np.int64), np.zeros(shape[:2]))
+        for one in settings
+    ]
     of = dict(zip(settings, panels, strict=True))
     place = [{value: n for n, value in enumerate(side.values)} for side in sides]
     verdicts = {verdict.value: n for n, verdict in enumerate(CELL_CLASSES)}
@@ -216,6 +226,11 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
         j, i = (place[n][row[side.key]] if side.key else 0 for n, side in enumerate(sides))
         panel = of[tuple((key, row[key]) for key in others)]
         panel.counts[i, j, verdicts[row["verdict"]]] += 1
+        exponent = row.get("exponent_per_s")
+        panel.exponents_per_s[i, j] += np.nan if exponent is None else exponent
+    for panel in panels:
+        panel.exponents_per_s[...] /= np.maximum(panel.runs, 1)
+        panel.exponents_per_s[panel.runs == 0] = np.nan
     return MapPlane(scenario.name, sides[0], sides[1], tuple(panels))
 
 

@@ -30,7 +30,7 @@ from ..commands import format_command, set_options
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .map_plane import MapPanel, MapPlane, PlaneAxis, build_plane
 from .sweep_cell import SweepSource
-from .sweep_plan import MAX_EXTENSION, MAX_SCENARIO_S, SweepPlan
+from .sweep_plan import SweepPlan
 from .sweep_results import SweepResults
 
 _GRAVITY = slice(3, 5)
@@ -186,15 +186,15 @@ LINEAR_ANALYSIS = "linear analysis"
 _ABOUT = "where the rightmost root of the loop, linearised, crosses the imaginary axis"
 
 
-class TheoryLine(NamedTuple):
+class MapLine(NamedTuple):
     """One line.
 
     Attributes:
         label: what the legend calls it; `text`: the same for plain text.
         about: where it is from.
-        spare: what is zero on it and positive where theory says stable, shape (y, x), and goes straight from
+        spare: what is zero on it and positive on its stable side, shape (y, x), and goes straight from
             one value of a column to the next; NaN where it is silent.
-        rank: how it is drawn: 0 is the first look, and so on.
+        rank: how it is drawn: 0 is the first look, and so on; -1 is that of what was measured.
     """
 
     label: str
@@ -220,7 +220,17 @@ class TheoryLine(NamedTuple):
         ]
 
 
-def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> TheoryLine | None:
+ZERO_EXPONENT = "exponent = 0"
+_TWINS = "where a small push of the run neither grows nor dies away, straight from cell to cell"
+
+
+def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
+    """Returns the line on which the growth exponents of a panel are zero; None if it has none."""
+    line = MapLine(ZERO_EXPONENT, ZERO_EXPONENT, _TWINS, -panel.exponents_per_s, -1)
+    return line if line.there else None
+
+
+def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
     """Returns the line of the condition in closed form; None where there is none, or not within the map."""
     found = [[evaluate_criterion(at(right, up)) for up in y.values] for right in x.values]
     first = next((one for column in found for one in column if one is not None), None)
@@ -234,7 +244,7 @@ def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> TheoryLine 
             edge = find_criterion_edge(partial(_criterion_at, at, right), *y.values[n : n + 2])
             edges |= {} if edge is None else {n: edge}
         columns.append(_straighten(y.values, excess, edges))
-    line = TheoryLine(first.symbol, first.text, first.source, np.array(columns).T, 0)
+    line = MapLine(first.symbol, first.text, first.source, np.array(columns).T, 0)
     return line if line.there else None
 
 
@@ -242,16 +252,14 @@ def _criterion_at(at: ScenarioAt, right: float, up: float) -> StabilityCriterion
     return evaluate_criterion(at(right, up))
 
 
-def trace_linear_analysis(
-    columns: Sequence[GrowthColumn], y: PlaneAxis
-) -> tuple[TheoryLine | None, list[str]]:
+def trace_linear_analysis(columns: Sequence[GrowthColumn], y: PlaneAxis) -> tuple[MapLine | None, list[str]]:
     """Returns the line of the linear analysis from its columns, and what is to be known of it."""
     spare = [
         _straighten(y.values, [np.nan if np.isinf(s) else -s for s in one.growth_per_s], one.edges)
         for one in columns
     ]
     remarks = list(dict.fromkeys(remark for one in columns for remark in one.remarks))
-    line = TheoryLine(LINEAR_ANALYSIS, LINEAR_ANALYSIS, _ABOUT, np.array(spare).T, 1)
+    line = MapLine(LINEAR_ANALYSIS, LINEAR_ANALYSIS, _ABOUT, np.array(spare).T, 1)
     return line if line.there else None, remarks
 
 
@@ -307,7 +315,7 @@ class StabilityMap(NamedTuple):
     """A map: its plane, per panel the lines of theory with remarks, and the commands that make it."""
 
     plane: MapPlane
-    lines: tuple[tuple[TheoryLine, ...], ...]
+    lines: tuple[tuple[MapLine, ...], ...]
     remarks: tuple[str, ...]
     commands: tuple[str, ...]
     title: str
@@ -347,7 +355,8 @@ def build_stability_map(
     if not drawn.y.key or len(drawn.y.values) < 2:
         return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
-    lines = [[trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
+    zeros = map(trace_zero_exponent, drawn.panels)
+    lines = [[next(zeros), trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
     remarks: dict[str, None] = {}
     if linearly:
         for some, columns in zip(lines, _columns(drawn, at, jobs, on, progress), strict=True):
@@ -392,7 +401,8 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     else:
         words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
     words += ["--law", ",".join(plan.laws)] if plan.laws else []
-    if plan.longest_s != min(MAX_SCENARIO_S, MAX_EXTENSION * plan.base.duration_s):
+    words += ["--judge", plan.judge] if plan.judge != "verdict" else []
+    if plan.longest_s != plan.default_longest_s:
         words += ["--longest", format_override_value(plan.longest_s)]
     return format_command("sweep", plan.written.source, *words, *more)
 

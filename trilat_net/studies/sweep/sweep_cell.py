@@ -100,6 +100,7 @@ class CellTask(NamedTuple):
     overrides: tuple[str, ...]
     seed: int
     longest_s: float
+    judge: str = "verdict"
 
     def __str__(self) -> str:
         return f"cell {self.number} ({', '.join(self.overrides)}), seed {self.seed}"
@@ -135,6 +136,8 @@ def run_cell(task: CellTask) -> CellRun:
     except ScenarioError as error:
         raise ScenarioError(f"cell {task.number} ({', '.join(task.overrides)}): {error}") from None
     outcome = cell_result.classify_cell(scenario.text, max(task.longest_s, scenario.duration_s))
+    if task.judge == "twins":
+        outcome = msgspec.structs.replace(outcome, exponent_per_s=cell_result.measure_exponent(scenario))
     return CellRun(
         task.number,
         task.seed,

@@ -16,7 +16,7 @@ from ...log.log_layout import collect_provenance
 from ..commands import format_command
 from ..run_journal import RunJournal
 from .sweep_cell import CellRun
-from .sweep_plan import SweepPlan, plan_from_json
+from .sweep_plan import JUDGES, SweepPlan, plan_from_json
 from .sweep_results import RESULTS_FILE
 
 JOURNAL_FILE = "cells.journal"
@@ -38,6 +38,7 @@ _DIFFERENCES = {
     "laws": "other laws",
     "seeds": "other seeds",
     "longest_s": "another longest time",
+    "judge": "another judge",
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
@@ -93,7 +94,7 @@ def open_sweep_folder(path: Path) -> SweepFolder:
 
 def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     for key, words in _DIFFERENCES.items():
-        if before.get(key) != now[key]:
+        if before.get(key) != now.get(key):
             there, here = (_shown(key, facts) for facts in (before, now))
             raise UsageError(
                 f"{path}: holds a sweep of {words}: there {there}, here {here}; results are not mixed: "
@@ -102,7 +103,7 @@ def _refuse_other(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
 
 
 def _shown(key: str, facts: Mapping[str, Any]) -> str:
-    value = facts.get(key)
+    value = facts.get(key, JUDGES[0])
     if key in ("text", "scenario_sha256"):
         digest = hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
         return f"{facts.get('name')} (sha256 {digest[:12]})"
@@ -124,7 +125,8 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    if not isinstance(facts, dict) or not {"source", "folder", "name", *_DIFFERENCES} <= facts.keys():
+    needed = {"source", "folder", "name", *_DIFFERENCES} - {"judge"}  # older plans name none
+    if not isinstance(facts, dict) or not needed <= facts.keys():
         raise UsageError(f"{file}: is no plan of a sweep")
     return facts
 

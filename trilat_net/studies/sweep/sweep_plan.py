@@ -182,6 +182,8 @@ MAX_EXTENSION = 8.0
 """Default limit of an undecided cell's duration, in durations of the scenario."""
 MAX_SCENARIO_S = 86_400.0
 """No scenario is longer, s."""
+JUDGES = ("verdict", "twins")
+"""What colours a map: the classes of the cells, or the growth exponents of their twins."""
 _CHECKED_VALUES = 32
 """Values of an axis that are tried before anything runs."""
 
@@ -197,6 +199,7 @@ class SweepPlan(NamedTuple):
         law_overrides: per law what puts it into force.
         seeds: of the runs of a cell in which anything is random; in others the first alone is run.
         longest_s: how long a cell may be extended, s.
+        judge: of `JUDGES`.
     """
 
     written: SweepSource
@@ -206,6 +209,12 @@ class SweepPlan(NamedTuple):
     law_overrides: tuple[tuple[str, ...], ...]
     seeds: tuple[int, ...]
     longest_s: float
+    judge: str = "verdict"
+
+    @property
+    def default_longest_s(self) -> float:
+        """How long a cell may be extended unless asked for, s: an exponent needs no extension."""
+        return min(MAX_SCENARIO_S, (1.0 if self.judge == "twins" else MAX_EXTENSION) * self.base.duration_s)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -244,7 +253,7 @@ class SweepPlan(NamedTuple):
 
     def task(self, number: int, seed: int) -> CellTask:
         """Returns one run of a cell, to be made."""
-        return CellTask(self.written, number, self.cell(number).overrides, seed, self.longest_s)
+        return CellTask(self.written, number, self.cell(number).overrides, seed, self.longest_s, self.judge)
 
     def facts(self) -> dict[str, Any]:
         """Returns all that names it, as plain values; `plan_from_json` reads them."""
@@ -259,6 +268,7 @@ class SweepPlan(NamedTuple):
             "name": self.base.name,
             "scenario_sha256": self.base.sha256,
             "text": self.written.text,
+            **({} if self.judge == "verdict" else {"judge": self.judge}),
         }
 
 
@@ -270,6 +280,7 @@ def plan_sweep(
     seeds: int | Sequence[int] = 1,
     laws: Sequence[str | type] = (),
     longest_s: float | None = None,
+    judge: str = "verdict",
 ) -> SweepPlan:
     """Returns a sweep, checked and ready to run.
 
@@ -281,7 +292,9 @@ def plan_sweep(
         laws: names of laws, or classes, swept besides the axes. One that all sites have stays with the gains
             of the scenario; another one replaces the law of every site, with its default gains. Overrides of
             gains count for either.
-        longest_s: how long an undecided cell may be extended, s; by default eight times its duration.
+        longest_s: how long an undecided cell may be extended, s; by default eight times its duration, and
+            not at all if twins judge.
+        judge: "twins" measures besides the growth exponent of every cell, and maps are drawn of that.
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
@@ -296,9 +309,10 @@ def plan_sweep(
     chosen: tuple[str, ...] = tuple(dict.fromkeys(map(name_law_classes, named)))
     _refuse_twice(axes, chosen)
     forced = tuple(_law_overrides(written, base, law) for law in chosen)
-    plan = SweepPlan(
-        written, base, axes, chosen, forced, _seeds(seeds, base.seed), _longest_s(longest_s, base)
-    )
+    if judge not in JUDGES:
+        raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
+    plan = SweepPlan(written, base, axes, chosen, forced, _seeds(seeds, base.seed), 0.0, judge)
+    plan = plan._replace(longest_s=_longest_s(longest_s, plan))
     for law in range(plan.shape[0]):
         _refuse_unfit(plan, law)
     return plan
@@ -313,8 +327,9 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     written = SweepSource(facts["source"], facts["text"], facts["folder"], tuple(facts["overrides"]))
     base = allow_own_laws(written.scenario())
     axes, laws = tuple(map(parse_axis, facts["over"])), tuple(facts["laws"])
+    judge = facts.get("judge", "verdict")
     forced = tuple(_law_overrides(written, base, law) for law in laws)
-    return SweepPlan(written, base, axes, laws, forced, tuple(facts["seeds"]), facts["longest_s"])
+    return SweepPlan(written, base, axes, laws, forced, tuple(facts["seeds"]), facts["longest_s"], judge)
 
 
 def _refuse_twice(axes: Sequence[SweepAxis], laws: Sequence[str]) -> None:
@@ -339,9 +354,10 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(asked)) or (own,)
 
 
-def _longest_s(asked: float | None, base: Scenario) -> float:
+def _longest_s(asked: float | None, plan: SweepPlan) -> float:
     if asked is None:
-        return min(MAX_SCENARIO_S, MAX_EXTENSION * base.duration_s)
+        return plan.default_longest_s
+    base = plan.base
     if not base.duration_s <= asked <= MAX_SCENARIO_S:
         raise UsageError(
             f"--longest is how long an undecided cell may run, from its {base.duration_s:g} s to "

@@ -205,7 +205,8 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
         lines.append(f"  over {one.asked}: {', '.join(shown)}")
     first_s, longest_s = plan.base.duration_s, plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
-    return [*lines, f"  {first_s:g} s each{extended}"]
+    twins = ", judged by twins" if plan.judge == "twins" else ""
+    return [*lines, f"  {first_s:g} s each{extended}{twins}"]
 
 
 def summarize_sweep(results: sweep_results.SweepResults) -> Iterator[str]:
@@ -221,6 +222,10 @@ def summarize_sweep(results: sweep_results.SweepResults) -> Iterator[str]:
         continued = f"and continued, the longest to {longest_s:g} s"
         yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
     yield from _describe_totals(rows)
+    found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
+    if found:
+        grow = f"{sum(one > 0.0 for one in found)} of {len(found)} grow"
+        yield f"growth exponents of small pushes {min(found):+.3g} to {max(found):+.3g} /s: {grow}"
     if len(results.plan.seeds) > 1:
         yield from _of_seeds(results)
 
