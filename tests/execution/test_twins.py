@@ -71,7 +71,7 @@ def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
     scenario = at_rest(0.5)
     free = aim_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
     often = free._replace(largest=2e-9)
-    twins = run_virtual_twins(scenario, [free, often], 40.0)
+    twins = run_virtual_twins(scenario, [free, often], 100.0)
     assert not twins.paths[0].scale.any()
     assert np.count_nonzero(np.diff(twins.paths[1].scale)) >= 3
     first, second = (path.largest[100:-2].max(axis=1) for path in twins.paths)

@@ -73,17 +73,11 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
     the wall in between, and its mean may be no contact.
     """
     deepest = find_deepest_contact(scenario, q)
-    return np.nan if deepest is None else find_growth_at(scenario, q[deepest], theta_hat[deepest])
-
-
-def find_growth_at(scenario: Scenario, q: Array, theta_hat: Array) -> float:
-    """Returns the real part of the sampled loop's rightmost root at the rest next to a state, 1/s.
-
-    NaN without such a rest. Angles have shape (N, n), rad, estimates (N, P).
-    """
+    if deepest is None:
+        return np.nan
     try:
         derive_operating_conditions(scenario, own_laws=False)  # the memory of such a law is not given
-        rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "", 0.0))
+        rest = follow_equilibrium(scenario, Equilibrium(q[deepest], theta_hat[deepest], "", 0.0))
         root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
     except ScenarioError:
         return np.nan

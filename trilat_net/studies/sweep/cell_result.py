@@ -12,11 +12,11 @@ from enum import StrEnum
 import msgspec
 import numpy as np
 
-from ...analysis.envelope_trend import FLOOR_RAD
+from ...analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend
 from ...analysis.json_values import finite_or_none
 from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...analysis.twin_growth import measure_virtual_twins
+from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
@@ -107,7 +107,7 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     A run that is not conclusive when its time is over (see `is_conclusive`) goes on for as long again, and
     so on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for
     a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance. A run that
-    looks stable and of which a joint moves on is undecided if the loop linearised there is unstable. If small
+    looks stable and of which a joint moves on is undecided unless the pushes of its twins die away. If small
     motions grow in contact with a sampled wall it is not extended: such chatter may die in minutes, when the
     estimates have drifted, and that makes no cell stable.
 
@@ -134,7 +134,9 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     if scenario.links_random and trend and not _pronounced(outcome):
         return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED)
     if outcome.verdict is CellClass.CONVERGED and _moves_on(run):
-        return _doubt_unstable_rest(outcome, scenario, run)
+        twins = _measure_twins(scenario, run)
+        if twins.trend not in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
+            return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED, reasons=twins.text)
     return outcome
 
 
@@ -145,9 +147,13 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance(scenario.duration_s)
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-    found = measure_virtual_twins(scenario, end, scenario.duration_s, TWINS_OF_A_CELL)
+    found = _measure_twins(scenario, run)
     return max((one.rate_per_s for one in found.pushes if math.isfinite(one.rate_per_s)), default=None)
+
+
+def _measure_twins(scenario: Scenario, run: FusedRun) -> TwinGrowth:
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    return measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
 
 
 def _moves_on(run: FusedRun) -> bool:
@@ -160,22 +166,6 @@ def _moves_on(run: FusedRun) -> bool:
         if (last > np.maximum(0.5 * first, FLOOR_RAD)).any():
             return True
     return False
-
-
-def _doubt_unstable_rest(outcome: CellResult, scenario: Scenario, run: FusedRun) -> CellResult:
-    """Returns a stable result as undecided if small motions grow where the run ended."""
-    # SciPy takes a worker half a second, which few cells need
-    from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
-    from ...theory.linear_edge import find_growth_at
-    from ...theory.operating_point import is_constant_link
-
-    if not all(map(is_constant_link, scenario.links.values())):
-        return outcome
-    growth_per_s = find_growth_at(scenario, run.q, run.theta_hat)
-    if not growth_per_s > STABILITY_EDGE_PER_S:
-        return outcome
-    reason = f"this rest: unstable, {growth_per_s:+.3g} /s"
-    return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED, reasons=reason)
 
 
 def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
