@@ -218,7 +218,7 @@ def check_linear(printed: str, names: dict[str, Any]) -> None:
     rows = re.findall(r"^\| roots \| (.+) \|$", page, re.MULTILINE)
     table = [cell for row in rows for cell in row.split(" | ")]
     assert [line.split()[3] for line in printed.splitlines()] == table
-    assert names["find_linear_edge"]
+    assert names["iterate_linear_edges"]
 
 
 def check_ports(_: str, names: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
 from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
 from trilat_net.studies.tuning.search_space import build_model_information, select_search_spaces
-from trilat_net.theory import analyse_linear_loop, find_equilibrium, find_linear_edge
+from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
@@ -94,7 +94,7 @@ def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
 def edge(name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None) -> float:
     scenario = load_scenario(name, changes)
     rest = None if pose is None else find_equilibrium(scenario, pose)
-    found = find_linear_edge(scenario, key, low, high, rest)
+    found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
     assert found is not None
     return found.value
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory import analyse_linear_loop, find_linear_edge
+from trilat_net.theory import analyse_linear_loop, iterate_linear_edges
 from trilat_net.theory.linear_edge import (
     ASSUMED_EQUILIBRIUM_REMARK,
     compute_growth_column,
@@ -37,7 +37,7 @@ def test_an_edge_is_where_the_sign_changes() -> None:
     (below, above), edges, _ = compute_growth_column([*map(damped, places)], "control.d", places)
     assert below > 0.0 > above
     assert edges == {0: pytest.approx(found, rel=1e-6)}
-    alone = find_linear_edge(damped(3.0), "control.d", 0.3, 3.0)
+    alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
     assert alone is not None
     assert found == pytest.approx(alone.value, rel=1e-6)
 

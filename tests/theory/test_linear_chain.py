@@ -29,7 +29,7 @@ from trilat_net.reporting.port_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 from trilat_net.studies.sweep.stability_map import evaluate_criterion
-from trilat_net.theory import LinearLoop, find_equilibrium, find_linear_edge
+from trilat_net.theory import LinearLoop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import predict_equilibrium
@@ -272,7 +272,9 @@ def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     assert found is not None
     assert found.excess == pytest.approx(0.1)
     assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
-    edge = find_linear_edge(damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4)
+    edge = next(
+        iterate_linear_edges(damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4), None
+    )
     assert edge is not None
     assert 0.8 < edge.value < 1.0
     assert evaluate_criterion(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario) is None

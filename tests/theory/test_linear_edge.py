@@ -12,7 +12,7 @@ from tests.theory.loops import Array
 from trilat_net.core.two_link_arm import inertia
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory import find_equilibrium, find_linear_edge, iterate_linear_edges
+from trilat_net.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.theory.equilibrium import predict_equilibrium
 from trilat_net.theory.linear_edge import LinearEdge
 
@@ -43,7 +43,7 @@ def test_p_d_turns_stable_where_its_mode_stands(name: str, share: float, delay_m
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
     line = share * 10.0 * T
-    found = find_linear_edge(scenario, "control.d", 0.3 * line, 1.5 * line, points=8)
+    found = next(iterate_linear_edges(scenario, "control.d", 0.3 * line, 1.5 * line, points=8), None)
     assert found is not None
     assert found.stable_above
     assert found.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
@@ -80,7 +80,7 @@ def test_two_sites_turn_stable_at_4_d_d_for_the_arms_that_need_most(seed: int) -
         return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
 
     scenario, (*_, d2) = heavy_pair(seed, worst)
-    found = find_linear_edge(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3)
+    found = next(iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None)
     assert found is not None
     assert found.value == pytest.approx(d2, rel=1e-3)
 
@@ -90,7 +90,9 @@ def test_two_like_arms_turn_stable_where_d1_over_k2_and_d2_over_k1_make_the_roun
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_: 1.0)
     exact = K1 * (T - d1 / K2)
-    found = find_linear_edge(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3)
+    found = next(
+        iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3), None
+    )
     assert found is not None
     assert found.value == pytest.approx(exact, rel=1e-3)
     assert found.value <= d2 * 1.001
@@ -101,17 +103,19 @@ def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_non
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
     rest = find_equilibrium(scenario, (-0.1729, 0.0874))
-    found = find_linear_edge(scenario, "rate_hz", 60, 400, rest, points=6)
+    found = next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6), None)
     assert found is not None
     assert 100 < found.value < 125
     assert found.stable_above
-    assert find_linear_edge(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False) is None
+    assert (
+        next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False), None) is None
+    )
 
 
 @pytest.mark.long
 def test_nothing_is_found_where_nothing_changes_and_all_is_found_where_much_does() -> None:
     scenario = load_scenario("p_d_margin")
-    assert find_linear_edge(scenario, "control.d", 1.2, 3.0, points=4) is None
+    assert next(iterate_linear_edges(scenario, "control.d", 1.2, 3.0, points=4), None) is None
     found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
     assert [one.stable_above for one in found] == [False, True, False, True][: len(found)]
     assert all(isinstance(one, LinearEdge) for one in found)
@@ -121,9 +125,9 @@ def test_nothing_is_found_where_nothing_changes_and_all_is_found_where_much_does
 @pytest.mark.parametrize(("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))])
 def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
     with pytest.raises(UsageError, match=r"control\.d is scanned from a value to a larger one"):
-        find_linear_edge(load_scenario("p_d_margin"), "control.d", low, high)
+        next(iterate_linear_edges(load_scenario("p_d_margin"), "control.d", low, high), None)
 
 
 def test_a_key_that_is_none_is_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'Kd'"):
-        find_linear_edge(load_scenario("p_d_margin"), "control.Kdd", 1, 2)
+        next(iterate_linear_edges(load_scenario("p_d_margin"), "control.Kdd", 1, 2), None)

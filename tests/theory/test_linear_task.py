@@ -12,7 +12,7 @@ from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.reporting.port_text import describe_ports
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium, find_linear_edge
+from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import find_mean_pose
@@ -219,7 +219,7 @@ def test_edges_margins_and_verdict_are_those_of_one_loop() -> None:
     there = compute_delay_spectrum(set_common_delay(found.loop, end.delay_s), 1).rightmost
     assert there is not None
     assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
-    edge = find_linear_edge(scenario, "control.d", 2.0, 20.0, found.rest, points=5)
+    edge = next(iterate_linear_edges(scenario, "control.d", 2.0, 20.0, found.rest, points=5), None)
     assert edge is not None
     for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
         beside = load_scenario(scenario, {"control.d": d})

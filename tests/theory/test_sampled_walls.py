@@ -11,7 +11,7 @@ from tests.core.chain_references import Array, ChainState, chain_references
 from trilat_net.analysis.run_end import Stability
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
-from trilat_net.theory import find_linear_edge
+from trilat_net.theory import iterate_linear_edges
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.linear_edge import LinearEdge, find_contact_growth
 
@@ -31,7 +31,7 @@ def windup(K: float, B: float = 0.0, b: float = 0.0) -> Scenario:
 def edge(B: float = 0.0, b: float = 0.0) -> LinearEdge | None:
     scenario = windup(5000.0, B, b)
     rest = find_equilibrium(scenario)
-    return find_linear_edge(scenario, STIFFNESS, 1e3, 2e5, rest, points=12)
+    return next(iterate_linear_edges(scenario, STIFFNESS, 1e3, 2e5, rest, points=12), None)
 
 
 @pytest.mark.long

@@ -111,26 +111,17 @@ def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> li
 
     The random ones are by less and by more than `delta`: growth that is not of small motions alone differs.
     """
-    layouts = [scenario.layout(name) for name in scenario.names]
-    joints, most = list_joints(scenario), max(layout.joints for layout in layouts)
-    owners = [(i, joint) for i, layout in enumerate(layouts) for joint in range(layout.joints)]
-    chance = np.random.Generator(np.random.Philox(0))
-    pushes = []
-    if count > 2 and any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names):
-        shape = len(layouts), max(layout.parameters for layout in layouts)
-        pushes.append(
-            Push(f"{delta:g} of the estimates", "theta_hat", delta * chance.uniform(-1.0, 1.0, shape))
-        )
-    for factor in (1.0, 1e-3, 1e3)[: max(1, min(3, count - len(owners) - len(pushes)))]:
-        by = np.zeros((len(layouts), most))
-        for i, joint in owners:
-            by[i, joint] = factor * delta * chance.uniform(-1.0, 1.0)
-        pushes.append(Push(f"{factor * delta:g} rad at all joints", "q", by))
-    for n, (i, joint) in enumerate(owners[: max(0, count - len(pushes))]):
-        by = np.zeros((len(layouts), most))
-        by[i, joint] = delta
-        pushes.append(Push(f"{delta:g} rad at {joints[n]}", "q", by))
-    return pushes[:count]
+    each = [
+        (f"{name}.q{joint + 1}", delta)
+        for name in scenario.names
+        for joint in range(scenario.layout(name).joints)
+    ]
+    learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
+    chosen = [("theta", delta)] * (learns and count > 2)
+    random = max(1, min(3, count - len(each) - len(chosen)))
+    chosen += [("q", factor * delta) for factor in (1.0, 1e-3, 1e3)[:random]]
+    pushes = [aim_push(scenario, *one) for one in (chosen + each)[:count]]
+    return [one._replace(again=True, largest=LARGEST) for one in pushes]
 
 
 LEAST_PUSH, MOST_PUSH = 1e-11, 1.0

@@ -17,7 +17,6 @@ from .linear_edge import (
     GrowthColumn,
     LinearEdge,
     compute_growth_column,
-    find_linear_edge,
     find_root_crossings,
     iterate_linear_edges,
 )
@@ -34,7 +33,6 @@ __all__ = [
     "analyse_linear_loop",
     "compute_growth_column",
     "find_equilibrium",
-    "find_linear_edge",
     "find_root_crossings",
     "iterate_linear_edges",
     "linearise_scenario",

@@ -100,20 +100,6 @@ class LinearEdge(NamedTuple):
     stable_above: bool
 
 
-def find_linear_edge(
-    scenario: Scenario,
-    key: str,
-    low: float,
-    high: float,
-    rest: Equilibrium | None = None,
-    *,
-    points: int = EDGE_SCAN_POINTS,
-    sampled: bool | None = None,
-) -> LinearEdge | None:
-    """Returns the lowest edge, or None; see `iterate_linear_edges`."""
-    return next(iterate_linear_edges(scenario, key, low, high, rest, points=points, sampled=sampled), None)
-
-
 class EdgeScan(NamedTuple):
     """The edges along a key from `low` to `high`, by rising value."""
 

@@ -26,7 +26,7 @@ from trilat_net.studies.sweep.stability_map import (
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.theory import GrowthColumn, compute_growth_column, find_linear_edge
+from trilat_net.theory import GrowthColumn, compute_growth_column, iterate_linear_edges
 
 from .maps import KEYS, rows
 
@@ -81,7 +81,7 @@ def test_a_coarse_map_has_the_line_of_the_linear_analysis_to_its_digits() -> Non
     line, _ = trace_linear_analysis(
         [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
     )
-    edge = find_linear_edge(scenarios[0], "control.d", 0.2, 1.2)
+    edge = next(iterate_linear_edges(scenarios[0], "control.d", 0.2, 1.2), None)
     assert line is not None
     assert edge is not None
     assert (
