@@ -269,13 +269,13 @@ def linear(
         ScenarioError: the scenario is not valid, or has no linear loop.
         UsageError: another argument is not valid.
     """
-    from .theory.linear_analysis import analyse_linearly
+    from .theory.linear_analysis import analyse_linear_loop
 
     try:
         fixed = None if pose is None else tuple(map(float, pose))
     except (TypeError, ValueError):
         raise UsageError(f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}") from None
-    return analyse_linearly(load_scenario(scenario, set), pose=fixed, roots=roots, over=over, ports=ports)
+    return analyse_linear_loop(load_scenario(scenario, set), pose=fixed, roots=roots, over=over, ports=ports)
 
 
 def sweep(

@@ -49,10 +49,10 @@ def linear_command(
     """
     if picture is not None:
         options.check_picture(picture, force=force)
-    from ..theory.linear_analysis import analyse_linearly
+    from ..theory.linear_analysis import analyse_linear_loop
 
     wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
-    found = analyse_linearly(
+    found = analyse_linear_loop(
         scenario, overrides or [], pose=_pose(pose), roots=roots, over=over or [], ports=wanted
     )
     if picture is not None:

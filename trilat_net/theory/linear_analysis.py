@@ -45,7 +45,7 @@ class LinearAnalysis(Result):
         continuous: roots of the delay-differential equation.
         sampled: roots of the sampled loop; None if the sites have several rates.
         margin: the common delays for which the continuous loop is stable.
-        scans: where stability changes along keys, of `analyse_linearly`.
+        scans: where stability changes along keys, of `analyse_linear_loop`.
         ports: the haptic ports of the operators, likewise; None if nobody asked.
     """
 
@@ -132,16 +132,24 @@ def analyse_linear_loop(
     *,
     pose: tuple[float, ...] | None = None,
     roots: int = DEFAULT_ROOTS,
+    over: Sequence[str] = (),
+    ports: bool = False,
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario, by name, by path, or itself, changed by texts KEY=VALUE.
+    """Returns the linear analysis of a scenario.
 
-    Its equilibrium is the end of a run, or all sites at `pose`, rad, with true estimates; its roots are the
-    rightmost ones.
+    Args:
+        source: the name of a shipped scenario, a path, or a scenario.
+        overrides: what is to be changed of it.
+        pose: the joint angles of all sites, rad, with true estimates; None for those at which a run ends.
+        roots: how many roots, the rightmost ones.
+        over: keys along which stability may change, and their ranges, as in "control.d=0.1:3".
+        ports: whether to analyse the ports of the operators.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
         UsageError: another argument is not valid.
     """
+    ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
         raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
     scenario = load_scenario(source, overrides)
@@ -151,39 +159,12 @@ def analyse_linear_loop(
     continuous = compute_delay_spectrum(loop, roots)
     near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
     sampled = compute_sampled_spectrum(conditions, rest, near, roots)
-    return LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
-
-
-def analyse_linearly(
-    source: str | Path | Scenario,
-    overrides: Mapping[str, Any] | Sequence[str] = (),
-    *,
-    pose: tuple[float, ...] | None = None,
-    roots: int = DEFAULT_ROOTS,
-    over: Sequence[str] = (),
-    ports: bool = True,
-) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario with its ports, and where stability changes along keys.
-
-    Args:
-        source: the name of a shipped scenario, a path, or a scenario.
-        overrides: what is to be changed of it.
-        pose: the joint angles of all sites, rad; None for those at which a run ends.
-        roots: how many roots.
-        over: keys and ranges, as in "control.d=0.1:3".
-        ports: whether to analyse the ports of the operators.
-
-    Raises:
-        ScenarioError: the scenario is not valid, or has no linear loop.
-        UsageError: another argument is not valid.
-    """
-    ranges = [parse_edge_range(text) for text in over]
-    found = analyse_linear_loop(source, overrides, pose=pose, roots=roots)
+    found = LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
     scans = tuple(
-        EdgeScan(key, low, high, tuple(iterate_linear_edges(found.scenario, key, low, high, found.rest)))
+        EdgeScan(key, low, high, tuple(iterate_linear_edges(scenario, key, low, high, rest)))
         for key, low, high in ranges
     )
-    return replace(found, scans=scans, ports=analyse_ports(found.scenario, found.rest) if ports else None)
+    return replace(found, scans=scans, ports=analyse_ports(scenario, rest) if ports else None)
 
 
 def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
