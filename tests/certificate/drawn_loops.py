@@ -340,7 +340,7 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
     if law in ("adaptive", "p_d", "pd_d") and rng.random() < 0.25:
         made["task"], space = {"space": "position", "axes": ["x", "y"]}, "position"
         starts = np.array([0.2, 1.4])
-    elif touch == "nobody" and rng.random() < 0.15:
+    elif touch == "nobody" and rng.random() < 0.15 and law != "adaptive_kinematics":
         made["arm"] = {"urdf": "arm6.urdf", "tip": "forearm", "armature_kg_m2": 0.3}
         starts, space = np.array([0.2, -1.0, 1.2]), "chain"
         for name in names:

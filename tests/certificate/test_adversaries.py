@@ -111,7 +111,7 @@ def test_the_truth_of_rows_that_grow(row: Row) -> None:
 
 
 BLOCK = 400
-OPEN_SHARE = 0.1
+OPEN_SHARE = 0.08
 """Of whatever was drawn, most that may stay open."""
 
 
