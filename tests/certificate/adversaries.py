@@ -689,13 +689,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="What is said of random experiments whose truth is known.")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--find-truths", action="store_true", help="write truths.csv anew")
+    parser.add_argument("--find-truths", action="store_true", help="write those of truths.csv anew")
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.seeds)
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         if asked.find_truths:
-            lines = TRUTHS.read_text().splitlines()[: 1 + asked.first]
-            TRUTHS.write_text("\n".join([*lines, *pool.map(write_truth, seeds, chunksize=8), ""]))
+            lines = TRUTHS.read_text().splitlines()
+            lines[1 + seeds.start : 1 + seeds.stop] = pool.map(write_truth, seeds, chunksize=8)
+            TRUTHS.write_text("\n".join([*lines, ""]))
             return
         judged = list(pool.map(judge_experiment, seeds, chunksize=8))
     print("| experiments | runs | unstable | near an edge | false ok | false alarms | open |")
