@@ -12,7 +12,6 @@ The first prints the table of docs/certificate.md, the second finds the truths a
 """
 
 import argparse
-import json
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
@@ -33,7 +32,7 @@ from trilat_net.analysis.certificate.stability_certificate import (
 )
 from trilat_net.analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
 from trilat_net.analysis.twin_growth import measure_virtual_twins
-from trilat_net.core.ticks import BUCKETS_PER_S
+from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
 from trilat_net.errors import ScenarioError
@@ -42,58 +41,44 @@ from trilat_net.log.accounting import Coverage
 from trilat_net.log.digest_chain import ChainState, Integrity
 from trilat_net.log.integrity import MIN_COVERAGE
 from trilat_net.log.log_reader import Log
-from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import classify_cell
 from trilat_net.theory.end_pose import find_end_pose_roots
 from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
 from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions, is_constant_link
 
+from .drawn_loops import (
+    SAMPLED,
+    STIFFNESS,
+    Drawn,
+    draw_experiment,
+    experiment,
+    p_d,
+    swinging,
+)
+
 LONGER = 8.0
 """The run that knows the truth is so many times as long."""
-DRAWN_S = 40.0
-"""The length of a drawn run."""
 SEEN = 1e-6
 """A growing mode counts from this size on, rad/s, in the records."""
 SLOW_PER_S = 0.01
 """A stable root this slow hardly dies within eight times the run: then the root decides."""
 NEAR_AN_EDGE = (0.8, 1.2)
+DEAD_RAD_S = 1e-11
+"""Slower is at rest."""
+NUDGE_RAD, LINEAR_RAD_S, LOST_RAD_S = 1e-8, 1e-5, 1e-13
+"""A push; a difference that is made small again; one that is lost in the rounding of the numbers."""
+WINDOW_S = 4.0
+"""In windows of this length the difference is looked at."""
+LEAST_WINDOWS = 12
+"""Of fewer windows no rate is told."""
+GROWS_PER_S = 0.004
+"""A push grows from this rate on."""
 TRUTHS = Path(__file__).with_name("truths.csv")
 """Per seed: the digest of its scenario, and its truth."""
 SEEDS = 2000
-"""Seeds whose truth is stored."""
-RODS = {"lc1_m": 0.5, "lc2_m": 0.5, "I1_kg_m2": 1 / 12, "I2_kg_m2": 1 / 12}
-CIRCLE = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}, "s": {"m1": 0.5, "m2": 0.5}}
-STIFFNESS = "sites.s.environment.0.stiffness_n_m"
-SAMPLED = "sites.s.environment.0.sampled"
-
-
-def _toml(value: Any) -> str:
-    """A value in TOML; nine digits, since further ones of a sine or an eigenvalue depend on the machine."""
-    if isinstance(value, float):
-        return json.dumps(float(f"{value:.9g}"))
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)
-
-
-def experiment(name: str, **tables: Any) -> Scenario:
-    """The scenario of some tables."""
-    given = {"name": name, "rate_hz": 100, "duration_s": 30.0, "scheme": "second_order", **tables}
-    return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in given.items()))
-
-
-def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[str, Any]:
-    """A hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
-    times, sizes = np.array(list(peaks)).T
-    t_s = np.arange(times[0], times[-1] + 1e-9, 0.02)
-    torque = np.interp(t_s, times, sizes) * np.sin(2 * np.pi * hertz * t_s)
-    return {
-        "kind": "recorded",
-        "points": [[float(t), float(x), float(x)] for t, x in zip(t_s, torque, strict=True)],
-    }
+"""Seeds below `WIDE_FROM` whose truth is stored."""
 
 
 def two_pairs(laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 0.0, **more: Any) -> Scenario:
@@ -110,11 +95,6 @@ def two_pairs(laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 
     dominance = {i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()}
     given = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
     return experiment("pairs", **{**given, **more})
-
-
-def p_d(d: Any, **more: Any) -> dict[str, Any]:
-    """P+d with 10 N m/rad."""
-    return {"law": "p_d", "K": 10.0, "d": d, **more}
 
 
 class Row(NamedTuple):
@@ -202,7 +182,151 @@ def _touched(across: float) -> Callable[[], Scenario]:
     return lambda: load_scenario(two_pairs(LEARNT, APART, across), {"sites.a.hands": [hand]})
 
 
+def _swinging(
+    name: str, d: float, period_s: float, swing_ms: float = 195.0, **more: Any
+) -> Callable[[], Scenario]:
+    """P+d whose delay of 200 ms swings, from starts that are 1e-9 rad apart."""
+    names = ("m1", "m2", "s") if name == "p_d_margin" else ("m", "s")
+    starts = {
+        f"sites.{one}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)] for n, one in enumerate(names)
+    }
+    link = {
+        "link.model": "sine",
+        "link.delay_ms": 200.0,
+        "link.amplitude_ms": swing_ms,
+        "link.period_s": period_s,
+    }
+    return _load(name, {**starts, **link, "control.d": d, "rate_hz": 200, "duration_s": 20.0}, **more)
+
+
+def _turntables(d: float, period_s: float, c: tuple[float, float] = (0.88, 0.12)) -> Callable[[], Scenario]:
+    """Three arms of one joint about an upright axis, 0.3 rad apart; `c` has the shares of the last."""
+    rows = {"a": {"b": 0.12, "c": 0.88}, "b": {"a": 0.53, "c": 0.47}, "c": {"a": c[0], "b": c[1]}}
+    sites = {name: {"role": "slave" if n else "master", "q0_rad": [0.3 * n]} for n, name in enumerate(rows)}
+    link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
+    arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
+    law, given = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
+    return lambda: experiment(
+        "turntables", arm=arm, control=law, link=link, sites=sites, dominance=rows, **given
+    )
+
+
+def pair(first: Any, second: Any, **more: Any) -> Scenario:
+    """Two sites that follow each other."""
+    sites = {"a": {"role": "master", "q0_rad": [0.3, 0.4], **first}}
+    sites["b"] = {"role": "slave", "q0_rad": [0.3, 0.4], **second}
+    given = {"scheme": "digital", "sites": sites, "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}}}
+    return experiment("pair", **{**given, **more})
+
+
+def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[], Scenario]:
+    """P+d without delay between sites that tick at two rates."""
+    first, second = ({"rate_hz": rate_hz} for rate_hz in rates_hz)
+    law = {"law": "p_d", "K": K, "d": d}
+    return lambda: pair(first, second | {"q0_rad": [0.5, 0.4]}, control=law, link={"delay_ms": 0.0})
+
+
+def _reserve(
+    reserve_J: float, K: float, B: float, damped: float = 0.0, apart_rad: float = 1e-10
+) -> Callable[[], Scenario]:
+    """Passivity control with a reserve, from starts next to each other; at arms that something resists."""
+    law = {"law": "tdpa", "K": K, "B": B, "reserve_J": reserve_J}
+    around = {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    made = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
+    return lambda: load_scenario(pair(around, around, **made), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]})
+
+
+def _held_apart(stiffness_nm_rad: float, by_rad: float) -> Callable[[], Scenario]:
+    """Two pairs that hardly hear of each other; a hand holds one arm of each where it stands."""
+
+    def make() -> Scenario:
+        starts = tuple(q if q > 0.0 else q - by_rad for q in APART)
+        hands = {
+            f"sites.{name}.hands": [
+                {
+                    "kind": "spring",
+                    "to_rad": [q, q],
+                    "stiffness_nm_rad": stiffness_nm_rad,
+                    "damping_nm_s_rad": 4.0,
+                }
+            ]
+            for name, q in zip("ac", starts[::2], strict=True)
+        }
+        return load_scenario(two_pairs(LEARNT, starts, 1e-6), hands)
+
+    return make
+
+
+def _wave(b: float, K: float, damped: float = 0.0) -> Callable[[], Scenario]:
+    """Wave variables between arms that start at rest, next to each other; at arms that something resists."""
+    law = {"law": "wave", "b": b, "K": K, "B": 0.1 * K}
+    around = {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    made = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
+    return lambda: pair(around, around, **made)
+
+
+def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scenario]:
+    """A user lets go of an arm that no spring holds, and the slave follows it."""
+    led = {"K": 40.0, "B": 5.0}
+    push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [0.4, 0.2]}
+    made = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
+    led = led if law in ("wave", "tdpa") else {**follows}
+    return lambda: pair(
+        {"control": {"law": law, **follows}, "hands": [push]}, {"control": {"law": law, **led}}, **made
+    )
+
+
+def _free_swinging(
+    period_s: float, swing_ms: float = 200.0, duration_s: float = 60.0
+) -> Callable[[], Scenario]:
+    """The paper's law over a delay of 200 ms that swings."""
+    link = {
+        "link.model": "sine",
+        "link.delay_ms": 200.0,
+        "link.amplitude_ms": swing_ms,
+        "link.period_s": period_s,
+    }
+    return _free(link, duration_s=duration_s)
+
+
 ROWS = (
+    Row("C1", "three sites, swinging at 1.4 s", _swinging("p_d_margin", 1.1, 1.4), NEVER_STABLE),
+    Row("C1", "the same, d 1.05", _swinging("p_d_margin", 1.05, 1.4), NEVER_STABLE),
+    Row("C1", "two sites, swinging at 1.25 s", _swinging("p_d_margin_two", 2.1, 1.25), NEVER_STABLE, "twins"),
+    Row("C1", "the same, d 2", _swinging("p_d_margin_two", 2.0, 1.25), NEVER_STABLE, "twins"),
+    Row("C1", "and by 199 ms", _swinging("p_d_margin_two", 2.1, 1.25, 199.0), NEVER_STABLE, "twins"),
+    Row("C1=", "three sites, d 2", _swinging("p_d_margin", 2.0, 1.4), STABLE),
+    Row("C1=", "a quarter of the swing, d 1.4", _swinging("p_d_margin", 1.4, 1.4, 50.0), STABLE),
+    Row("C1=", "two sites, d 4", _swinging("p_d_margin_two", 4.0, 1.25), STABLE),
+    Row("C2", "one joint, swinging at 2.5 s", _turntables(0.902, 2.5), NEVER_STABLE),
+    Row("C2", "at 2.6 s", _turntables(0.902, 2.6), NEVER_STABLE),
+    Row("C2", "at 1.75 s, other shares", _turntables(0.902, 1.75, (0.12, 0.88)), NEVER_STABLE),
+    Row("C2=", "one joint, d 2.5", _turntables(2.5, 2.5), STABLE),
+    Row("C3", "40 and 30 Hz, K 50", _unlike_rates((40, 30), 50.0, 2.0), NEVER_STABLE, "twins"),
+    Row("C3", "50 and 30 Hz, K 60", _unlike_rates((50, 30), 60.0, 2.0), NEVER_STABLE, "twins"),
+    Row("C3", "40 and 25 Hz", _unlike_rates((40, 25), 50.0, 2.0), NEVER_STABLE, "twins"),
+    Row("C3=", "40 and 30 Hz, d 5", _unlike_rates((40, 30), 50.0, 5.0), STABLE),
+    Row("C3=", "50 and 30 Hz, K 20", _unlike_rates((50, 30), 20.0, 4.0), STABLE),
+    Row("C4", "a reserve of 100 J", _reserve(100.0, 100.0, 5.0), NEVER_STABLE),
+    Row("C4", "of 1000 J, stiffer", _reserve(1000.0, 200.0, 5.0), NEVER_STABLE),
+    Row("C4", "of 1 J, softer", _reserve(1.0, 50.0, 2.0), NEVER_STABLE, "twins"),
+    Row("C4=", "arms that something resists", _reserve(100.0, 40.0, 10.0, 15.0), STABLE),
+    Row("C4=", "a reserve of 1 J, the same", _reserve(1.0, 20.0, 5.0, 8.0), STABLE),
+    Row("C6", "wave without motion, b too large", _wave(120.0, 0.0), NEVER_STABLE, "twins"),
+    Row("C6", "b 200", _wave(200.0, 0.0), NEVER_STABLE, "twins"),
+    Row("C6=", "without motion, arms that something resists", _wave(5.0, 20.0, 4.0), STABLE),
+    Row("C6=", "the same, b 60", _wave(60.0, 20.0, 2.0), STABLE),
+    Row("C7", "the paper's law, swinging at 0.5831 s", _free_swinging(0.5831), NEVER_STABLE, "twins"),
+    Row("C7", "for 150 s", _free_swinging(0.5831, duration_s=150.0), NEVER_STABLE, "twins"),
+    Row("C7", "at 0.55 s", _free_swinging(0.55), NEVER_STABLE, "nobody pushed"),
+    Row("C7=", "at 1.3 s", _free_swinging(1.3), STABLE),
+    Row("C7=", "by 20 ms", _free_swinging(0.5831, 20.0), STABLE),
+    Row("S1", "a wave line that nobody holds", _coasting({"b": 5.0}, "wave"), ("open",), "coasting"),
+    Row("S1", "all follow, and nobody holds", _coasting({"K": 40.0, "B": 5.0}), ("open",), "coasting"),
+    Row("S1=", "both follow, and are damped", _coasting({"K": 40.0, "d": 6.0}, "pd_d"), STABLE),
+    Row("S4", "a hand at one arm only", _touched(1e-6), NEVER_STABLE, "apart"),
+    Row("S4=", "two hands hold 0.4 rad apart", _held_apart(30.0, 0.0), STABLE),
+    Row("S4=", "weaker ones, 0.5 rad apart", _held_apart(12.0, 0.1), STABLE),
     Row(
         "F1", "the wide group decays, the small one grows", _pairs(p_d(2.4), p_d(1.7)), NEVER_STABLE, "joint"
     ),
@@ -274,156 +398,6 @@ def under_noise(scenario: Scenario) -> Scenario:
     return load_scenario(scenario, links | delays)
 
 
-class Drawn(NamedTuple):
-    """An experiment that was drawn: its kind, its scenario, and the key that may be near an edge."""
-
-    kind: str
-    scenario: Scenario
-    key: str = ""
-
-
-def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str, Any]:
-    """Arms of several masses, about one pose."""
-    pose = rng.uniform(-0.8, 0.8, 2)
-    return {
-        name: {
-            "role": "slave" if n else "master",
-            "q0_rad": (pose + spread_rad * rng.uniform(-1, 1, 2)).tolist(),
-            "arm": {
-                **({"l1_m": 1.0, "l2_m": 1.0, **RODS} if rng.random() < 0.5 else {}),
-                "m1_kg": float(np.exp(rng.uniform(-0.7, 0.7))),
-                "m2_kg": float(np.exp(rng.uniform(-0.7, 0.7))),
-            },
-        }
-        for n, name in enumerate(names)
-    }
-
-
-def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]:
-    """Shares of every site, of all of its peers or of one."""
-    rows = {}
-    for name in names:
-        peers = [peer for peer in names if peer != name]
-        if len(peers) > 1 and rng.random() < 0.2:
-            peers = [str(rng.choice(peers))]
-        cut = rng.dirichlet(np.ones(len(peers))).round(3)
-        cut[-1] = 1.0 - cut[:-1].sum()
-        rows[name] = dict(zip(peers, cut.tolist(), strict=True))
-    return rows
-
-
-def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
-    """A network of P+d or PD+d whose damping is about the edge of stability."""
-    shares, T_ms, K = _shares(rng, names), float(rng.uniform(80.0, 400.0)), float(rng.uniform(8.0, 40.0))
-    alpha = np.array([[shares[i].get(j, 0.0) for j in names] for i in names])
-    worst = max(float(np.abs(np.linalg.eigvals(alpha).real.min())), 0.2173)
-    bound = worst * K * (T_ms + 10.0) / 1e3
-    factor = rng.uniform(0.8, 1.2) if rng.random() < 0.6 else rng.choice([0.5, 1.5, 3.0])
-    control = {"law": "p_d", "K": K, "d": float(factor * bound)}
-    if rng.random() < 0.2:
-        control |= {"law": "pd_d", "Kd": float(rng.uniform(0.2, 2.0))}
-    spread = float(rng.choice([0.5, 0.05, 1e-3]))
-    return {
-        "rate_hz": 100,
-        "duration_s": DRAWN_S,
-        "scheme": str(rng.choice(["second_order", "digital"])),
-        "control": control,
-        "link": {"delay_ms": T_ms},
-        "sites": _sites(rng, names, spread),
-        "dominance": shares,
-        **more,
-    }
-
-
-def _draw_network(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abce"[: rng.integers(2, 5)])
-    return Drawn("network", experiment("network", **made), "control.d")
-
-
-def _draw_noisy(rng: np.random.Generator) -> Drawn:
-    made = _loop(rng, "abc"[: rng.integers(2, 4)])
-    made["link"] |= {"model": "uniform", "half_width_ms": min(3.0, made["link"]["delay_ms"]), "loss": 0.02}
-    return Drawn("noise", experiment("noise", **made), "control.d")
-
-
-def _draw_groups(rng: np.random.Generator) -> Drawn:
-    """Two closed groups: what one does hides the other."""
-    made, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
-    d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
-    sites = _sites(rng, "abce", 0.5)
-    for n, name in enumerate("abce"):
-        sites[name]["control"] = p_d(float(d[n // 2]))
-        if n >= 2:
-            sites[name]["q0_rad"] = [0.1 + 1e-3 * n, 0.2]
-    pairs = {"a": {"b": 1.0}, "b": {"a": 1.0}, "c": {"e": 1.0}, "e": {"c": 1.0}}
-    made |= {"sites": sites, "dominance": pairs, "link": {"delay_ms": 1e3 * T}}
-    return Drawn("groups", experiment("groups", **{**made, "control": p_d(1.0)}), "control.d")
-
-
-def _draw_adaptive(rng: np.random.Generator) -> Drawn:
-    """The paper's law at rates at which sampling may feed it."""
-    names = "abc"[: rng.integers(2, 4)]
-    late = rng.random() < 0.6
-    made = _loop(rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0})
-    made["control"] = {
-        "law": "adaptive",
-        "Kp": float(rng.uniform(0.5, 3.0)),
-        "Kd": float(rng.uniform(1.0, 5.0)),
-    }
-    return Drawn("adaptive", experiment("adaptive", **{**made, "rate_hz": int(rng.choice([50, 100]))}))
-
-
-def _draw_delay(rng: np.random.Generator) -> Drawn:
-    """A delay that swings about twice as fast as the loop does."""
-    T = float(rng.uniform(100.0, 250.0))
-    link = {
-        "model": "sine",
-        "delay_ms": T,
-        "amplitude_ms": T * float(rng.choice([0.1, 0.9])),
-        "period_s": 1.0 / rng.uniform(1.0, 2.5),
-    }
-    made = _loop(rng, "abc", link=link)
-    if rng.random() < 0.5:
-        made["control"] = {"law": "adaptive"}
-    return Drawn("delay", experiment("delay", **made))
-
-
-def _draw_wall(rng: np.random.Generator) -> Drawn:
-    rate_hz = int(rng.choice([100, 200]))
-    edge = 15.5e3 * rate_hz / 1000
-    K = edge * (rng.uniform(0.8, 1.2) if rng.random() < 0.5 else rng.uniform(0.2, 2.5))
-    made = {SAMPLED: True, STIFFNESS: K, "rate_hz": rate_hz, "duration_s": DRAWN_S}
-    return Drawn("wall", load_scenario("windup", made), STIFFNESS)
-
-
-def _draw_operator(rng: np.random.Generator) -> Drawn:
-    """A hand that swings to the end, or lets go long before it."""
-    made = _loop(rng, "abc")
-    made["control"] = p_d(float(rng.uniform(2.0, 6.0)))
-    until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
-    hand = swinging([(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5)))
-    made["sites"]["a"]["hands"] = [hand]
-    return Drawn("operator", experiment("operator", **made))
-
-
-KINDS: tuple[tuple[float, Callable[[np.random.Generator], Drawn]], ...] = (
-    (0.62, _draw_network),
-    (0.08, _draw_noisy),
-    (0.06, _draw_groups),
-    (0.08, _draw_adaptive),
-    (0.05, _draw_delay),
-    (0.05, _draw_wall),
-    (0.06, _draw_operator),
-)
-
-
-def draw_experiment(seed: int) -> Drawn:
-    """The experiment of a seed."""
-    rng = np.random.default_rng(seed)
-    shares, draws = zip(*KINDS, strict=True)
-    return draws[rng.choice(len(draws), p=shares)](rng)
-
-
 class Truth(NamedTuple):
     """What is true of a run: whether it is unstable, its rightmost root, 1/s, and whether an edge is near."""
 
@@ -436,7 +410,10 @@ def find_truth(drawn: Drawn) -> Truth:
     """The truth by the rightmost root and by a run eight times as long, in which operators let go.
 
     Of random links the roots are those of mean ages, and the longer run alone decides.
+    See `find_wide_truth` for whatever was drawn widely.
     """
+    if drawn.wide:
+        return find_wide_truth(drawn.scenario)
     scenario, ends_s = drawn.scenario, drawn.scenario.duration_s
     run = FusedRun(prolong_scenario(scenario, LONGER * ends_s))
     states = []
@@ -461,6 +438,77 @@ def find_truth(drawn: Drawn) -> Truth:
     lasts = bool((late > np.maximum((1.2 if slow else 0.5) * early, SEEN)).any())
     grows = root is not None and root > 0.0 and not scenario.links_random
     return Truth(lasts or grows or in_contact > 0.0, root, near)
+
+
+def find_wide_truth(scenario: Scenario) -> Truth:
+    """The truth of any run: whether its motion lasts, or a small push in it grows, to eight times its length.
+
+    The exponent is that of a push in the last three quarters. One so small that it does not double or halve
+    a motion within the judged half of the run itself is near an edge, and so is a motion that dies although a
+    push in it grows, for the while that it lasts.
+    """
+    whole, ends_s = prolong_scenario(scenario, LONGER * scenario.duration_s), scenario.duration_s
+    run = FusedRun(whole)
+    run.advance(LONGER * ends_s)
+    if run.diverged_s is not None:
+        return Truth(True, None, False)
+    early, late = (_largest_speed(run, end_s) for end_s in (ends_s, LONGER * ends_s))
+    exponent = measure_exponent(whole, LONGER * ends_s)
+    lasts = late > max(0.5 * early, DEAD_RAD_S)
+    near = abs(exponent) * 0.5 * ends_s < np.log(2.0) or (exponent > GROWS_PER_S and not lasts)
+    return Truth(lasts or exponent > GROWS_PER_S, exponent, bool(near))
+
+
+def _largest_speed(run: FusedRun, until_s: float) -> float:
+    """The largest speed of any joint in the quarter of a run's own length before a time, rad/s."""
+    last = round(until_s * BUCKETS_PER_S)
+    first = last - round(run.ran_s * BUCKETS_PER_S / LONGER / 4.0)
+    return max(float(np.split(site[first:last], 3, axis=1)[1].max()) for site in run.buckets)
+
+
+def measure_exponent(scenario: Scenario, until_s: float) -> float:
+    """The rate at which a push of 1e-8 rad grows in the last three quarters of a run, 1/s.
+
+    The speeds of a run and of one that was pushed are compared in windows; their difference is made small
+    again when it is large, and pushed anew when it is lost in the rounding of the numbers. The rate is that
+    of the later half of its windows, in which what decays faster is gone; of one that is lost, over its life.
+    """
+    run, pushed = FusedRun(scenario), FusedRun(scenario)
+    for one in (run, pushed):
+        one.plan([round(until_s * spec.rate_hz) for spec in scenario.sites.values()])
+    joints = max(scenario.layout(name).joints for name in scenario.names)
+    by = NUDGE_RAD * np.random.default_rng(1).uniform(-1.0, 1.0, (len(scenario.names), joints))
+    scale, sizes, lost = 0.0, [], []
+    for start_s in np.arange(0.25 * until_s, until_s - 1e-9, WINDOW_S):
+        run.step_to(round(start_s * NS_PER_S))
+        if not sizes:
+            pushed.copy_state(run)
+            pushed.push("q", by)
+            scale = 0.0
+        size = _largest_difference(run, pushed, start_s)
+        if not np.isfinite(size) or pushed.diverged_s is not None or run.diverged_s is not None:
+            return np.inf
+        sizes.append(np.log(max(size, LOST_RAD_S)) + scale)
+        if size < LOST_RAD_S:
+            lost.append((sizes[-1] - np.log(NUDGE_RAD)) / (WINDOW_S * len(sizes)))
+            sizes = []
+        elif size > LINEAR_RAD_S:
+            pushed.approach(run, NUDGE_RAD / size)
+            scale += np.log(size / NUDGE_RAD)
+    late = sizes[len(sizes) // 2 :]
+    if len(late) < LEAST_WINDOWS:
+        return float(np.mean(lost)) if lost else 0.0
+    return float(np.polyfit(WINDOW_S * np.arange(len(late)), late, 1)[0])
+
+
+def _largest_difference(run: FusedRun, pushed: FusedRun, start_s: float) -> float:
+    """The largest difference of the speeds of two runs in a window, which both make, rad/s."""
+    apart = []
+    for t_s in np.linspace(start_s, start_s + WINDOW_S, 21)[1:]:
+        for one in (run, pushed):
+            one.step_to(round(t_s * NS_PER_S))
+        apart.append(pushed.measure_distance(run, "qd"))
+    return max(apart)
 
 
 def has_sampled_wall(scenario: Scenario) -> bool:
@@ -590,6 +638,11 @@ def _read_rows() -> list[list[str]]:
     return [row.split(",")[1:] for row in TRUTHS.read_text().splitlines()[1:]]
 
 
+def count_stored() -> int:
+    """How many seeds have a stored truth."""
+    return len(_read_rows())
+
+
 def _digest(drawn: Drawn) -> str:
     return drawn.scenario.sha256[:12]
 
@@ -626,18 +679,24 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
     )
 
 
+def tally_clear(judged: Iterable[Judged]) -> Tally:
+    """The same of what `certify` says, of those that are not near an edge."""
+    return tally(one for one in judged if not one.truth.near)
+
+
 def main() -> None:
     """Prints the table of docs/certificate.md."""
     parser = argparse.ArgumentParser(description="What is said of random experiments whose truth is known.")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--find-truths", action="store_true", help="write truths.csv anew")
+    parser.add_argument("--find-truths", action="store_true", help="write those of truths.csv anew")
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.seeds)
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         if asked.find_truths:
-            rows = pool.map(write_truth, range(asked.seeds), chunksize=8)
-            TRUTHS.write_text("\n".join(["seed,digest,unstable,root_per_s,near", *rows, ""]))
+            lines = TRUTHS.read_text().splitlines()
+            lines[1 + seeds.start : 1 + seeds.stop] = pool.map(write_truth, seeds, chunksize=8)
+            TRUTHS.write_text("\n".join([*lines, ""]))
             return
         judged = list(pool.map(judge_experiment, seeds, chunksize=8))
     print("| experiments | runs | unstable | near an edge | false ok | false alarms | open |")

@@ -14,21 +14,39 @@ from trilat_net.scenario import Scenario
 from .adversaries import (
     ROWS,
     SEEDS,
-    Drawn,
     Row,
-    draw_experiment,
+    count_stored,
     find_truth,
     judge_experiment,
     read_truth,
     say_of,
     say_of_run,
     tally,
+    tally_clear,
     under_noise,
 )
+from .drawn_loops import WIDE_FROM, Drawn, draw_experiment, experiment
 
-SLOW = tuple(f"{mark}{mirror}" for mark in ("F2", "F4", "F5", "F8", "F9") for mirror in ("", "="))
+SLOW = tuple(
+    f"{mark}{mirror}"
+    for mark in ("F2", "F4", "F5", "F8", "F9", "C1", "C2", "C3", "C4", "C6", "C7", "S1", "S4")
+    for mirror in ("", "=")
+)
 """Rows at 1 kHz, or that take minutes of their own time, or beside which another one says nearly the same."""
-CHEAP = ("a sampled wall of 5 kN/m at 100 Hz", "a push without end", "P+d, 1.6 s, d 2.7", "gravity known")
+CHEAP = (
+    "a sampled wall of 5 kN/m at 100 Hz",
+    "a push without end",
+    "P+d, 1.6 s, d 2.7",
+    "gravity known",
+    "the same, d 2",
+    "at 1.75 s, other shares",
+    "40 and 30 Hz, K 50",
+    "40 and 30 Hz, d 5",
+    "a reserve of 1 J, the same",
+    "by 20 ms",
+    "a wave line that nobody holds",
+    "two hands hold 0.4 rad apart",
+)
 
 
 def _named(row: Row) -> str:
@@ -93,6 +111,8 @@ def test_the_truth_of_rows_that_grow(row: Row) -> None:
 
 
 BLOCK = 400
+OPEN_SHARE = 0.08
+"""Of whatever was drawn, most that may stay open."""
 
 
 @pytest.mark.parametrize(
@@ -108,6 +128,40 @@ def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
         assert found.false_alarm <= 0.02 * found.runs
         assert found.undecided <= 0.15 * found.runs
         assert found.near >= 0.3 * found.runs
+
+
+@pytest.mark.parametrize(
+    ("first", "count"),
+    [
+        (WIDE_FROM, 8),
+        pytest.param(WIDE_FROM, count_stored() - WIDE_FROM, marks=pytest.mark.long),
+    ],
+)
+def test_whatever_is_drawn_does_not_fool_it(first: int, count: int) -> None:
+    """Of those near no edge; `truths.csv` has the rates at which pushes grow."""
+    found = tally_clear(map(judge_experiment, range(first, first + count)))
+    assert found.false_ok == 0
+    assert found.false_alarm <= 0.01 * found.runs
+    assert found.undecided <= max(1, OPEN_SHARE * found.runs)
+
+
+@pytest.mark.parametrize(
+    "seed", [WIDE_FROM, *(pytest.param(n, marks=pytest.mark.long) for n in range(2001, 2040))]
+)
+def test_the_stored_truth_of_whatever_is_drawn_is_that_found_anew(seed: int) -> None:
+    drawn = draw_experiment(seed)
+    stored, found = read_truth(seed, drawn), find_truth(drawn)
+    assert (found.unstable, found.near) == (stored.unstable, stored.near)
+
+
+def test_a_run_without_motion_is_read_whole() -> None:
+    """It is packed a thousandfold, which the file of somebody else may not be."""
+    sites = {name: {"role": "slave" if name == "c" else "master", "q0_rad": [0.1, 0.2]} for name in "abc"}
+    shares = {name: dict.fromkeys(set("abc") - {name}, 0.5) for name in "abc"}
+    given = {"rate_hz": 200, "scheme": "digital", "dominance": shares, "link": {"delay_ms": 0.0}}
+    still = experiment("still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **given)
+    log = trilat_net.simulate(still)
+    assert [len(log[name]) for name in "abc"] == [6000] * 3
 
 
 def _kinds(seeds: range) -> list[int]:

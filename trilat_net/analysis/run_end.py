@@ -24,6 +24,8 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
+from ..scenario.energy_laws import EnergyLaw
+from ..scenario.plugged_laws import UnknownLengths
 from .arm_rows import build_arm_rows
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelope, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
@@ -79,6 +81,7 @@ class EndBehaviour(StrEnum):
     DECAYS = "decaying"
     HARDLY = "hardly decaying"
     UNDECIDED = "undecided (record longer)"
+    COASTS = "coasting, as nobody holds the arm, and it follows nobody or what coasts too"
     BOUNDED = "bounded oscillation"
     DRIFTS = "drifting"
     GROWS = "growing"
@@ -89,7 +92,7 @@ class EndBehaviour(StrEnum):
         """The judgement of a run of which nothing else is known."""
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.STABLE
-        undecided = self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
+        undecided = self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS)
         return Stability.OPEN if undecided else Stability.NOT_STABLE
 
 
@@ -303,10 +306,13 @@ def _find_worst_joint(
                 behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s)
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
             joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
+    end_s = float(t_s[-1]) if len(t_s) else 0.0
     owners = np.repeat(np.arange(len(sites)), [site.shape[2] for site in sites])
     for group in find_coupled_sites(scenario):
         for n in _find_fed_joints(joints, owners, group):
             joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
+        for n in _find_coasting_joints(scenario, joints, owners, group, end_s):
+            joints[n] = joints[n]._replace(behaviour=EndBehaviour.COASTS)
     worst = max(joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s))
     return worst._replace(
         end_error_rad=max(one.end_error_rad for one in joints),
@@ -324,6 +330,30 @@ def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int
     fastest = max((joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling), default=0.0)
     bounded = [n for n in own if joints[n].behaviour is EndBehaviour.BOUNDED]
     return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
+
+
+def _find_coasting_joints(
+    scenario: Scenario, joints: Sequence[RunEnd], owners: Ints, group: Sequence[int], end_s: float
+) -> list[int]:
+    """Returns the drifting joints of coupled sites that nothing brakes.
+
+    That is so if the law of a site that nobody holds or resists at the end has no spring to a peer, and the
+    others follow it; or if that is so of all sites, and their laws take energy from the links alone.
+    """
+    specs = [scenario.sites[scenario.names[site]] for site in group]
+    alone = [
+        spec.control
+        for spec in specs
+        if not any(one.actor.start_s <= end_s < one.actor.end_s for one in (*spec.hands, *spec.environment))
+    ]
+    brakeless = [law for law in alone if isinstance(law, EnergyLaw) and not any(getattr(law, "d", ()))]
+    free = len(brakeless) == len(specs) or not all(any(getattr(law, "K", (1.0,))) for law in alone)
+    own = np.flatnonzero(np.isin(owners, group)).tolist() if free else []
+    return [
+        n
+        for n in own
+        if joints[n].behaviour is EndBehaviour.DRIFTS and joints[n].speed.trend is not EnvelopeTrend.GROWS
+    ]
 
 
 def _classify_joint(
@@ -405,7 +435,9 @@ def _find_disagreement(
 ) -> Iterable[str]:
     """Yields what is said of sites that do not agree, do not come closer, and are not held apart."""
     for group in find_coupled_sites(scenario):
-        if len(group) < 2 or any(scenario.arms[scenario.names[n]].shares_pose for n in group):
+        names = [scenario.names[n] for n in group]
+        places = any(isinstance(scenario.sites[name].control, UnknownLengths) for name in names)
+        if len(group) < 2 or places or any(scenario.arms[name].shares_pose for name in names):
             continue  # e says if they agree
         q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)

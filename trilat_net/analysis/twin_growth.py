@@ -241,7 +241,8 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
         end.speed.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) and end.end_speed_rad_s > FLOOR_RAD
     )
     grows = (twins.grows or (settles is False and twins.doubles)) and not falls
-    if (grows or twins.left is not None) and not end.operator_acts:
+    left = twins.left is not None and end.behaviour is not EndBehaviour.COASTS
+    if (grows or left) and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)
     dies = trend is EnvelopeTrend.DECAYS or (trend is EnvelopeTrend.HARDLY and bool(settles))
     if own is Stability.STABLE and not (dies or trend is EnvelopeTrend.HARDLY):

@@ -122,7 +122,7 @@ def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
         asked += 0.5 * now.sent[j].u[i] * now.sent[j].u[i] * h
     most = now.to_all.H[i] - ahead - 0.5 * law.reserve
     share = 1.0
-    if asked > most:
+    if asked > max(most, 0.0):  # of nothing asked nothing is cut
         share = math.sqrt(max(most, 0.0) / asked)
     for j in range(len(now.peers)):
         sent = now.sent[j]
