@@ -16,7 +16,8 @@ from trilat_net.core.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.linear_loop import linearise_scenario
+from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.operating_point import derive_operating_conditions
 
 RHO_NM, WIDTH_RAD_S = 3.0, 0.03
 SHAKEN = """name = "shaken"
@@ -99,7 +100,7 @@ def test_to_a_small_motion_it_is_a_larger_kp() -> None:
 
     def static(law: str, more: str) -> np.ndarray:
         scenario = parse_scenario(SHAKEN.format(law=law, more=more))
-        return linearise_scenario(scenario, find_equilibrium(scenario, (0.3, 0.2))).A
+        return linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.2))).A
 
     robust = static("adaptive_robust", f"Kp = 1.0\n{ROBUST}")
     larger = static("adaptive_box", f"Kp = {1.0 + RHO_NM / WIDTH_RAD_S}")

@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 
 from tests.theory.loops import loop
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import find_equilibrium, linearise_scenario
+from trilat_net.theory import find_equilibrium
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import MAX_COMMON_DELAY_S, find_delay_margin, set_common_delay
+from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.operating_point import derive_operating_conditions
 
 
 @given(a=st.floats(0.2, 5.0))
@@ -64,14 +66,18 @@ def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
 
 def test_roots_at_zero_cross_nothing() -> None:
     scenario = load_scenario("free")
-    found = find_delay_margin(linearise_scenario(scenario, find_equilibrium(scenario, (-0.1236, 0.3373))))
+    found = find_delay_margin(
+        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373)))
+    )
     assert found.words == "stable for every common delay up to 10 s"
 
 
 def test_force_reflection_in_contact_has_a_margin_between_calm_and_hammering() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
-    found = find_delay_margin(linearise_scenario(scenario, find_equilibrium(scenario)))
+    found = find_delay_margin(
+        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario))
+    )
     (span,) = found.intervals
     assert 0.02 < span.high_s < 0.2
     assert "crosses at" in found.words

@@ -22,7 +22,8 @@ from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.linear_analysis import analyse_linear_loop
-from trilat_net.theory.linear_loop import LinearLoop, linearise_scenario
+from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.theory.operating_point import derive_operating_conditions
 from trilat_net.theory.port_response import CLAMPED, apply_loads, evaluate_transfer
 
 ALONG = np.array([1.0, 0.5])
@@ -31,7 +32,7 @@ HELD = {**CLAMP, "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 10.0}
 
 
 def loop_of(scenario: Scenario) -> LinearLoop:
-    return linearise_scenario(scenario, find_equilibrium(scenario, (0.0, 0.0)))
+    return linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.0, 0.0)))
 
 
 def felt(loop: LinearLoop, s: complex, site: int = 0) -> complex:
@@ -240,7 +241,7 @@ def test_arms_that_a_line_holds_against_hands_are_at_rest_there() -> None:
     """A line between passive ends has no root to the right: its torque balances that of the operator."""
     follows = {"sites.s.control.K": 100.0, "sites.s.control.B": 10.0, "duration_s": 6.0}
     scenario = load_scenario("two_sites", {"control.law": "wave", "scheme": "digital", **follows})
-    loop = linearise_scenario(scenario, find_equilibrium(scenario, (0.4, 1.2)))
+    loop = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.4, 1.2)))
     assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
 
 

@@ -11,10 +11,12 @@ from tests.virtual_runs import trajectories
 from trilat_net.core.ticks import BUCKETS_PER_S
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import analyse_linear_loop, find_equilibrium, linearise_scenario
+from trilat_net.theory import analyse_linear_loop, find_equilibrium
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import follow_equilibrium
+from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.operating_point import derive_operating_conditions
 
 POSE = (-0.1236, 0.3373)
 
@@ -22,14 +24,16 @@ POSE = (-0.1236, 0.3373)
 def rightmost(overrides: dict[str, float]) -> complex:
     """Of `free`."""
     scenario = load_scenario("free", overrides)
-    root = compute_delay_spectrum(linearise_scenario(scenario, find_equilibrium(scenario)), 1).rightmost
+    root = compute_delay_spectrum(
+        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario)), 1
+    ).rightmost
     assert root is not None
     return root.s
 
 
 def test_states_inputs_and_outputs_are_in_the_order_of_the_scenario() -> None:
     scenario = load_scenario("contact")
-    found = linearise_scenario(scenario, find_equilibrium(scenario, (-0.6, 1.8)))
+    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8)))
     assert found.names == ("m.q1", "m.q2", "m.qd1", "m.qd2", "s.q1", "s.q2", "s.qd1", "s.qd2")
     assert found.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
     assert found.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
@@ -42,16 +46,20 @@ def test_states_inputs_and_outputs_are_in_the_order_of_the_scenario() -> None:
 
 def test_an_adaptive_site_has_its_estimate_among_its_states() -> None:
     scenario = load_scenario("two_sites")
-    names = linearise_scenario(scenario, find_equilibrium(scenario, (0.1, 0.2))).names
+    names = linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.1, 0.2))
+    ).names
     assert names[:9] == ("m.q1", "m.q2", "m.qd1", "m.qd2", *(f"m.theta{p}" for p in range(1, 6)))
 
 
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
-    found = linearise_scenario(scenario, find_equilibrium(scenario, POSE))
+    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
     assert [delayed.delay_s for delayed in found.delayed] == [0.05, 0.2]
     both = found.delayed[0].A + found.delayed[1].A
-    alike = linearise_scenario(load_scenario("free"), find_equilibrium(load_scenario("free"), POSE))
+    alike = linearise_loop(
+        derive_operating_conditions(load_scenario("free")), find_equilibrium(load_scenario("free"), POSE)
+    )
     assert both == pytest.approx(alike.delayed[0].A)
 
 
@@ -69,7 +77,7 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
 
 def test_no_delay_at_all_is_the_limit_of_one_tick() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
-    found = linearise_scenario(scenario, find_equilibrium(scenario, POSE))
+    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
     tick, none = (compute_delay_spectrum(set_common_delay(found, T), 1).roots[0].s for T in (1e-3, 0.0))
     tenth = compute_delay_spectrum(set_common_delay(found, 1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
@@ -110,7 +118,13 @@ def test_a_rest_with_wrong_estimates_can_be_unstable_and_the_run_leaves_it_for_a
         begun[f"sites.{name}.q0_rad"] = (rest.q.mean(axis=0) + off).tolist()
         begun[f"sites.{name}.control.theta_hat0"] = rest.theta_hat[i].tolist()
     late = load_scenario("paper", begun)
-    root = compute_delay_spectrum(linearise_scenario(late, follow_equilibrium(late, rest)), 1).roots[0].s
+    root = (
+        compute_delay_spectrum(
+            linearise_loop(derive_operating_conditions(late), follow_equilibrium(late, rest)), 1
+        )
+        .roots[0]
+        .s
+    )
     run = FusedRun(late)
     run.advance(late.duration_s)
     speeds = np.max([site[:, 1] for site in run.maxima], axis=0)

@@ -7,7 +7,7 @@ import pytest
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
-from trilat_net.theory.linear_loop import LinearLoop, linearise_scenario
+from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from trilat_net.theory.port_analysis import (
     build_proof_output,
@@ -65,7 +65,7 @@ def test_hands_back_at_their_ports_make_the_loop_that_had_them() -> None:
     bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
     again, whole = (
         apply_loads(bare, {"m1": PortLoad(20.0, 3.0), "s": PortLoad(0.0, 0.7)}),
-        linearise_scenario(scenario, rest),
+        linearise_loop(derive_operating_conditions(scenario), rest),
     )
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(again.B, whole.B)
@@ -82,7 +82,7 @@ def test_force_that_a_law_reflects_is_reflected_of_a_load_as_well() -> None:
     again = apply_loads(
         linearise_teleoperator(derive_operating_conditions(scenario), rest), {"s": PortLoad(50.0, 4.0)}
     )
-    whole = linearise_scenario(scenario, rest)
+    whole = linearise_loop(derive_operating_conditions(scenario), rest)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(a.B, b.B)

@@ -114,6 +114,7 @@ class RunEnd(NamedTuple):
         missing_sites: sites without any record, which leave the run undecided.
         error_unit: of |e|: that of angles, or of places in task space.
         counts_from_s: since when the run counts; the second half from there on is judged, s.
+        quiet_from_s: since when nobody acts on it, and its loop does not change, s.
     """
 
     behaviour: EndBehaviour
@@ -129,6 +130,7 @@ class RunEnd(NamedTuple):
     missing_sites: tuple[str, ...] = ()
     error_unit: str = "rad"
     counts_from_s: float = 0.0
+    quiet_from_s: float = 0.0
 
     @property
     def stability(self) -> Stability:
@@ -251,7 +253,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     t_s, columns = t_s[first:], [site[kept[first:]] for site in sites]
     missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
     end = _find_worst_joint(scenario, t_s, columns, sites)
-    end = end._replace(missing_sites=missing, counts_from_s=float(t_s[0]) if len(t_s) else 0.0)
+    counts_from_s, quiet_from_s = float(t_s[0]) if len(t_s) else 0.0, max(acted_s, changed_s)
+    end = end._replace(missing_sites=missing, counts_from_s=counts_from_s, quiet_from_s=quiet_from_s)
     if scenario.sites[scenario.names[0]].task.space == "position":
         end = end._replace(error_unit="m")
     if trace.diverged_at_s is not None:

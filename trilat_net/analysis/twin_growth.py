@@ -45,8 +45,6 @@ from .run_end import (
     RunEnd,
     Stability,
     find_coupled_sites,
-    find_last_change,
-    find_last_operator_action,
 )
 
 TWINS = 8
@@ -194,25 +192,23 @@ class TwinGrowth(NamedTuple):
         worst = self.worst
         if worst is None:
             return f"twins: {self.why}"
-        if self.left is not None:
-            left = self.left
-            return (
-                f"twins: from {left.from_s:.4g} to {left.to_s:.4g} s the run and its twins left a rest by "
-                f"themselves, at {left.rate_per_s:+.3g} /s, most at {left.joint}"
-            )
-        in_s = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
+        if (left := self.left) is not None:
+            when, rate = f"from {left.from_s:.4g} to {left.to_s:.4g} s", f"{left.rate_per_s:+.3g} /s"
+            return f"twins: {when} the run and its twins left a rest by themselves, {rate} at {left.joint}"
         if worst.factor == 0.0:
             return "twins: every push died down to the rounding of the numbers"
+        if math.isnan(worst.rate_per_s):
+            return "twins: the run is too short to tell"
+        what, in_s = worst.push.name, f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
+        changed = f"x {worst.factor:.3g} {in_s}, most at {worst.joint}"
         if self.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
-            slowest = f"the slowest, {worst.push.name}, to {worst.factor:.3g} of its size {in_s}"
-            return f"twins: every push dies away; {slowest}"
-        if self.trend is EnvelopeTrend.GROWS:
             return (
-                f"twins: a push of {worst.push.name} grows x {worst.factor:.3g} {in_s}, most at {worst.joint}"
+                f"twins: every push dies away; the slowest, {what}, to {worst.factor:.3g} of its size {in_s}"
             )
+        if self.trend is EnvelopeTrend.GROWS:
+            return f"twins: a push of {what} grows {changed}"
         more = "" if self.needs_s is None else f"; a run of {self.needs_s:.3g} s would tell"
-        changed = f"it changes x {worst.factor:.3g} {in_s}"
-        return f"twins: a push of {worst.push.name} shows no clear trend: {changed}{more}"
+        return f"twins: a push of {what} shows no clear trend: it changes {changed}{more}"
 
 
 class TwinVerdict(NamedTuple):
@@ -267,7 +263,7 @@ def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool =
         twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
     except NotRepeatable as why:
         return TwinGrowth(str(why).removeprefix("no twins: "))
-    return judge_twins(log.scenario, twins, end.counts_from_s, find_quiet_from_s(log))
+    return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
 def measure_virtual_twins(
@@ -279,24 +275,7 @@ def measure_virtual_twins(
         ScenarioError: virtual time cannot run it.
     """
     twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
-    known_s = find_last_operator_action(scenario, duration_s), find_last_change(scenario, duration_s)
-    return judge_twins(scenario, twins, end.counts_from_s, max(known_s))
-
-
-def find_quiet_from_s(log: Log) -> float:
-    """Returns since when nobody acts on a run and its loop does not change, s."""
-    ends_s = [len(log[name]) / log[name].rate_hz for name in log.sites]
-    changed_s = [tick / log[name].rate_hz for name in log.sites for tick in log.changes(name)]
-    acted_s = [
-        float(part.t_s[part.hand[:, 0] > 0.0].max(initial=0.0))
-        for part in map(log.__getitem__, log.sites)
-        if part.layout.hand
-    ]
-    known_s = (
-        find_last_operator_action(log.scenario, max(ends_s)),
-        find_last_change(log.scenario, max(ends_s)),
-    )
-    return max([0.0, *changed_s, *acted_s, *known_s])
+    return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
 def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_from_s: float) -> TwinGrowth:

@@ -83,14 +83,12 @@ class RunInputs(NamedTuple):
     Attributes:
         feed: arrivals, and what live hands did.
         changes: the tick before which a site takes a change in, the site's place, and the change, by time.
-        keep: records of a site that a late sample may still ask for.
         late_ns: by how much samples came late, at the most, ns.
         longest_us: the longest delay that a change gave a link, us.
     """
 
     feed: RecordedFeed
     changes: Sequence[tuple[int, int, CoreChange]] = ()
-    keep: int = 0
     late_ns: int = 0
     longest_us: int = 0
 
@@ -135,7 +133,8 @@ class FusedRun:
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
         self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
-        kept = 1 << max(_largest_ratio(scenario) + 1, keep, self._inputs.keep).bit_length()
+        late_ticks = self._inputs.late_ns * int(self._progress["rate_hz"].max()) // NS_PER_S + 2
+        kept = 1 << max(_largest_ratio(scenario) + 1, keep, late_ticks).bit_length()
         floats = max(layout.floats for layout in self._layouts)
         self._sent = KeptRecords(np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats)))
         self._peaks = np.full((count, 0, 3 * joints), -1.0)

@@ -15,9 +15,6 @@ from ..log.log_reader import Log
 from ..scenario.law_consent import find_user_laws
 from .fused import RunInputs
 
-MOST_KEPT = 1 << 16
-"""Most records of a site that are kept for samples that come late."""
-
 
 def explain_no_repetition(log: Log, *, own_laws: bool = False) -> str:
     """Returns why a run cannot be executed again from its log alone; "" if it can.
@@ -51,11 +48,9 @@ def read_run_inputs(log: Log) -> RunInputs:
     changes = _list_changes(log)
     models = [change.model for _, _, change in changes if change.model is not None]
     first, samples, late_ns = _list_arrivals(log, ticks)
-    fastest_hz = max(log[name].rate_hz for name in log.sites)
     return RunInputs(
         RecordedFeed(first, samples, *_stack_hands(log, ticks)),
         changes,
-        min(late_ns * fastest_hz // NS_PER_S + 2, MOST_KEPT),
         late_ns,
         max_delay_us(models, [None] * len(models)) if models else 0,
     )
@@ -79,12 +74,11 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
     """
     names = log.scenario.names
     peers = max(len(names) - 1, 1)
-    if log.driver == "virtual":
-        return np.zeros((len(names), peers, 0), np.int64), np.zeros(0, np.int64), 0
-    first = np.zeros((len(names), peers, ticks + 1), dtype=np.int64)
+    virtual = log.driver == "virtual"
+    first = np.zeros((len(names), peers, 0 if virtual else ticks + 1), dtype=np.int64)
     listed: list[IntArray] = []
     total = late_ns = 0
-    for i, part in enumerate(log[name] for name in names):
+    for i, part in enumerate([] if virtual else [log[name] for name in names]):
         counts, rows = part.arrivals
         came = np.repeat(part.tick, counts)
         for p, peer in enumerate(part.peers):

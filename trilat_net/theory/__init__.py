@@ -20,7 +20,7 @@ from .linear_edge import (
     find_root_crossings,
     iterate_linear_edges,
 )
-from .linear_loop import DelayedTerm, LinearLoop, linearise_scenario
+from .linear_loop import DelayedTerm, LinearLoop
 from .operating_point import Equilibrium
 
 __all__ = [
@@ -35,5 +35,4 @@ __all__ = [
     "find_equilibrium",
     "find_root_crossings",
     "iterate_linear_edges",
-    "linearise_scenario",
 ]

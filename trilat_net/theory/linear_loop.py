@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
 from ..core.vectors import Array
-from ..scenario import Scenario
 from ..scenario.linear_form import LinearForm, Place
 from . import site_dynamics
 from .numeric_law import NumericLaw
-from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .operating_point import Equilibrium, OperatingConditions
 from .textbook_task import PLACE_COORDINATES, evaluate_reference
 
 _DEPENDENT = 1e-9
@@ -102,15 +101,6 @@ class LinearLoop(NamedTuple):
         for term in self.delayed:
             total += term.A
         return total
-
-
-def linearise_scenario(scenario: Scenario, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop of a scenario, linearised at an equilibrium, see `find_equilibrium`.
-
-    Raises:
-        ScenarioError: the scenario has no linear loop, see `derive_operating_conditions`.
-    """
-    return linearise_loop(derive_operating_conditions(scenario), rest)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:

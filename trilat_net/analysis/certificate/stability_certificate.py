@@ -196,12 +196,8 @@ class Certificate(Result):
         settles = known.get(self.roots.verdict) if self.roots is not None and self.roots.exact else None
         if self.verdict.finding is StabilityFinding.COVERED:
             settles = True
-        return judge_end_by_twins(
-            self.end,
-            self.twins,
-            settles=settles,
-            rises=self.verdict.finding is StabilityFinding.ROSE,
-        )
+        rose = self.verdict.finding is StabilityFinding.ROSE
+        return judge_end_by_twins(self.end, self.twins, settles=settles, rises=rose)
 
     @property
     def stability(self) -> Stability:
