@@ -251,7 +251,6 @@ class FusedRun:
     def copy_state(self, other: "FusedRun") -> None:
         """Becomes equal to another run of the same scenario, which is planned alike."""
         self.approach(other, 0.0)
-        self._state.copy(other._state)
 
     def approach(self, other: "FusedRun", factor: float) -> None:
         """Becomes another run plus so much of its difference to that, whose records it has made by now."""

@@ -38,14 +38,12 @@ class RunState:
                 self._words.append(flat)
                 self._floats.append(np.tile(_float_words(array.dtype), array.size))
 
-    def copy(self, other: "RunState") -> None:
-        """Becomes equal to another state of the same run."""
-        for own, its in zip(self._words, other._words, strict=True):
-            own[:] = its
-
     def approach(self, other: "RunState", factor: float) -> None:
-        """Becomes another state plus so much of the difference to it."""
+        """Becomes another state of the same run plus so much of the difference to it; 0: its very bits."""
         for own, its, floats in zip(self._words, other._words, self._floats, strict=True):
+            if factor == 0.0:
+                own[:] = its
+                continue
             changed = np.flatnonzero((own != its) & floats)
             x, y = own.view(np.float64)[changed], its.view(np.float64)[changed]
             mixed: Array = y + factor * (x - y)
