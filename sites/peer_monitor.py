@@ -45,6 +45,7 @@ class PeerMonitor:
         self._alive: set[tuple[str, str]] = set()
         self._ended: set[int] = set()
         self._refused: set[int] = set()
+        self._firsts: dict[int, int] = {}  # of the starts that it admitted, by boot
 
     @property
     def all_stored(self) -> bool:
@@ -114,7 +115,7 @@ class PeerMonitor:
     def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
         """Admits another start of a site, or says why not."""
         member, before = event.member, self.boots.get(event.member)
-        if event.boots.get(member) != event.boot:
+        if event.boots.get(member) != event.boot or self._firsts.get(event.boot) == event.ticks:
             return
         if before not in (event.boot, *self._ended) and (member, str(before)) in self._alive:
             if event.boot not in self._refused:
@@ -125,6 +126,7 @@ class PeerMonitor:
         self.boots = {**self.boots, member: event.boot}
         self.away.pop(member, None)
         self.admitted.append(event)
+        self._firsts[event.boot] = event.ticks
         publisher.update(boots=self.boots)
         self._answer("admit", f"{member} may join from its tick {event.ticks} on", publisher, event, t_ns)
 

@@ -8,6 +8,8 @@ seconds (`shutdown`).
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
+from msgspec.structs import asdict
+
 from trilat_net.core.site_setup import StaleAction
 from trilat_net.core.ticks import (
     NS_PER_S,
@@ -150,6 +152,7 @@ class RunningSite:
         self._output: TickRecord | None = None
         self._status_s = self._told_s = 0
         self._held_s = -1
+        self._came_ns = tick_ns(epoch.first, site.rate_hz)
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
@@ -253,6 +256,7 @@ class RunningSite:
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
         self._watch_members(t_ns)
+        self._come_again(t_ns)
         for news in () if self._parts.hand is None else self._parts.hand.take_news():
             self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
             self._parts.say(news.text.partition(": ")[2])
@@ -304,6 +308,15 @@ class RunningSite:
         patience_s = parts.options.leave_timeout_s
         since_ns = min((since_ns for since_ns, _ in monitor.away.values()), default=t_ns)
         self._given_up = patience_s is not None and t_ns - since_ns > patience_s * NS_PER_S
+
+    def _come_again(self, t_ns: int) -> None:
+        """Says once a second that this site has come, while a peer that was cut off then ignores it."""
+        coming, now_ns = self._epoch.coming, self._parts.clock.monotonic_ns()
+        if coming is None or t_ns < self._came_ns + NS_PER_S:
+            return
+        if any(meter.ignores(now_ns) for meter in self._timing.meters):
+            self._came_ns = t_ns
+            self._publisher.publish(**{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published})
 
     def _tell_last(self, index: int, coming: Event, t_ns: int) -> None:
         """Publishes how far the start of a peer was heard that ends now: it may not have been able to."""

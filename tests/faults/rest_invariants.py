@@ -121,7 +121,9 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
         qd_des = rest.rows("qd_des")[1:]
         free = ~rest.limited[1:-1]
         rests = (qd_des == 0.0).all(axis=1)[:-1]
-        still = rests & np.r_[False, rests[:-1]]  # the torque is extrapolated from the tick before, Eq. (8)
+        # a torque is extrapolated from the tick before, Eq. (8), and the first of a rest decelerates
+        before = np.r_[False, False, rests]
+        still = rests & before[1:-1] & before[:-2]
         largest_j = max(1.0, S.max())
         rises = np.diff(S) / largest_j
         work = 0.5 * (power[1:] + power[:-1]) / rest.setup.rate_hz / largest_j
@@ -196,22 +198,24 @@ def check_travel(session: FaultSession) -> Iterator[str]:
     for rest in find_rests(session):
         q = rest.rows("q")
         travel = np.abs(q - q[0]).max(axis=1)
-        allowed_rad = find_stopping_distance(rest)
+        allowed_rad = find_stopping_distance(session.scenario, rest)
         for row in np.flatnonzero(travel > allowed_rad)[:1]:
             at = rest.states[row]
             if rest.judged < len(rest.states):
                 yield f"{rest.name} goes {travel.max():.3g} rad by {at.mode}; at most {allowed_rad:.3g}"
 
 
-def find_stopping_distance(rest: Rest) -> float:
-    """How far an arm goes until it rests: its reference, and what its torque takes it besides, rad.
+def find_stopping_distance(scenario: Scenario, rest: Rest) -> float:
+    """How far a joint goes until all rest: its reference, and what its torque takes it besides, rad.
 
-    The reference goes |v| T / 2. A torque that gives an acceleration a as it begins is taken on by w
-    while s adds up to a M / (k B) = 4 a time_s^2.
+    The reference goes |v| T / 2. A torque d that nothing balances as it begins, M times the acceleration
+    that is seen, is taken on by w while s adds up to d / (k B) = 4 time_s d / B.
     """
     still = rest.setup.rest
     assert still is not None
-    v = rest.rows("qd")[: rest.blend + 1]
+    q, v = (rest.rows(key)[: rest.blend + 1] for key in ("q", "qd"))
     stop_s = max(LEAST_STOP_S, float((np.abs(v[0]) / still.deceleration).max()))
-    a = np.abs(np.diff(v, axis=0)).max(initial=0.0) * rest.setup.rate_hz
-    return MOST_WAY * float(np.abs(v[0]).max() * stop_s / 2.0 + 4.0 * a * still.time_s**2)
+    a = np.diff(v, axis=0) * rest.setup.rate_hz
+    d_nm = np.abs(inertia_product_rows(scenario.arms[rest.name].theta, q[1:], a)).max(axis=0, initial=0.0)
+    aside_rad = 4.0 * still.time_s * d_nm / still.damping
+    return MOST_WAY * float((np.abs(v[0]) * stop_s / 2.0 + aside_rad).max())

@@ -199,13 +199,15 @@ class Membership:
         return met is not None and met.boot != boot and str(boot) not in self.alive
 
     def running(self) -> list[Info]:
-        """Returns the sites of a running session that were met, of those that agree on its members."""
+        """Returns the sites of a running session that were met, of those that agree on its other members."""
         infos = [
             info
             for _, info in sorted(self.met.items())
             if info.running and info.scenario and info.boots.get(info.member) == info.boot
         ]
-        return [info for info in infos if info.boots == infos[0].boots]
+        own = {self.own.member: self.own.boot}  # some may have admitted it
+        others = [info.boots | own for info in infos]
+        return [info for info, boots in zip(infos, others, strict=True) if boots == others[0]]
 
     def poll(self, *, invited: bool) -> None:
         """Takes answers, repeats the query, and forgets members that are gone.
@@ -279,6 +281,7 @@ class Epoch(NamedTuple):
         boots: the members and their boots.
         epochs: the same instant on every member's own clock; empty for a recorder that joins late.
         first: the first tick of this site.
+        coming: what it says who joins late, until all acknowledge its samples.
     """
 
     mono_ns: int
@@ -286,3 +289,4 @@ class Epoch(NamedTuple):
     boots: Mapping[str, int]
     epochs: Mapping[str, int] = {}
     first: int = 0
+    coming: Event | None = None

@@ -152,11 +152,11 @@ class SessionJoin:
             event, told = self._coming
             first_ns = told.mono_ns + tick_ns(event.ticks, rate_hz)
             if now_ns < first_ns - DECIDE_NS:
-                if self._admitted < {info.member for info in running}:
+                if not self._admitted >= {info.member for info in running}:
                     return None
                 epochs = {info.member: info.epoch_mono_ns for info in running} | {own.member: told.mono_ns}
                 boots = {**running[0].boots, **self._starts, own.member: own.boot}
-                return told._replace(boots=boots, epochs=epochs, first=event.ticks)
+                return told._replace(boots=boots, epochs=epochs, first=event.ticks, coming=event)
         since_ns = now_ns - epoch.mono_ns
         first = first_tick_at(since_ns + EPOCH_AHEAD_NS + 2 * slowest_ns, rate_hz)
         self._attempt += 1
