@@ -147,11 +147,10 @@ class RunningSite:
         scenario, site = parts.scenario, parts.site
         self._parts, self._publisher, self._epoch = parts, publisher, epoch
         self._failure: RunFailed | None = None
-        self._given_up = False
         self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
         self._status_s = self._told_s = 0
-        self._held_s = -1
+        self._given_up, self._held_s = False, -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
@@ -314,7 +313,8 @@ class RunningSite:
         coming, now_ns = self._epoch.coming, self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._came_ns + NS_PER_S:
             return
-        if any(meter.ignores(now_ns) for meter in self._timing.meters):
+        meters = self._timing.meters
+        if any(meter.is_heard(now_ns) and meter.hears(now_ns) is None for meter in meters):
             self._came_ns = t_ns
             self._publisher.publish(**{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published})
 

@@ -5,6 +5,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -51,10 +52,10 @@ def test_keys_that_the_disk_refuses_are_named_and_not_there(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("mib", [40])
-def test_too_little_memory_is_said_in_one_line(mib: int, tmp_path: Path) -> None:
-    """As `ulimit -v` leaves it, where libraries cannot be loaded."""
-    done = limited(resource.RLIMIT_AS, mib << 20, "log", "check", LOG, cwd=tmp_path)
+@pytest.mark.parametrize(("mib", "words"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))])
+def test_too_little_memory_is_said_in_one_line(mib: int, words: Sequence[str], tmp_path: Path) -> None:
+    """As `ulimit -v` leaves it, where libraries cannot be loaded, or try for ever."""
+    done = limited(resource.RLIMIT_AS, mib << 20, *words, LOG, cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "error: there is too little memory" in done.stderr

@@ -145,7 +145,11 @@ pose = st.one_of(st.just(()), row(3))
 
 
 @settings(max_examples=40)
-@given(output=outputs, task=st.tuples(pose, row(3), row(3)), echo=st.lists(st.tuples(ticks, ticks, instants)))
+@given(
+    output=outputs,
+    task=st.tuples(pose, row(3), row(3)),
+    echo=st.lists(st.tuples(ticks, ticks, instants), max_size=32),
+)
 def test_each_field_of_a_sample_is_bit_for_bit_one_of_the_record_of_its_tick(
     output: TickRecord, task: tuple[list[float], list[float], list[float]], echo: list[tuple[int, int, int]]
 ) -> None:

@@ -159,12 +159,8 @@ _add("keys", _KEYS, help="Keys that authenticate members of a session, and sign 
 
 
 _TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
-
-
-def _is_short_of_memory(error: Exception) -> bool:
-    """True of what Python, Numba and threads say who get no memory."""
-    texts = ("failed to map segment", "libllvmlite", "start new thread", "allocate memory")
-    return isinstance(error, MemoryError) or any(text in str(error) for text in texts)
+_WITHOUT_MEMORY = ("failed to map segment", "libllvmlite", "start new thread", "allocate memory")
+"""What Python, Numba and threads say who get none."""
 
 
 def main() -> None:
@@ -180,20 +176,15 @@ def main() -> None:
     except BrokenPipeError:  # the reader of a pipe has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
-    except OSError as error:  # a full disk, a folder that vanished
-        short = _is_short_of_memory(error)
-        print_error(
-            _TOO_LITTLE
-            if short
-            else f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
-        )
+    except (MemoryError, ImportError, RuntimeError, OSError) as error:
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _WITHOUT_MEMORY):
+            sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
+            sys.exit(1)
+        if not isinstance(error, OSError):  # else a full disk, a folder that vanished
+            raise
+        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
         bad_name = error.errno == errno.ENAMETOOLONG
         sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
-    except (MemoryError, ImportError, RuntimeError) as error:
-        if not _is_short_of_memory(error):
-            raise
-        sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
-        sys.exit(1)
     finally:
         TrilatError.in_command = False
         gc.freeze()  # at exit, Python need not traverse every record

@@ -1,9 +1,17 @@
 """`trilat demo`: runs a scenario live on this machine, a process per site and recorder, and reports."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import typer
 
 from ..reporting import terminal_output as terminal
 from . import options
+
+if TYPE_CHECKING:
+    from live.live_session import PageOptions
+
+    from ..scenario import Scenario
 
 
 def demo_command(
@@ -17,26 +25,37 @@ def demo_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
-    from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
-
     from ..files import make_results_folder
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    results = make_results_folder(folder, chosen.name, force=force)
+    run_and_report(chosen, make_results_folder(folder, chosen.name, force=force), png=png, as_json=as_json)
+
+
+def run_and_report(
+    chosen: "Scenario", results: Path, page: "PageOptions | None" = None, *, png: bool, as_json: bool
+) -> None:
+    """Runs a scenario live, with a page if asked, which may end it; then verifies and reports."""
+    from live.live_session import attend_with_page
+    from sites.demo_session import run_demo
+    from sites.monitor import SessionDisplay
+
+    from ..net.clock import SystemClock
+
     with terminal.lines_aside(as_json):
         terminal.print_text(chosen.title or chosen.name)
         members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
         with SessionDisplay(chosen, terminal.out) as display:
-            outcome = run_demo(chosen, results, display)
+            attend = None if page is None else attend_with_page(page, SystemClock(), display.say)
+            outcome = run_demo(chosen, results, display, attend)
     for problem in outcome.problems:
         terminal.print_error(problem)
-    if outcome.interrupted:
-        kept = f"; {outcome.log} holds what there was" if outcome.log.exists() else ""
+    there = outcome.log.exists()
+    if outcome.interrupted and not (page and there):
+        kept = f"; {outcome.log} holds what there was" if there else ""
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
-    if not outcome.log.exists():
+    if not there:
         raise typer.Exit(outcome.exit_code)
     _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
     if outcome.problems or not conclusion.passed:

@@ -1,6 +1,5 @@
 """`trilat live`: a session with a page that shows it and takes part, or a page of a session that runs."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,6 +7,7 @@ import typer
 from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from . import options
+from .demo import run_and_report
 
 
 def live_command(
@@ -46,8 +46,9 @@ def live_command(
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
     """
-    from live.live_session import PageOptions, watch_with_page
+    from live.live_session import LONGEST_S, PageOptions, watch_with_page
 
+    from ..files import make_results_folder
     from ..net.clock import SystemClock
 
     page = PageOptions(host, port, insecure, browser)
@@ -64,40 +65,7 @@ def live_command(
         raise typer.Exit(code)
     if connect or router or zenoh_config or keys:
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
-    _run_session(page, scenario, folder, duration, seed, overrides, force=force, png=png, as_json=as_json)
-
-
-def _run_session(
-    page: object,
-    source: str,
-    folder: Path | None,
-    duration: float | None,
-    seed: int | None,
-    overrides: list[str] | None,
-    *,
-    force: bool,
-    png: bool,
-    as_json: bool,
-) -> None:
-    from live.live_session import LONGEST_S, PageOptions, attend_with_page
-    from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
-
-    from ..files import make_results_folder
-    from ..net.clock import SystemClock
-
-    assert isinstance(page, PageOptions)
-    chosen = options.load_chosen_scenario(
-        source, overrides, LONGEST_S if duration is None else duration, seed
-    )
+    longest_s = LONGEST_S if duration is None else duration
+    chosen = options.load_chosen_scenario(scenario, overrides, longest_s, seed)
     results = make_results_folder(folder, chosen.name, force=force)
-    with terminal.lines_aside(as_json), SessionDisplay(chosen, terminal.out) as display:
-        terminal.print_text(chosen.title or chosen.name)
-        outcome = run_demo(chosen, results, display, attend_with_page(page, SystemClock(), display.say))
-    for problem in outcome.problems:
-        terminal.print_error(problem)
-    if not outcome.log.exists():
-        raise typer.Exit(128 + outcome.interrupted if outcome.interrupted else outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
-    if outcome.problems or not conclusion.passed:
-        raise typer.Exit(outcome.exit_code)
+    run_and_report(chosen, results, page, png=png, as_json=as_json)

@@ -10,6 +10,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -20,6 +21,12 @@ from ..process import let_signals_kill
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+with suppress(ImportError):  # systems without it have no such limit
+    from resource import RLIMIT_AS, getrlimit
+
+    if 0 <= getrlimit(RLIMIT_AS)[0] < 1 << 30:
+        raise MemoryError  # LLVM and OpenBLAS would try for ever, deaf to signals, or abort
 
 
 def _cache_root() -> Path:

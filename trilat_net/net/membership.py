@@ -206,8 +206,7 @@ class Membership:
             if info.running and info.scenario and info.boots.get(info.member) == info.boot
         ]
         own = {self.own.member: self.own.boot}  # some may have admitted it
-        others = [info.boots | own for info in infos]
-        return [info for info, boots in zip(infos, others, strict=True) if boots == others[0]]
+        return [info for info in infos if info.boots | own == infos[0].boots | own]
 
     def poll(self, *, invited: bool) -> None:
         """Takes answers, repeats the query, and forgets members that are gone.

@@ -183,10 +183,6 @@ class LinkTimingMonitor:
             return None
         return self._heard_ns - self._acknowledged_ns <= UNHEARD_NS
 
-    def ignores(self, now_ns: int) -> bool:
-        """True if the peer is heard and never acknowledged a sample: it does not know this start."""
-        return self._acknowledged < 0 and self.is_heard(now_ns)
-
     def close(self, now_ns: int, from_ns: int) -> OffsetEstimate | None:
         """Closes the window if it is due, and slews to the new estimate from an instant on; else None."""
         estimator = self.peer.estimator
