@@ -22,10 +22,9 @@ from ..process import let_signals_kill
 P = ParamSpec("P")
 R = TypeVar("R")
 
-with suppress(ImportError):  # systems without it have no such limit
-    from resource import RLIMIT_AS, getrlimit
-
-    if 0 <= getrlimit(RLIMIT_AS)[0] < 1 << 30:
+with suppress(OSError, IndexError):  # of Linux alone
+    _addresses = Path("/proc/self/limits").read_text("utf-8").partition("Max address space")[2].split()[0]
+    if _addresses != "unlimited" and int(_addresses) < 1 << 30:
         raise MemoryError  # LLVM and OpenBLAS would try for ever, deaf to signals, or abort
 
 
