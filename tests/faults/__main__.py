@@ -131,9 +131,9 @@ def describe_torques(seeds: Seeds) -> str:
     return (
         f"Largest step of a torque in a tick, N m: {stepped} (`start`: the first 0.1 s of every start). "
         f"Allowed are {allowed_nm:.3g}, the larger of the limit of its rate and 1.1 times the "
-        f"{undisturbed_nm:.3g} of the session without faults. The change of a holding site's storage in a "
-        f"tick is at most {at_rest_j:.2g} J from 20 ticks on; before, less the work of Kd qd_des, at most "
-        f"{before_j:.2g} J."
+        f"{undisturbed_nm:.3g} of the session without faults. The storage of an arm that comes to rest "
+        f"changes in a tick by at most {at_rest_j:.2g} J once its reference rests; before, less the work of "
+        f"that, by at most {before_j:.2g} J."
     )
 
 
