@@ -313,8 +313,7 @@ class RunningSite:
         coming, now_ns = self._epoch.coming, self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._came_ns + NS_PER_S:
             return
-        meters = self._timing.meters
-        if any(meter.is_heard(now_ns) and meter.hears(now_ns) is None for meter in meters):
+        if any(meter.is_heard(now_ns) and meter.hears(now_ns) is None for meter in self._timing.meters):
             self._came_ns = t_ns
             self._publisher.publish(**{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published})
 

@@ -17,6 +17,7 @@ from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.messages import (
+    MOST_PEERS,
     READABLE,
     TASK_VECTORS,
     VERSION,
@@ -148,7 +149,7 @@ pose = st.one_of(st.just(()), row(3))
 @given(
     output=outputs,
     task=st.tuples(pose, row(3), row(3)),
-    echo=st.lists(st.tuples(ticks, ticks, instants), max_size=32),
+    echo=st.lists(st.tuples(ticks, ticks, instants), max_size=MOST_PEERS),
 )
 def test_each_field_of_a_sample_is_bit_for_bit_one_of_the_record_of_its_tick(
     output: TickRecord, task: tuple[list[float], list[float], list[float]], echo: list[tuple[int, int, int]]

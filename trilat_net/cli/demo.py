@@ -1,5 +1,6 @@
 """`trilat demo`: runs a scenario live on this machine, a process per site and recorder, and reports."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,9 +10,11 @@ from ..reporting import terminal_output as terminal
 from . import options
 
 if TYPE_CHECKING:
-    from live.live_session import PageOptions
+    from sites.demo_session import SessionAttendant
 
     from ..scenario import Scenario
+
+    Attend = Callable[[Callable[[str], None]], SessionAttendant] | None
 
 
 def demo_command(
@@ -25,33 +28,30 @@ def demo_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
-    from ..files import make_results_folder
-
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    run_and_report(chosen, make_results_folder(folder, chosen.name, force=force), png=png, as_json=as_json)
+    run_and_report(chosen, folder, force=force, png=png, as_json=as_json)
 
 
 def run_and_report(
-    chosen: "Scenario", results: Path, page: "PageOptions | None" = None, *, png: bool, as_json: bool
+    chosen: "Scenario", folder: Path | None, attend: "Attend" = None, *, force: bool, png: bool, as_json: bool
 ) -> None:
-    """Runs a scenario live, with a page if asked, which may end it; then verifies and reports."""
-    from live.live_session import attend_with_page
+    """Runs a scenario live, then verifies and reports; what `attend` makes may end it as planned."""
     from sites.demo_session import run_demo
     from sites.monitor import SessionDisplay
 
-    from ..net.clock import SystemClock
+    from ..files import make_results_folder
 
+    results = make_results_folder(folder, chosen.name, force=force)
     with terminal.lines_aside(as_json):
         terminal.print_text(chosen.title or chosen.name)
         members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
         with SessionDisplay(chosen, terminal.out) as display:
-            attend = None if page is None else attend_with_page(page, SystemClock(), display.say)
-            outcome = run_demo(chosen, results, display, attend)
+            outcome = run_demo(chosen, results, display, attend and attend(display.say))
     for problem in outcome.problems:
         terminal.print_error(problem)
     there = outcome.log.exists()
-    if outcome.interrupted and not (page and there):
+    if outcome.interrupted and not (attend and there):
         kept = f"; {outcome.log} holds what there was" if there else ""
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)

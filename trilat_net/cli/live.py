@@ -1,5 +1,6 @@
 """`trilat live`: a session with a page that shows it and takes part, or a page of a session that runs."""
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -46,9 +47,8 @@ def live_command(
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
     """
-    from live.live_session import LONGEST_S, PageOptions, watch_with_page
+    from live.live_session import LONGEST_S, PageOptions, attend_with_page, watch_with_page
 
-    from ..files import make_results_folder
     from ..net.clock import SystemClock
 
     page = PageOptions(host, port, insecure, browser)
@@ -67,5 +67,5 @@ def live_command(
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     longest_s = LONGEST_S if duration is None else duration
     chosen = options.load_chosen_scenario(scenario, overrides, longest_s, seed)
-    results = make_results_folder(folder, chosen.name, force=force)
-    run_and_report(chosen, results, page, png=png, as_json=as_json)
+    attend = partial(attend_with_page, page, SystemClock())
+    run_and_report(chosen, folder, attend, force=force, png=png, as_json=as_json)
