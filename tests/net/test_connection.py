@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.connection import (
     ROUTER_POLL_NS,
     Connection,
@@ -27,6 +27,8 @@ from trilat_net.net.connection import (
 )
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
+
+from .local_bus import LocalNetwork
 
 HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
 A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"

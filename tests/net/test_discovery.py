@@ -11,7 +11,6 @@ from sites.change_server import ChangeServer
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
 from trilat_net.net.discovery import connect_to_session, find_members, request_change
@@ -22,6 +21,7 @@ from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
 
+from .local_bus import LocalNetwork
 from .parties import told
 from .waiting import until
 

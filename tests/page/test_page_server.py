@@ -17,9 +17,9 @@ from live.live_session import PageOptions
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
 from live.page_server import MOST_EXCESS, PageServer
 from tests.cli.running import trilat
+from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
-from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode

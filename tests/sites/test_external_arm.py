@@ -22,6 +22,7 @@ from sites.external_arm import (
     ExternalArm,
 )
 from sites.session_stop import order_sites
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
 from trilat_net.core.site_step import Site
@@ -32,7 +33,7 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.arm_port import ArmPort, EnablePort
-from trilat_net.net.bus import Bus, LocalNetwork, StampingRing
+from trilat_net.net.bus import Bus, StampingRing
 from trilat_net.net.messages import VERSION, Event
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
 from trilat_net.net.site_port import FRESH_NS

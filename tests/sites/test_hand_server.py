@@ -10,6 +10,7 @@ import pytest
 
 from sites.hand_server import MESSAGES_KEPT, HandServer
 from sites.hand_session import open_hand
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, free_hand
 from trilat_net.errors import UsageError
@@ -17,7 +18,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.hand_port import Hand
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import encode

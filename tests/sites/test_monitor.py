@@ -8,10 +8,10 @@ import pytest
 
 import trilat_net
 from sites.monitor import LINE_EVERY, SessionDisplay, SessionMonitor
+from tests.net.local_bus import LocalNetwork
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.net import topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode

@@ -10,11 +10,12 @@ from rich.console import Console
 from live.session_frames import SessionFrames, show_event
 from live.terminal_watch import HEADS, SessionWatch, describe_row, frame_alarms
 from sites.session_stop import order_sites, stop_session
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
