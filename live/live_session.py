@@ -12,19 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 
-from sites.demo_session import SessionAttendant
-from trilat_net.errors import SessionError, UsageError
+from trilat_net.errors import UsageError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.connection import Connection
-from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.process import Interrupt
-from trilat_net.scenario import embedded_names_reader
 
 from .page_server import LOOPBACK, PageServer
+from .session_view import SessionView
 
-POLL_NS = 100_000_000
 LONGEST_S = 3600.0
 """A session with a page runs for so long at most, unless told otherwise, s."""
 
@@ -63,18 +58,16 @@ class PageOptions:
             raise UsageError(f"{self.host}:{self.port}: cannot listen: {error.strerror}") from None
 
 
-def attend_with_page(options: PageOptions, clock: Clock, say: Callable[[str], None]) -> SessionAttendant:
-    """Returns what serves a page beside a session that is started for it, until the page asks for its end."""
-
-    @contextmanager
-    def attend(session: str, endpoints: Sequence[str]) -> Iterator[Callable[[], bool]]:
-        with (
-            closing(ZenohBus([], endpoints)) as bus,
-            serve_page(bus, clock, session, options, say, ends=True) as page,
-        ):
-            yield page.end_requested.is_set
-
-    return attend
+@contextmanager
+def attend_with_page(
+    options: PageOptions, clock: Clock, session: str, endpoints: Sequence[str], say: Callable[[str], None]
+) -> Iterator[Callable[[], bool]]:
+    """The `SessionAttendant` that serves a page, until that asks for the end of the session."""
+    with (
+        closing(ZenohBus([], endpoints)) as bus,
+        serve_page(bus, clock, session, options, say, ends=True) as page,
+    ):
+        yield page.end_requested.is_set
 
 
 @contextmanager
@@ -102,36 +95,10 @@ def _has_browser() -> bool:
     return sys.stdout.isatty()
 
 
-def watch_with_page(
-    session: str,
-    connection: Connection,
-    options: PageOptions,
-    clock: Clock,
-    say: Callable[[str], None],
-    timeout_s: float,
-) -> int:
-    """Serves a page of a session that runs already, until it ends or a signal comes; returns the exit code.
-
-    Raises:
-        SessionError: the session is not there.
-        UsageError: an endpoint or the page's address cannot be used.
-    """
-    with Interrupt() as interrupt:
-        names, stopped = embedded_names_reader(session), interrupt.requested
-        reached = connect_to_session(
-            connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
-        )
-        with reached as bus:
-            if bus is None:
-                return interrupt.exit_code
-            with serve_page(bus, clock, session, options, say, ends=False) as page:
-                give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-                while not (interrupt.requested() or page.view.ended):
-                    now_ns = clock.monotonic_ns()
-                    if now_ns > give_up_ns and not page.view.met:
-                        raise SessionError(f"no site of session {session!r} answered within {timeout_s:g} s")
-                    clock.sleep_until(now_ns + POLL_NS)
-        if not interrupt.requested():
-            say(f"session {session} has ended")
-            return 0
-        return interrupt.exit_code
+@contextmanager
+def show_on_page(
+    options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
+) -> Iterator[tuple[SessionView, Callable[[], None]]]:
+    """The `SessionOnlooker` of a page."""
+    with serve_page(bus, clock, session, options, say, ends=False) as page:
+        yield page.view, lambda: None

@@ -253,11 +253,7 @@ class SessionFrames:
         }
 
     def _add_energy(self) -> None:
-        view = self._view
-        if view.energy is None:
-            return
-        course = view.energy.advance({name: site.complete for name, site in view.sites.items()})
-        if course is None:
+        if (course := self._view.advance_energy()) is None:
             return
         for t_s, V, supplied in zip(*(column.tolist() for column in course), strict=True):
             if t_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:

@@ -14,7 +14,7 @@ import msgspec
 from recorder.backfill import GapRepair
 from recorder.inbound_queue import InboundMessage, InboundQueue
 from recorder.site_reception import SiteReception
-from trilat_net.analysis.certificate.running_energy import RunningEnergy
+from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy
 from trilat_net.analysis.record_window import RecordWindow, make_windows
 from trilat_net.core.live_hand import TAKEN
 from trilat_net.core.site_setup import Layout
@@ -182,6 +182,11 @@ class SessionView:
             for channel, message, _ in site.repair.poll(now_ns, alive=not self.silent(site)):
                 self._keep(name, site, channel, message.content)
         self._follow_timeline()
+
+    def advance_energy(self) -> EnergyCourse | None:
+        """Returns V at the ticks of which all records have come since the last call; None without any."""
+        complete = {name: site.complete for name, site in self.sites.items()}
+        return None if self.energy is None else self.energy.advance(complete)
 
     def _meet(self) -> None:
         for info in self._query.poll():

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
+    from sites.demo_session import run
     from sites.hand_session import hand
-    from sites.live_run import run
     from sites.network_benchmark import ping_benchmark
     from sites.running_session import doctor, session, start
 
@@ -116,7 +116,7 @@ _MODULES = {
     "read_member_keys": "trilat_net.net.member_keys",
     "read_template": "trilat_net.scenario",
     "rerun": "trilat_net.execution.rerun",
-    "run": "sites.live_run",
+    "run": "sites.demo_session",
     "session": "sites.running_session",
     "sign_log": "trilat_net.log.log_signature",
     "start": "sites.running_session",
