@@ -16,7 +16,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from sites.hand_session import open_hand
+from sites.running_session import open_hand
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock, SystemClock

@@ -12,25 +12,28 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from trilat_net import process
 from trilat_net.core.jit import is_core_cached
 from trilat_net.errors import RunFailed, SessionError, UsageError
-from trilat_net.net.clock import Clock
+from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
     ENCRYPTED,
     Connection,
     find_endpoint_addresses,
     is_loopback,
+    resolve_member_connection,
     secure_connection,
 )
 from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+from trilat_net.results import Result
 
 from .session_ping import PingResult, ping_session
 
@@ -282,3 +285,56 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
         yield DoctorFinding(
             "core", "warn", "not yet compiled: the first session here begins half a minute later"
         )
+
+
+@dataclass(frozen=True, repr=False)
+class DoctorReport(Result):
+    """What stands in the way of a session on this machine, and what does not."""
+
+    findings: list[DoctorFinding]
+
+    def headline(self) -> str:
+        """Returns how many findings warn or fail."""
+        states = [finding.state for finding in self.findings]
+        return f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the findings as of `trilat doctor --json`."""
+        return {"findings": self.to_rows()}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per finding."""
+        return [finding._asdict() for finding in self.findings]
+
+
+def doctor(
+    *,
+    listen: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+    session: str | None = None,
+    folder: str | Path = "runs",
+    insecure: bool = False,
+) -> DoctorReport:
+    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat doctor`.
+
+    >>> "clock" in {finding.check for finding in tn.doctor().findings}
+    True
+
+    Args:
+        listen: endpoints to listen at.
+        connect: endpoints to connect to.
+        router: endpoints of routers.
+        keys: folder of a member's keys.
+        session: a session whose members are asked for their clocks.
+        folder: where results would go.
+        insecure: whether everybody on the network is trusted.
+
+    Raises:
+        UsageError: an endpoint or the keys cannot be used.
+    """
+    connection = resolve_member_connection(listen, connect, router)
+    place = None if keys is None else Path(keys)
+    found = examine_machine(connection, place, Path(folder), session, SystemClock(), insecure=insecure)
+    return DoctorReport(list(found))

@@ -21,7 +21,7 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from sites.session_stop import order_sites
+from sites.running_session import order_sites
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six

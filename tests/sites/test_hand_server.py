@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sites.hand_server import MESSAGES_KEPT, HandServer
-from sites.hand_session import open_hand
+from sites.running_session import open_hand
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, free_hand

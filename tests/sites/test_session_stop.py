@@ -10,7 +10,7 @@ from rich.console import Console
 from live.session_frames import SessionFrames, show_event
 from live.terminal_watch import SessionWatch
 from sites.monitor import SiteRow, describe_row, frame_alarms
-from sites.session_stop import order_sites, stop_session
+from sites.running_session import order_sites, stop_session
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.ticks import LifeAlarm, LifeReason

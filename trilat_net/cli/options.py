@@ -262,7 +262,7 @@ def resolve_connection(
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     connection = resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
-    return secure_connection(connection, read_keys(keys), insecure=insecure)
+    return secure_connection(connection, keys, insecure=insecure)
 
 
 def resolve_client_connection(

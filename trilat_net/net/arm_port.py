@@ -22,7 +22,6 @@ from .access_rules import OPERATOR
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
-from .member_keys import read_member_keys
 from .membership import new_boot
 from .requests import ArmEnable, ArmMeasurement
 from .site_port import SitePort
@@ -62,8 +61,7 @@ class OutsidePort(SitePort):
         Raises:
             UsageError: an endpoint cannot be used.
         """
-        known = None if keys is None else read_member_keys(Path(keys))
-        reached = secure_connection(Connection((), list(connect)), known, insecure=False)
+        reached = secure_connection(Connection((), list(connect)), keys, insecure=False)
         reached.require(cls.member or site)
         bus = ZenohBus([], reached.reach(list(connect)), own=reached.own)
         return cls(bus, SystemClock(), session, site)

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SessionError, UsageError
@@ -122,13 +123,19 @@ class Connection:
         return self
 
 
-def secure_connection(connection: Connection, keys: "MemberKeys | None", *, insecure: bool) -> Connection:
-    """Returns a connection with a member's keys; without any it must not be open to a network.
+def secure_connection(
+    connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
+) -> Connection:
+    """Returns a connection with a member's keys, or those of a folder; else it must not be open to a network.
 
     Raises:
-        UsageError: an endpoint is not encrypted, or reached from other machines without keys, or the user's
-            own settings contradict the keys.
+        UsageError: an endpoint is not encrypted, or reached from other machines without keys, the user's own
+            settings contradict the keys, or these cannot be used.
     """
+    if isinstance(keys, str | Path):
+        from .member_keys import read_member_keys  # loads what makes certificates
+
+        keys = read_member_keys(keys)
     own, named = connection.own, (*connection.listen, *(connection.connect or ()))
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
@@ -187,9 +194,9 @@ def resolve_member_connection(
     listen: Sequence[str] | None,
     connect: Sequence[str] | None,
     routers: Sequence[str] | None,
-    file: ZenohFile | None,
-    listen_else: Sequence[str],
-    connect_else: Sequence[str] | None,
+    file: ZenohFile | None = None,
+    listen_else: Sequence[str] = (),
+    connect_else: Sequence[str] | None = None,
 ) -> Connection:
     """Returns the connection of a site, a recorder or a tool.
 
