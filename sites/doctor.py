@@ -35,14 +35,14 @@ from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, Memb
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 
-from .session_ping import PingResult, ping_session
+from .session_ping import ping_session
 
 FindingState = Literal["ok", "warn", "fail"]
 ENDS_SOON = timedelta(days=7)
 CONNECT_S = 2.0
 LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
 """Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
-STEADY_NS, STEP_NS, BOUND_NS = 100_000_000, 1_000_000, 1_000_000
+STEADY_NS, STEP_NS, BOUND_US = 100_000_000, 1_000_000, 1_000
 """How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
 PINGS = 20
 
@@ -233,19 +233,15 @@ def examine_offsets(connection: Connection, clock: Clock, session: str) -> Itera
     except (RunFailed, SessionError, UsageError) as error:
         yield DoctorFinding("clock", "fail", str(error))
         return
-    for reach in ping.reached() if ping else ():
-        yield _describe_offset(reach)
-
-
-def _describe_offset(reach: PingResult) -> DoctorFinding:
-    if reach.shared:
-        return DoctorFinding("clock", "ok", f"{reach.info.member} has the same clock")
-    if reach.estimate is None:
-        return DoctorFinding("clock", "warn", f"{reach.info.member} answered too few pings")
-    estimate = reach.estimate
-    bound_ns = estimate.bound_at(estimate.at_ns, estimate.offset_ns)
-    text = f"{reach.info.member} is {estimate.offset_ns / 1e9:+.6f} s, known to {bound_ns / 1e3:.0f} us"
-    return DoctorFinding("clock", "ok" if bound_ns <= BOUND_NS else "warn", text)
+    for facts in ping.members if ping else ():
+        if facts["same_clock"]:
+            yield DoctorFinding("clock", "ok", f"{facts['member']} has the same clock")
+        elif "offset_ns" not in facts:
+            yield DoctorFinding("clock", "warn", f"{facts['member']} answered too few pings")
+        else:
+            offset_s, bound_us = facts["offset_ns"] / 1e9, facts["bound_us"]
+            text = f"{facts['member']} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            yield DoctorFinding("clock", "ok" if bound_us <= BOUND_US else "warn", text)
 
 
 _RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"

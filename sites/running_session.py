@@ -33,7 +33,7 @@ from trilat_net.scenario import Scenario, embedded_names_reader, find_site, pars
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators import find_live_hand
 
-from .session_ping import PingReport, describe_ping, ping_session
+from .session_ping import PingReport, ping_session
 
 GATHER_NS = 500_000_000
 """Time for further sites to answer, after the first one of a session that some may have left."""
@@ -106,9 +106,9 @@ class RunningSession:
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
         """Measures round trips, clock offsets and links of the session; as `trilat ping`."""
-        probe = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
-        assert probe is not None  # nothing stops it
-        return describe_ping(self.name, probe)
+        found = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
+        assert found is not None  # nothing stops it
+        return found
 
     @contextmanager
     def _hold(self, site: str, source: str, timeout_s: float) -> Iterator[Hand]:
