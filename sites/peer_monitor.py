@@ -52,10 +52,6 @@ class PeerMonitor:
         """True if there is a recorder that has stored all, and none is present that has not."""
         return bool(self.stored) and self.recorders <= self.stored
 
-    def admit(self, boots: Mapping[str, int]) -> None:
-        """Sets the boots that belong to the session."""
-        self.boots = boots
-
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Takes events and presence; publishes who comes, and who is lost without an end event."""
         coming = [event for inbox in self._events.values() for event in self._read(inbox, publisher, t_ns)]

@@ -91,57 +91,52 @@ def take_part(parts: SiteParts) -> int:
     give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
     if parts.arm is not None and not parts.arm.wait_for_first(stopped, give_up_ns, parts.say):
         return parts.interrupt.exit_code
-    running = JoiningSite(parts).join(give_up_ns)
+    running = join_session(parts, give_up_ns)
     return parts.interrupt.exit_code if running is None else running.run().leave()
 
 
-class JoiningSite:
-    """A site that has declared itself alive and waits for the epoch."""
+def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
+    """Declares a site alive, and waits for the others and the epoch; None if a signal comes first.
 
-    def __init__(self, parts: SiteParts) -> None:
-        scenario, options = parts.scenario, parts.options
-        needs = {"needs_recorder": options.needs_recorder}
-        info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
-        late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
-        self._parts = parts
-        keep = parts.buffer.channels[topics.EVENT].keep
-        self._publisher = EventPublisher(parts.bus, options.session, info, keep)
-        meets = (parts.bus, parts.clock, options.session, self._publisher)
-        self._joining = SessionJoin(*meets, scenario.names, late)
-
-    def join(self, give_up_ns: int) -> "RunningSite | None":
-        """Waits for the others; None if a signal comes first.
-
-        Raises:
-            SessionError: the session did not begin in time, or this site cannot be part of it.
-        """
-        parts, membership, pinger = self._parts, self._joining.membership, self._joining.pinger
-        parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
-        begins = 0
-        while not parts.interrupt.requested():
-            epoch = self._joining.poll()
-            if epoch is not None:
-                return RunningSite(parts, self._publisher, pinger, epoch)
-            if self._joining.coming_at != begins:
-                begins = self._joining.coming_at
-                parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
-            now_ns = parts.clock.monotonic_ns()
-            if now_ns > give_up_ns:
-                missing = membership.missing()
-                reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
-                reason = self._joining.reason or reason
-                for member, problem in membership.unreadable.items():
-                    reason += f"; the answer of {member} cannot be read: {problem}"
-                raise SessionError(
-                    f"{parts.name} waited {parts.options.join_timeout_s:g} s in session "
-                    f"{parts.options.session!r}: {reason}"
-                )
-            parts.clock.sleep_until(now_ns + pinger.pause_ns(POLL_NS))
-        return None
+    Raises:
+        SessionError: the session did not begin in time, or this site cannot be part of it.
+    """
+    scenario, options = parts.scenario, parts.options
+    needs = {"needs_recorder": options.needs_recorder}
+    info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
+    late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
+    keep = parts.buffer.channels[topics.EVENT].keep
+    publisher = EventPublisher(parts.bus, options.session, info, keep)
+    joining = SessionJoin(parts.bus, parts.clock, options.session, publisher, scenario.names, late)
+    membership, pinger = joining.membership, joining.pinger
+    parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
+    begins = 0
+    while not parts.interrupt.requested():
+        epoch = joining.poll()
+        if epoch is not None:
+            return RunningSite(parts, publisher, pinger, epoch)
+        if joining.coming_at != begins:
+            begins = joining.coming_at
+            parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
+        now_ns = parts.clock.monotonic_ns()
+        if now_ns > give_up_ns:
+            missing = membership.missing()
+            reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+            reason = joining.reason or reason
+            for member, problem in membership.unreadable.items():
+                reason += f"; the answer of {member} cannot be read: {problem}"
+            waited = f"{parts.name} waited {options.join_timeout_s:g} s in session {options.session!r}"
+            raise SessionError(f"{waited}: {reason}")
+        parts.clock.sleep_until(now_ns + pinger.pause_ns(POLL_NS))
+    return None
 
 
 class RunningSite:
-    """A site between the epoch and its last tick; the `LoopIO` of its loop."""
+    """A site between the epoch and its last tick.
+
+    Its loop calls `use_slack` after a block of records, and again after the next tick if it returns true, in a
+    quarter of a period.
+    """
 
     def __init__(self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch) -> None:
         scenario, site = parts.scenario, parts.site
@@ -155,7 +150,7 @@ class RunningSite:
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
-        parts.monitor.admit(epoch.boots)
+        parts.monitor.boots = epoch.boots
         boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
         peers = [
             PeerClock(
@@ -228,7 +223,7 @@ class RunningSite:
             self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
-        """See `LoopIO`."""
+        """True if the run ends before its next tick."""
         parts = self._parts
         for input_ in (parts.arm, parts.switch):
             if input_ is not None:
@@ -237,7 +232,7 @@ class RunningSite:
         return bool(ended) or parts.interrupt.requested() or self._given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """See `LoopIO`."""
+        """Steps the site; None if its law failed, which ends the run."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.take(k)
@@ -249,7 +244,10 @@ class RunningSite:
         return self._output
 
     def attend(self, k: int, t_ns: int) -> None:
-        """See `LoopIO`: answers queries, follows the leader's grid, publishes news."""
+        """Answers queries, follows the leader's grid, publishes news: ten times a second, after statistics.
+
+        These are of tick k, whose nominal time is given.
+        """
         grid_ns = self._timing.schedule.deadline(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
@@ -338,7 +336,7 @@ class RunningSite:
         )
 
     def report(self, output: TickRecord) -> None:
-        """See `LoopIO`."""
+        """Tells of a tick that took a command in, or at which the mode changed."""
         name, at = self._parts.name, {"t_ns": output.t_ns, "ticks": output.tick}
         if skipped := count_skipped_ticks(output.cmd):  # told together, in `attend`
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")

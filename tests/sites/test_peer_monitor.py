@@ -24,7 +24,7 @@ class Desk:
         bus = self.network.join()
         self._publisher = EventPublisher(bus, "t", told("m1", 1))
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
-        self.company.admit(BOOTS)
+        self.company.boots = BOOTS
 
     def comes(self, member: str, boot: int) -> LocalBus:
         bus = self.network.join()

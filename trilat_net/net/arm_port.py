@@ -1,8 +1,10 @@
-"""Connections of an external arm's program (`plant = "external"`) and of its dead-man switch to their site.
+"""Connections of programs beside a site: of an external arm (`plant = "external"`) and its dead-man switch.
 
 Invariant: the arm sends its position as often as it likes; the torque to apply stands in the record that the
 site publishes at every tick, so the arm receives exactly what the log holds. Without a valid torque,
-`torque` returns None and the arm must brake.
+`torque` returns None and the arm must brake. A record of another start of the site than the first one met is
+passed over, and so is one that is older than the newest or too far ahead; what cannot be read is a
+stranger's, and changes nothing.
 
     with ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:
         while not port.over:
@@ -12,24 +14,122 @@ site publishes at every tick, so the arm receives exactly what the log holds. Wi
             robot.wait()
 """
 
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 from ..core.ticks import LifeReason
+from ..errors import WireError
 from . import topics
 from .access_rules import OPERATOR
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
-from .membership import new_boot
-from .requests import ArmEnable, ArmMeasurement
-from .site_port import SitePort
-from .wire import encode
+from .membership import new_boot, read_events
+from .messages import State
+from .requests import ArmEnable, ArmMeasurement, Request
+from .wire import decode, encode, split_states
 from .zenoh_bus import ZenohBus
 
+FRESH_NS = 100_000_000
+"""Age at which a record is no longer the present: the site is late, or gone."""
+AHEAD_NS = 1_000_000_000
+"""A record may be so much later than the one before than the time that has passed since."""
 BRAKE_NS = 100_000_000
 """Time of a fault, or since a dead-man switch was let go, after which the brakes are to hold the arm."""
+
+
+R = TypeVar("R", bound=Request)
+
+
+class SiteSender:
+    """Sends a site numbered messages of one kind, under one of its keys.
+
+    Attributes:
+        boot: names this start of the sender.
+        number: of the newest message; -1 before the first.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, site: str, channel: str, boot: int) -> None:
+        self.boot, self.number = boot, -1
+        self._clock, self._site = clock, site
+        self._publish = bus.publisher(topics.key(session, site, channel))
+
+    def send(self, kind: type[R], **fields: object) -> R:
+        """Sends the next message, and returns it."""
+        about = {"site": self._site, "boot": self.boot, "n": self.number + 1}
+        message = kind(**about, sent_ns=self._clock.monotonic_ns(), **fields)  # type: ignore[call-arg,arg-type]
+        self.number += 1
+        self.repeat(message)
+        return message
+
+    def repeat(self, message: R) -> None:
+        """Sends a message again."""
+        self._publish(encode(message))
+
+
+class SitePort:
+    """The connection of a program to one site; a context, which closes it."""
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
+        self._bus, self._clock, self._site = bus, clock, site
+        self._record: State | None = None
+        self._came_ns = 0
+        self._present = self._gone = False
+        self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64)
+        self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
+        self._presence = bus.presence(topics.presence_key(session, site))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bus.close()
+
+    @property
+    def record(self) -> State | None:
+        """The newest record of the site; None before the first."""
+        self._read_messages()
+        return self._record
+
+    @property
+    def fresh(self) -> bool:
+        """True if the newest record is of now: not before the first tick, after the run, or too old."""
+        record = self.record
+        if record is None or self._gone or record.mode == "diverged":
+            return False
+        return self._clock.monotonic_ns() - self._came_ns <= FRESH_NS
+
+    @property
+    def over(self) -> bool:
+        """True once the site's run has ended, or the site is gone."""
+        self._read_messages()
+        return self._gone
+
+    def _follows_last(self, record: State, came_ns: int) -> bool:
+        """True if a record is later than the newest one, of the same start, and no later than it can be."""
+        last = self._record
+        if last is None:
+            return True
+        newer = record.boot == last.boot and record.tick > last.tick and record.t_ns > last.t_ns
+        return newer and record.t_ns - last.t_ns <= came_ns - self._came_ns + AHEAD_NS
+
+    def _read_messages(self) -> None:
+        while (message := self._records.poll()) is not None:
+            try:
+                (payload,) = deque(split_states(message[0]), maxlen=1)
+                record = decode(payload, State)
+            except WireError:
+                continue  # a stranger's
+            if self._follows_last(record, message[1]):
+                self._record, self._came_ns = record, message[1]
+        for event in read_events(self._events):
+            if event.kind == "end" and self._record is not None and event.boot == self._record.boot:
+                self._gone = True
+        for _, alive in topics.read_presence(self._presence):
+            self._present = self._present or alive
+            self._gone = self._gone or (self._present and not alive)
 
 
 class OutsidePort(SitePort):
@@ -42,9 +142,7 @@ class OutsidePort(SitePort):
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         super().__init__(bus, clock, session, site)
-        self._boot = new_boot()
-        self._n = 0
-        self._publish = bus.publisher(topics.key(session, site, self.channel))
+        self._sender = SiteSender(bus, clock, session, site, self.channel, new_boot())
 
     @classmethod
     def connected(
@@ -80,11 +178,7 @@ class EnablePort(OutsidePort):
 
     def send(self, *, held: bool) -> None:
         """Says that somebody holds it, or has let it go."""
-        now_ns = self._clock.monotonic_ns()
-        self._publish(
-            encode(ArmEnable(site=self._site, boot=self._boot, n=self._n, held=held, sent_ns=now_ns))
-        )
-        self._n += 1
+        self._sender.send(ArmEnable, held=held)
 
 
 class ArmPort(OutsidePort):
@@ -104,17 +198,8 @@ class ArmPort(OutsidePort):
         Raises:
             ValueError: tau_x is not as long as q, or not finite.
         """
-        message = ArmMeasurement(
-            site=self._site,
-            boot=self._boot,
-            n=self._n,
-            q=[float(angle) for angle in q],
-            qd=[float(speed) for speed in qd],
-            sent_ns=self._clock.monotonic_ns(),
-            tau_x=[float(torque) for torque in tau_x],
-        )
-        self._n += 1
-        self._publish(encode(message))
+        measured = {"q": q, "qd": qd, "tau_x": tau_x}
+        self._sender.send(ArmMeasurement, **{name: [*map(float, v)] for name, v in measured.items()})
 
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, N m per joint; None if the arm must brake.

@@ -13,19 +13,23 @@ from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.live_hand import GRIP_NS, SILENCE_NS, HandInForce
 from ..errors import UsageError
 from . import topics
+from .arm_port import SitePort, SiteSender
 from .bus import Bus
 from .clock import Clock
 from .membership import new_boot
 from .messages import State
 from .requests import HandMessage
-from .site_port import SitePort
-from .wire import encode
 
 HEARTBEAT_S = SILENCE_NS / 4e9
 """Between two messages of a hand that rests."""
 _DOES = {TorqueKind.LIVE_TIP: "move", TorqueKind.LIVE_JOINT: "turn", TorqueKind.LIVE_FORCE: "push"}
 _STEP = 1e-6
 """Of the derivative of the arm's place, s."""
+
+
+def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
+    """Returns what sends a site the messages of a hand; its boot is above 0 and exact in a record."""
+    return SiteSender(bus, clock, session, site, topics.HAND, new_boot() % (2**32 - 1) + 1)
 
 
 class Hand(SitePort):
@@ -53,11 +57,9 @@ class Hand(SitePort):
     ) -> None:
         super().__init__(bus, clock, session, site)
         self._operator, self._place, self._source = operator, place, source
-        self._boot = new_boot() % (2**32 - 1) + 1
-        self._publish = bus.publisher(topics.key(session, site, topics.HAND))
+        self._sender = make_hand_sender(bus, clock, session, site)
         self._message: HandMessage | None = None
         self._lock, self._ended = threading.Lock(), threading.Event()
-        self._sent = -1
         self._heart = threading.Thread(target=self._beat, daemon=True)
         self._heart.start()
 
@@ -94,20 +96,19 @@ class Hand(SitePort):
         with self._lock:
             held, self._message = self._message, None
             if held is not None:
-                self._sent += 1
-                self._publish(encode(self._make_message(grip=False)))
+                self._sender.send(HandMessage, source=self._source, grip=False)
 
     @property
     def holds(self) -> bool:
         """True if the newest record says that this hand holds the arm."""
         hand = self.in_force
-        return hand is not None and hand.source == self._boot
+        return hand is not None and hand.source == self._sender.boot
 
     @property
     def number(self) -> int:
         """Number of its newest message that the newest record follows; -1: it does not hold the arm."""
         hand = self.in_force
-        return -1 if hand is None or hand.source != self._boot else hand.number
+        return -1 if hand is None or hand.source != self._sender.boot else hand.number
 
     @property
     def in_force(self) -> HandInForce | None:
@@ -163,20 +164,13 @@ class Hand(SitePort):
         if not all(map(math.isfinite, goal)):
             raise UsageError(f"a hand can {does} to finite numbers, not to {goal}")
         with self._lock:
-            self._sent += 1
-            goals = {"force": goal} if does == "push" else {"target": goal}
-            self._message = self._make_message(**goals)
-            self._publish(encode(self._message))
-            return self._sent
-
-    def _make_message(self, **fields: object) -> HandMessage:
-        now_ns = self._clock.monotonic_ns()
-        about = {"site": self._site, "boot": self._boot, "source": self._source}
-        return HandMessage(**about, n=self._sent, sent_ns=now_ns, **fields)  # type: ignore[arg-type]
+            goals = {"force" if does == "push" else "target": goal}
+            self._message = self._sender.send(HandMessage, source=self._source, **goals)
+            return self._sender.number
 
     def _beat(self) -> None:
         """Repeats the newest message, so that a hand at rest is heard."""
         while not self._ended.wait(HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:
-                    self._publish(encode(self._message))
+                    self._sender.repeat(self._message)
