@@ -134,8 +134,8 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
 class RunningSite:
     """A site between the epoch and its last tick.
 
-    Its loop calls `use_slack` after a block of records, and again after the next tick if it returns true, in a
-    quarter of a period.
+    The loop calls `use_slack` after a block of records, and again after the next tick if it returns true, in
+    a quarter of a period.
     """
 
     def __init__(self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch) -> None:

@@ -47,7 +47,7 @@ def live_command(
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
     """
-    from live.live_session import LONGEST_S, PageOptions, attend_with_page, show_on_page
+    from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
     from live.terminal_watch import watch_session
 
     from ..net.clock import SystemClock

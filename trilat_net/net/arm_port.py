@@ -30,7 +30,6 @@ from .membership import new_boot, read_events
 from .messages import State
 from .requests import ArmEnable, ArmMeasurement, Request
 from .wire import decode, encode, split_states
-from .zenoh_bus import ZenohBus
 
 FRESH_NS = 100_000_000
 """Age at which a record is no longer the present: the site is late, or gone."""
@@ -160,9 +159,7 @@ class OutsidePort(SitePort):
             UsageError: an endpoint cannot be used.
         """
         reached = secure_connection(Connection((), list(connect)), keys, insecure=False)
-        reached.require(cls.member or site)
-        bus = ZenohBus([], reached.reach(list(connect)), own=reached.own)
-        return cls(bus, SystemClock(), session, site)
+        return cls(reached.require(cls.member or site).open(), SystemClock(), session, site)
 
 
 class EnablePort(OutsidePort):

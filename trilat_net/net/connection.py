@@ -110,6 +110,11 @@ class Connection:
             return list(endpoints)
         return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
 
+    def open(self) -> ZenohBus:
+        """Opens it; see `ZenohBus`."""
+        listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
+        return ZenohBus(listen, connect, self.mode, self.own)
+
     def require(self, member: str) -> "Connection":
         """Returns itself.
 
@@ -290,10 +295,7 @@ def open_bus(
     begun_ns, printed = clock.monotonic_ns(), False
     while not stopped():
         try:
-            listen, connect = (
-                connection.reach(side or ()) for side in (connection.listen, connection.connect)
-            )
-            return ZenohBus(listen, connect, connection.mode, connection.own)
+            return connection.open()
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None
