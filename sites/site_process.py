@@ -1,10 +1,11 @@
 """One site as one process: it joins a session, runs, and leaves.
 
 Invariant: a site declares itself alive only when its subscriptions are declared and its step is compiled.
-Until the epoch its arm is braked; at the end it stays until every recorder has all records, or for some
-seconds (`shutdown`).
+Until the epoch its arm is braked; at the end it stays until every recorder present has all messages that it
+can have, or for some seconds.
 """
 
+import signal
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
@@ -18,12 +19,13 @@ from trilat_net.core.ticks import (
     Mode,
     TickInput,
     TickRecord,
+    describe_divergence,
     describe_mode,
     find_alarm,
     find_life_reason,
     tick_ns,
 )
-from trilat_net.errors import LawFailed, RunFailed, SessionError
+from trilat_net.errors import LawFailed, PeerLeft, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -41,7 +43,6 @@ from trilat_net.scenario.run_changes import count_skipped_ticks
 from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
-from .shutdown import LeavingSite
 from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
@@ -50,6 +51,14 @@ NOBODY = -1
 """No start of a peer that is not there yet."""
 STATUS_TICKS_S = 5
 """Between two lines that say how a site does, s."""
+LINGER_NS = 5 * NS_PER_S
+"""Longest wait after the last query of a recorder."""
+LAST_EVENT_NS = 100_000_000
+"""Wait for the last event of a recorder that is gone."""
+LEAVE_TIMEOUT_NS = 2 * NS_PER_S
+"""Wait after a recorder that has everything is gone: its process ends."""
+QUERIED_NS = NS_PER_S
+"""A recorder that has sent a query within this time is present, whatever its token says."""
 
 
 def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]) -> int:
@@ -92,7 +101,10 @@ def take_part(parts: SiteParts) -> int:
     if parts.arm is not None and not parts.arm.wait_for_first(stopped, give_up_ns, parts.say):
         return parts.interrupt.exit_code
     running = join_session(parts, give_up_ns)
-    return parts.interrupt.exit_code if running is None else running.run().leave()
+    if running is None:
+        return parts.interrupt.exit_code
+    running.run()
+    return running.leave()
 
 
 def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
@@ -144,6 +156,7 @@ class RunningSite:
         self._failure: RunFailed | None = None
         self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
+        self._ticks, self._t_ns = 0, -1
         self._status_s = self._told_s = 0
         self._given_up, self._held_s = False, -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
@@ -180,7 +193,7 @@ class RunningSite:
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
         )
 
-    def run(self) -> LeavingSite:
+    def run(self) -> None:
         """Runs every tick, or until the run ends."""
         parts = self._parts
         self._publish_setup()
@@ -190,11 +203,10 @@ class RunningSite:
             ticks = parts.scenario.ticks(name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
-            output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
-        if output is not None:
+            self._output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
+        if (output := self._output) is not None:
             self._tell_skipped(output.tick, output.t_ns)
-        unheard = [meter.peer.name for meter in self._timing.meters if meter.unheard]
-        return LeavingSite(parts, self._publisher, output, self._failure, unheard)
+            self._ticks, self._t_ns = output.tick + 1, output.t_ns
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
@@ -366,3 +378,81 @@ class RunningSite:
         shown = (parts.options.session, parts.name, mode.name.lower(), output.mem, len(output.q_des), lost)
         if (alarm := find_alarm(*shown)) is not None:
             parts.say(f"*** {alarm}")
+
+    def leave(self) -> int:
+        """Publishes the end, waits for the recorders, and returns the exit code.
+
+        Raises:
+            RunFailed: the run ended badly, here or at a peer; as `PeerLeft`, without a peer.
+        """
+        parts, interrupt, output = self._parts, self._parts.interrupt, self._output
+        kind = "failed"
+        if output is not None and output.mode is Mode.DIVERGED:
+            kind, self._failure = "diverged", RunFailed(describe_divergence(parts.name, output))
+        if self._failure is not None:
+            self._publish(kind, str(self._failure))
+        if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
+            self._publish("law", hiccups)
+            parts.say(hiccups)
+        about, why = self._find_cause()
+        if unheard := [meter.peer.name for meter in self._timing.meters if meter.unheard]:
+            why += f"; {', '.join(unheard)} did not hear it at the end"
+        self._publish("end", f"{parts.name} made {self._ticks} ticks{why}", about=about)
+        code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
+        parts.monitor.watch(self._publisher, self._t_ns)
+        if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
+            self._await_recorders()
+        dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
+        parts.say(
+            f"{self._ticks} ticks, {parts.stats.overruns} of them late by a period or more"
+            + (f"; dropped: {dropped}" if dropped else "")
+        )
+        if self._failure is not None:
+            raise self._failure
+        if parts.monitor.ended_by:
+            raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
+        if not code and self._away:
+            raise PeerLeft(f"{parts.name} made {self._ticks} ticks; {self._away}, and did not come back")
+        return code
+
+    @property
+    def _away(self) -> str:
+        """What sites that have left said of it, "" if all are there."""
+        return "; ".join(text for _, text in self._parts.monitor.away.values())
+
+    def _find_cause(self) -> tuple[str, str]:
+        """Returns whose end it was if the run ends before its time, and why, to be put behind a sentence."""
+        parts, monitor = self._parts, self._parts.monitor
+        if self._failure is not None:
+            return parts.name, f": {self._failure}"
+        if monitor.ended_by:
+            return monitor.ended_member, f": {monitor.ended_by}"
+        if parts.changes.stopped:
+            return "", ", as many as it was asked for"
+        if self._ticks == parts.scenario.ticks(parts.name):
+            return "", ""
+        if parts.interrupt.requested():
+            return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
+        return next(iter(monitor.away), ""), f": {self._away}"
+
+    def _publish(self, kind: str, text: str, about: str = "") -> None:
+        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
+
+    def _await_recorders(self) -> None:
+        """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""
+        parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
+        interrupted = parts.interrupt.requested
+        give_up_ns, queried_ns = clock.monotonic_ns() + LINGER_NS, 0
+        while clock.monotonic_ns() < give_up_ns and not (monitor.all_stored and interrupted()):
+            while parts.buffer.answer_query():
+                queried_ns = clock.monotonic_ns()
+                give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
+            self._publisher.answer_queries()
+            monitor.watch(self._publisher, self._t_ns)
+            gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
+            if gone and (monitor.stored or interrupted()):  # else one may come back whose connection broke
+                patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
+            if monitor.read_stored(self._ticks) and monitor.all_stored:
+                give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)

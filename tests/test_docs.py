@@ -11,7 +11,7 @@ import pytest
 
 from recorder import backfill, record_process, session_recording
 from recorder.play import pace
-from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
+from sites import change_server, external_arm, law_watchdog, retransmit_buffer, site_process
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
@@ -59,8 +59,8 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),
     ("design.md", "an epoch 500 ms ahead", 500, session.EPOCH_AHEAD_NS / 1e6),
     ("design.md", "150 ms before the epoch", 150, session.DECIDE_NS / 1e6),
-    ("design.md", "at most 5 s from the last question", 5, shutdown.LINGER_NS / 1e9),
-    ("design.md", "and 2 s more", 2, shutdown.LEAVE_TIMEOUT_NS / 1e9),
+    ("design.md", "at most 5 s from the last question", 5, site_process.LINGER_NS / 1e9),
+    ("design.md", "and 2 s more", 2, site_process.LEAVE_TIMEOUT_NS / 1e9),
     ("design.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("design.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
