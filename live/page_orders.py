@@ -166,6 +166,7 @@ class PageHands:
             if not order.grip:
                 return
             self._senders[site] = make_hand_sender(self._bus, self._clock, self._session, site)
+            self._senders[site].number = 0  # a page counts from 1
         (self._held.add if order.grip else self._held.discard)(site)
         goals = {"force" if pushes else "target": order.to if order.grip else []}
         self._senders[site].send(HandMessage, source=self._source, grip=order.grip, **goals)

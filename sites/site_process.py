@@ -266,18 +266,21 @@ class RunningSite:
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
         self._watch_members(t_ns)
         self._come_again(t_ns)
-        for news in () if self._parts.hand is None else self._parts.hand.take_news():
-            self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
-            self._parts.say(news.text.partition(": ")[2])
-        for tick, text in self._parts.changes.marks:
-            at_ns = tick_ns(tick, self._parts.site.rate_hz)
-            self._publisher.publish("mark", text, t_ns=at_ns, ticks=tick)
-        self._parts.changes.marks.clear()
+        if (hand := self._parts.hand) is not None:
+            for _, text in hand.news:
+                self._parts.say(text.partition(": ")[2])
+            self._tell("hand", hand.news)
+        self._tell("mark", self._parts.changes.marks)
         self._tell_skipped(k, t_ns)
         self._tell_waiting(k, t_ns)
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))
+
+    def _tell(self, kind: str, news: list[tuple[int, str]]) -> None:
+        for tick, text in news:
+            self._publisher.publish(kind, text, t_ns=tick_ns(tick, self._parts.site.rate_hz), ticks=tick)
+        news.clear()
 
     def _tell_skipped(self, k: int, t_ns: int) -> None:
         """Publishes which ticks up to tick k were not made."""

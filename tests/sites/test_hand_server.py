@@ -177,6 +177,4 @@ def test_a_flood_is_read_a_little_at_a_time_and_moves_nobody() -> None:
     assert hand.source == 5
     assert hand.number == 99
     assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}
-    assert [news.text for news in served.server.take_news()] == [
-        "m1: hand 00000005 takes hold at t = 0.000 s"
-    ]
+    assert [text for _, text in served.server.news] == ["m1: hand 00000005 takes hold at t = 0.000 s"]

@@ -202,8 +202,10 @@ def resolve_member_connection(
     file: ZenohFile | None = None,
     listen_else: Sequence[str] = (),
     connect_else: Sequence[str] | None = None,
+    *,
+    routes: bool = False,
 ) -> Connection:
-    """Returns the connection of a site, a recorder or a tool.
+    """Returns the connection of a site, a recorder or a tool; or of a router, which `routes`.
 
     With a router, named by `--router` or by a file of mode "client", a member listens nowhere and connects to
     nothing else. `listen_else` and `connect_else` hold where neither an option nor the file names endpoints.
@@ -212,6 +214,10 @@ def resolve_member_connection(
         UsageError: options and file contradict each other.
     """
     file = file or ZenohFile("")
+    if routes:
+        if file.mode not in ("", "router"):
+            raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
+        return _join_options(listen, connect, file, "router", listen_else, ())
     if file.mode == "router":
         raise UsageError(f"{file.source}: mode: router is for `trilat router`; here it is peer or client")
     if not routers and file.mode != "client":
@@ -232,23 +238,6 @@ def resolve_member_connection(
     if not chosen:
         raise UsageError(f"{where}: there is no router to connect to; name it with --router")
     return Connection((), chosen, "client", file.settings)
-
-
-def resolve_router_connection(
-    listen: Sequence[str] | None,
-    connect: Sequence[str] | None,
-    file: ZenohFile | None,
-    listen_else: Sequence[str],
-) -> Connection:
-    """Returns the connection of a router; arguments as for `resolve_member_connection`.
-
-    Raises:
-        UsageError: options and file contradict each other.
-    """
-    file = file or ZenohFile("")
-    if file.mode not in ("", "router"):
-        raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
-    return _join_options(listen, connect, file, "router", listen_else, ())
 
 
 def _join_options(
