@@ -16,6 +16,7 @@ from trilat_net.core.chain import build_chain, place_end_effector, place_joints
 from trilat_net.core.vectors import Vector
 from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net.access_rules import OPERATOR
+from trilat_net.net.arm_port import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
@@ -26,7 +27,6 @@ from trilat_net.net.discovery import (
     find_site_info,
     send_change,
 )
-from trilat_net.net.hand_port import Hand
 from trilat_net.net.messages import Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded

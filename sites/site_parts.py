@@ -129,7 +129,9 @@ class SiteParts:
         measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
         if name in self.scenario.external:
             ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
-            place = " at ".join([measured, *map(str, self.options.connection.places[:1])])
+            connection = self.options.connection
+            reached = connection.reach(connection.listen or connection.connect or ())  # its own, or a router
+            place = " at ".join([measured, *map(str, reached[:1])])
             self.arm = ExternalArm(self.site, ring, self.clock, dropped, place)
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)

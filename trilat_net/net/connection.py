@@ -99,11 +99,6 @@ class Connection:
     own: Mapping[str, Any] = field(default_factory=dict)
     keys_of: str = ""
 
-    @property
-    def places(self) -> Sequence[Endpoint]:
-        """Endpoints at which others reach this member: its own, or the routers of a client."""
-        return self.reach(self.listen or self.connect or ())
-
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
         """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
         if not self.keys_of:
