@@ -156,7 +156,6 @@ class RunningSite:
         self._failure: RunFailed | None = None
         self._mode, self._skipped = Mode.RUN, list[str]()
         self._output: TickRecord | None = None
-        self._ticks, self._t_ns = 0, -1
         self._status_s = self._told_s = 0
         self._given_up, self._held_s = False, -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
@@ -204,9 +203,11 @@ class RunningSite:
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
             self._output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
-        if (output := self._output) is not None:
+        output = self._output
+        self._ticks = 0 if output is None else output.tick + 1
+        self._t_ns = -1 if output is None else output.t_ns
+        if output is not None:
             self._tell_skipped(output.tick, output.t_ns)
-            self._ticks, self._t_ns = output.tick + 1, output.t_ns
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
