@@ -110,23 +110,6 @@ class RunningSession:
         assert found is not None  # nothing stops it
         return found
 
-    @contextmanager
-    def _hold(self, site: str, source: str, timeout_s: float) -> Iterator[Hand]:
-        """Takes hold of an arm; see `hand`."""
-        with self._reach(timeout_s=timeout_s) as bus:
-            clock, name = self._clock, self.name
-            give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-            while True:
-                try:
-                    info = _find_running(bus, clock, name, site)
-                    break
-                except SessionError:
-                    if clock.monotonic_ns() > give_up_ns:
-                        raise
-                clock.sleep_until(clock.monotonic_ns() + 50_000_000)
-            with open_hand(bus, clock, name, site, parse_embedded(info.scenario, name), source) as port:
-                yield port
-
 
 def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
     """Returns the identity of a site of a session that runs."""
@@ -208,8 +191,19 @@ def hand(
         UsageError: nobody can hold that arm, or an endpoint cannot be used.
     """
     connection = secure_connection(resolve_member_connection(None, connect, router), keys, insecure=False)
-    with RunningSession(session, connection)._hold(site, source, timeout_s) as port:
-        yield port
+    clock = SystemClock()
+    with RunningSession(session, connection)._reach(timeout_s=timeout_s) as bus:
+        give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
+        while True:
+            try:
+                info = _find_running(bus, clock, session, site)
+                break
+            except SessionError:
+                if clock.monotonic_ns() > give_up_ns:
+                    raise
+            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+        with open_hand(bus, clock, session, site, parse_embedded(info.scenario, session), source) as port:
+            yield port
 
 
 def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenario, source: str = "") -> Hand:

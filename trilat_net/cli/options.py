@@ -12,7 +12,6 @@ from ..errors import UsageError
 
 if TYPE_CHECKING:
     from ..net.connection import Connection
-    from ..net.member_keys import MemberKeys
     from ..scenario import Scenario
 
 
@@ -281,15 +280,6 @@ def resolve_client_connection(
 
     connection = resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
     return connection.require(OPERATOR) if operates else connection
-
-
-def read_keys(folder: Path | None) -> "MemberKeys | None":
-    """Returns a member's keys, None without a folder."""
-    if folder is None:
-        return None
-    from ..net.member_keys import read_member_keys
-
-    return read_member_keys(folder)
 
 
 ResultsOption = Annotated[

@@ -42,10 +42,9 @@ def router_command(
     from ..process import Interrupt
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    owned = options.read_keys(keys)
-    places = [LOOPBACK if owned is None else ANY_ADDRESS]
+    places = [LOOPBACK if keys is None else ANY_ADDRESS]
     named = resolve_member_connection(listen, connect, None, file, places, (), routes=True)
-    connection = secure_connection(named, owned, insecure=insecure).require(ROUTER)
+    connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)
