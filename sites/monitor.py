@@ -97,7 +97,7 @@ class SessionDisplay:
     def __init__(self, console: Console, clock: Clock) -> None:
         self._console, self._clock = console, clock
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._shown_ns = clock.monotonic_ns()
+        self._shown_ns, self._title = clock.monotonic_ns(), ""
 
     def __enter__(self) -> "SessionDisplay":
         return self
@@ -120,7 +120,8 @@ class SessionDisplay:
         self._shown_ns = self._clock.monotonic_ns()
         if self._live is None:
             shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
-            for line in [title, *shouted, *(describe_row(row) for row in rows if row["time"])]:
+            titled, self._title = [title] if title != self._title else [], title
+            for line in [*titled, *shouted, *(describe_row(row) for row in rows if row["time"])]:
                 self.say(line)
             return
         table = Table(title=escape(title), title_justify="left")
