@@ -7,7 +7,6 @@ from pathlib import Path
 from rich.console import Console
 
 from sites.demo_session import run_demo
-from sites.monitor import SessionDisplay
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
@@ -30,8 +29,7 @@ def run() -> list[str]:
 
 
 def _session(scenario: Scenario, folder: Path) -> str:
-    with SessionDisplay(scenario, Console(quiet=True)) as display:
-        outcome = run_demo(scenario, folder, display)
+    outcome = run_demo(scenario, folder, Console(quiet=True))
     if outcome.problems or not outcome.log.exists():
         return "; ".join(outcome.problems)
     log = open_log(outcome.log)

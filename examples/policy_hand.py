@@ -16,13 +16,13 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from sites.hand_session import open_hand
+from sites.running_session import open_hand
 from trilat_net.net import topics
+from trilat_net.net.arm_port import Hand
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import resolve_member_connection
 from trilat_net.net.discovery import connect_to_session, find_site_info, send_change
-from trilat_net.net.hand_port import Hand
 from trilat_net.net.messages import State
 from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.wire import decode, split_states

@@ -8,7 +8,7 @@ site is open at a time, besides that to stop.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -16,9 +16,9 @@ from msgspec import Meta
 
 from trilat_net.errors import WireError
 from trilat_net.net import topics
+from trilat_net.net.arm_port import SiteSender, make_hand_sender
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import new_boot
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 
@@ -155,33 +155,20 @@ class PageHands:
 
     def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
         self._bus, self._clock, self._session, self._source = bus, clock, session, source
-        self._boots: dict[str, int] = {}
-        self._numbers: Counter[str] = Counter()
-        self._publish: dict[str, Callable[[bytes], None]] = {}
+        self._senders: dict[str, SiteSender] = {}
         self._held: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
         """Sends an arm's site what the page wants of it."""
         site = order.site
-        if site not in self._publish:
+        if site not in self._senders:
             if not order.grip:
                 return
-            self._boots[site] = new_boot() % (2**32 - 1) + 1
-            self._publish[site] = self._bus.publisher(topics.key(self._session, site, topics.HAND))
-        self._numbers[site] += 1
+            self._senders[site] = make_hand_sender(self._bus, self._clock, self._session, site)
+            self._senders[site].number = 0  # a page counts from 1
         (self._held.add if order.grip else self._held.discard)(site)
-        goal = order.to if order.grip else []
-        message = HandMessage(
-            site=site,
-            boot=self._boots[site],
-            source=self._source,
-            n=self._numbers[site],
-            grip=order.grip,
-            target=[] if pushes else goal,
-            force=goal if pushes else [],
-            sent_ns=self._clock.monotonic_ns(),
-        )
-        self._publish[site](encode(message))
+        goals = {"force" if pushes else "target": order.to if order.grip else []}
+        self._senders[site].send(HandMessage, source=self._source, grip=order.grip, **goals)
 
     def release(self) -> None:
         """Lets go of every arm."""
@@ -190,7 +177,7 @@ class PageHands:
 
     def holds(self, site: str, source: int) -> bool:
         """True if it is this page that a record of a site names as holding its arm."""
-        return source != 0 and self._boots.get(site) == source
+        return source != 0 and site in self._senders and self._senders[site].boot == source
 
 
 class OrderDesk:

@@ -1,5 +1,8 @@
 """The page's server: its files and its socket, from one `websockets` server in a thread of its own.
 
+It is an onlooker of a session that is started for it, or of one that runs already: the session neither waits
+for it nor needs it, and runs on if it fails. A browser is opened only where there is one.
+
 Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
 page sees fewer frames and nobody waits for it. A page of another origin, without the token, with too many or
 too large messages is refused and counted; nothing of it reaches a site. One thread serves all pages and takes
@@ -9,11 +12,16 @@ in the session's messages.
 import asyncio
 import hmac
 import logging
+import os
 import secrets
+import socket
+import sys
 import threading
+import webbrowser
 from collections import Counter, deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
 from typing import Any
@@ -28,6 +36,7 @@ from websockets.http11 import Request, Response
 from trilat_net.errors import UsageError, WireError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
+from trilat_net.net.zenoh_bus import ZenohBus
 
 from .page_orders import (
     MAX_MESSAGE_BYTES,
@@ -70,6 +79,9 @@ _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 """For the library of sockets: what strangers send is counted, and prints no tracebacks."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+LONGEST_S = 3600.0
+"""A session with a page runs for so long at most, unless told otherwise, s."""
 
 _KINDS = {
     "html": "text/html; charset=utf-8",
@@ -146,6 +158,40 @@ class Page:
         self.limits, self.excess = MessageLimits(), 0
 
 
+@dataclass(frozen=True, slots=True)
+class PageOptions:
+    """How a page is served.
+
+    Attributes:
+        host: address to listen at.
+        port: 0: any.
+        insecure: true: another address than this machine's is allowed, though nothing is encrypted.
+        opens: true: a browser is opened where there is one.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    insecure: bool = False
+    opens: bool = True
+
+    def check(self) -> None:
+        """Refuses an address that is taken, and to serve others without being told that it is not safe.
+
+        Raises:
+            UsageError: with the reason.
+        """
+        if self.host not in LOOPBACK and not self.insecure:
+            raise UsageError(
+                f"--host {self.host}: whoever reads the network reads the page's token and could take part; "
+                "say --insecure if that network is yours, or leave out --host and use an SSH tunnel"
+            )
+        try:
+            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+            socket.create_server((self.host, self.port), family=family).close()
+        except OSError as error:
+            raise UsageError(f"{self.host}:{self.port}: cannot listen: {error.strerror}") from None
+
+
 class PageServer:
     """Serves one session's page; a context, inside of which the server's thread runs.
 
@@ -153,8 +199,7 @@ class PageServer:
         bus: a connection of its own to the session.
         clock: the time.
         session: the session's name.
-        host: address to listen at; another than this machine's needs the token.
-        port: 0: any.
+        options: how it is served; at another address than this machine's it needs the token.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
 
@@ -169,20 +214,19 @@ class PageServer:
         bus: Bus,
         clock: Clock,
         session: str,
+        options: PageOptions = PageOptions(),
         *,
-        host: str = "127.0.0.1",
-        port: int = 0,
         ends: bool = False,
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._bus, self._clock, self._host, self._port, self._ends = bus, clock, host, port, ends
-        self._say = say
+        self._bus, self._clock, self._ends, self._say = bus, clock, ends, say
+        self._host, self._port = options.host, options.port
         self._met = 0
         self.view = SessionView(bus, clock, session)
         self._frames = SessionFrames(self.view)
         self._desk = OrderDesk(bus, clock, session)
         self.refused: Counter[str] = self._desk.refused
-        self._token = "" if host in LOOPBACK else secrets.token_urlsafe(16)
+        self._token = "" if options.host in LOOPBACK else secrets.token_urlsafe(16)
         self._files = _list_assets()
         self._pages: set[Page] = set()
         self._frame: dict[str, Any] | None = None
@@ -483,3 +527,48 @@ class PageServer:
             "holds": self._list_held(page),
             "refused": sum(self.refused.values()),
         }
+
+
+@contextmanager
+def attend_with_page(
+    options: PageOptions, clock: Clock, session: str, endpoints: Sequence[str], say: Callable[[str], None]
+) -> Iterator[Callable[[], bool]]:
+    """The `SessionAttendant` that serves a page, until that asks for the end of the session."""
+    with (
+        closing(ZenohBus([], endpoints)) as bus,
+        serve_page(bus, clock, session, options, say, ends=True) as page,
+    ):
+        yield page.end_requested.is_set
+
+
+@contextmanager
+def serve_page(
+    bus: Bus, clock: Clock, session: str, options: PageOptions, say: Callable[[str], None], *, ends: bool
+) -> Iterator[PageServer]:
+    """Serves a page inside the block, and opens a browser at it."""
+    with PageServer(bus, clock, session, options, ends=ends, say=say) as page:
+        say(f"the page: {page.address}")
+        with suppress(OSError, webbrowser.Error):
+            if options.opens and _has_browser():
+                webbrowser.open(page.address)
+        yield page
+        for reason, count in sorted((+page.refused).items()):
+            say(f"the page refused {count} messages or requests: {reason}")
+
+
+def _has_browser() -> bool:
+    """True if this process may open a browser that somebody sees."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        return False
+    return sys.stdout.isatty()
+
+
+@contextmanager
+def show_on_page(
+    options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
+) -> Iterator[tuple[SessionView, Callable[[], None]]]:
+    """The `SessionOnlooker` of a page."""
+    with serve_page(bus, clock, session, options, say, ends=False) as page:
+        yield page.view, lambda: None

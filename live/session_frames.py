@@ -17,7 +17,7 @@ from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_to
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
-from trilat_net.net.messages import Event, LinkStats
+from trilat_net.net.messages import Event
 from trilat_net.reporting.palette import order_palette
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
@@ -46,7 +46,7 @@ class ArmFrames:
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario, self._site = scenario, site
         self._model, self._spec = scenario.arms[site], scenario.sites[site]
-        self._walls = list_walls(self._spec)
+        self._walls, self._hand = list_walls(self._spec), find_live_hand(self._spec.hands)
         counts = self._model.counts.joints
         limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
         self._tau_limit = limits
@@ -71,18 +71,12 @@ class ArmFrames:
             "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
             "task": self._model.shares_pose,
             "unit": "m" if self._model.shares_pose else "rad",
-            "hand": self._describe_hand(),
+            "hand": None
+            if self._hand is None
+            else {"mode": self._hand.mode, "limit": self._hand.actor.limit},
             "stops": self._spec.on_stale.action == "glide",
             "law": type(self._spec.control).__struct_config__.tag,
         }
-
-    def _describe_hand(self) -> Json | None:
-        """Returns what somebody who takes hold can do; None if nobody can."""
-        hand = find_live_hand(self._spec.hands)
-        if hand is None:
-            return None
-        limit = hand.torque_limit_nm if hand.mode == "joint" else hand.force_limit_n
-        return {"mode": hand.mode, "limit": limit}
 
     def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
         """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
@@ -114,8 +108,7 @@ class ArmFrames:
         if not own.hand.size:
             return {}
         held = HandInForce.read(own.hand[-1].tolist())
-        hand = find_live_hand(self._spec.hands)
-        limited = False
+        hand, limited = self._hand, False
         if hand is not None and hand.mode != "joint" and held.source:
             limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (1.0 - 1e-6)
         shown = held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
@@ -243,7 +236,8 @@ class SessionFrames:
         if record is not None and used >= 0:
             age_ms = record.t_ns / 1e6 - used * 1e3 / rate_hz
         newest = other.record.tick if other.record else used
-        counts = _link_counts(stats, peer)
+        shown = ("delay_us", -1), ("accepted", 0), ("late", 0), ("lost", 0)
+        counts = {} if stats is None else {key: getattr(stats, key).get(peer, none) for key, none in shown}
         return {
             "age_ms": age_ms,
             "under_way": max(0, min(newest - used, 100_000)) if used >= 0 else 0,
@@ -253,27 +247,12 @@ class SessionFrames:
         }
 
     def _add_energy(self) -> None:
-        view = self._view
-        if view.energy is None:
-            return
-        course = view.energy.advance({name: site.complete for name, site in view.sites.items()})
-        if course is None:
+        if (course := self._view.advance_energy()) is None:
             return
         for t_s, V, supplied in zip(*(column.tolist() for column in course), strict=True):
             if t_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
                 self._energy_s = t_s
                 self.energies.add([t_s, V, supplied])
-
-
-def _link_counts(stats: LinkStats | None, peer: str) -> Json:
-    if stats is None:
-        return {}
-    return {
-        "delay_us": stats.delay_us.get(peer, -1),
-        "accepted": stats.accepted.get(peer, 0),
-        "late": stats.late.get(peer, 0),
-        "lost": stats.lost.get(peer, 0),
-    }
 
 
 def show_event(event: Event) -> Json:

@@ -6,7 +6,6 @@ for no records from before it, and for all events, which say what was changed.
 """
 
 from collections import Counter, deque
-from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -14,10 +13,9 @@ import msgspec
 from recorder.backfill import GapRepair
 from recorder.inbound_queue import InboundMessage, InboundQueue
 from recorder.site_reception import SiteReception
-from trilat_net.analysis.certificate.running_energy import RunningEnergy
+from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy
 from trilat_net.analysis.record_window import RecordWindow, make_windows
 from trilat_net.core.live_hand import TAKEN
-from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import topics
@@ -33,7 +31,7 @@ from trilat_net.scenario import (
     parse_embedded,
     scheduled_link_tables,
 )
-from trilat_net.scenario.operators import LiveHand, find_live_hand
+from trilat_net.scenario.operators import find_live_hand
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
@@ -79,22 +77,16 @@ class SiteView:
     """
 
     def __init__(
-        self,
-        bus: Bus,
-        session: str,
-        reception: SiteReception,
-        window: RecordWindow,
-        hand: LiveHand | None = None,
-        *,
-        glides: bool = False,
-        layout: Layout | None = None,
-        peers: Sequence[str] = (),
+        self, bus: Bus, session: str, scenario: Scenario, name: str, boot: int, window: RecordWindow
     ) -> None:
-        self.glides, self.layout, self.peers = glides, layout, peers
-        self.reception, self.window, self.hand = reception, window, hand
+        rule = scenario.sites[name].on_stale
+        self.glides, self.peers = rule.action == "glide", scenario.peers(name)
+        self.layout = scenario.layout(name) if rule.rule.degrades else None
+        self.hand = find_live_hand(scenario.sites[name].hands)
+        self.reception, self.window = SiteReception(scenario, name, boot), window
         self.holder = ""
         self.dropped: Counter[str] = Counter()
-        self.repair = GapRepair(bus, session, reception, self.dropped)
+        self.repair = GapRepair(bus, session, self.reception, self.dropped)
         self.record: State | None = None
         self.stats: LinkStats | None = None
         self.holds_from = 0
@@ -183,6 +175,11 @@ class SessionView:
                 self._keep(name, site, channel, message.content)
         self._follow_timeline()
 
+    def advance_energy(self) -> EnergyCourse | None:
+        """Returns V at the ticks of which all records have come since the last call; None without any."""
+        complete = {name: site.complete for name, site in self.sites.items()}
+        return None if self.energy is None else self.energy.advance(complete)
+
     def _meet(self) -> None:
         for info in self._query.poll():
             self.met[info.member] = info
@@ -203,13 +200,7 @@ class SessionView:
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)
         self.sites = {
-            name: SiteView(
-                *(self.bus, self.session, SiteReception(scenario, name, boots[name]), windows[name]),
-                find_live_hand(scenario.sites[name].hands),
-                glides=scenario.sites[name].on_stale.action == "glide",
-                layout=scenario.layout(name) if scenario.sites[name].on_stale.rule.degrades else None,
-                peers=scenario.peers(name),
-            )
+            name: SiteView(self.bus, self.session, scenario, name, boots[name], windows[name])
             for name in scenario.names
         }
 

@@ -7,22 +7,26 @@ sessions of their own, so that Ctrl-C reaches them through this process, in that
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+from typing import Any
+
+from rich.console import Console
 
 from trilat_net.core.jit import COMPILING, compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import find_page
+from trilat_net.files import find_page, make_results_folder
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.validate import check_outside_arms
 
 from .monitor import SessionDisplay, SessionMonitor
@@ -84,13 +88,15 @@ class _Child:
         return f"{self.name} ended with code {code}: {last}"
 
 
-SessionAttendant = Callable[[str, Sequence[str]], AbstractContextManager[Callable[[], bool]]]
-"""Given a session's name and the endpoints of its sites, a context that lasts as long as the session; what it
-yields returns true once the session is to end."""
+SessionAttendant = Callable[
+    [str, Sequence[str], Callable[[str], None]], AbstractContextManager[Callable[[], bool]]
+]
+"""Given a session's name, the endpoints of its sites and what tells people, a context that lasts as long as
+the session; what it yields returns true once the session is to end."""
 
 
 def run_demo(
-    scenario: Scenario, folder: Path, display: SessionDisplay, attend: SessionAttendant | None = None
+    scenario: Scenario, folder: Path, console: Console, attend: SessionAttendant | None = None
 ) -> SessionResult:
     """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
 
@@ -102,30 +108,20 @@ def run_demo(
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
     session, clock = scenario.name, SystemClock()
-    with Interrupt() as interrupt, ExitStack() as reserved:
-        layouts = {arm.counts: name for name, arm in scenario.arms.items()}
-        chains = any(arm.chain is not None for arm in scenario.arms.values())
-        if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
-            display.say(COMPILING)
-            compiling_notice.said = True
-            with interrupt.raising():
-                for name in layouts.values():
-                    warm_up(scenario, name)  # once for all children
+    with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
+        _compile_core(scenario, display, interrupt)
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         sites, recorder = _start(scenario, folder, session, endpoints)
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.external:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
             display.say(f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}")
-        attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints)
+        attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints, display.say)
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
-                monitor = SessionMonitor(bus, session, scenario)
+                monitor = SessionMonitor(bus, session, scenario, display)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, recorder], result)):
                     monitor.poll()
-                    display.update(monitor)
-                    for text in monitor.take_news():
-                        display.say(text)
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         finally:
             _end_all(sites, recorder, clock)
@@ -137,6 +133,18 @@ def run_demo(
         if problem and not result.interrupted and problem not in result.problems:
             result.problems.append(problem)
     return result
+
+
+def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interrupt) -> None:
+    """Compiles the code of a tick once for all children, if it must be."""
+    layouts = {arm.counts: name for name, arm in scenario.arms.items()}
+    chains = any(arm.chain is not None for arm in scenario.arms.values())
+    if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
+        display.say(COMPILING)
+        compiling_notice.said = True
+        with interrupt.raising():
+            for name in layouts.values():
+                warm_up(scenario, name)
 
 
 def _start(
@@ -182,3 +190,46 @@ def _end_all(sites: list[_Child], recorder: _Child, clock: Clock) -> None:
                 for child in group:
                     child.end(signal.SIGKILL)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
+
+
+def run(
+    scenario: str | Path | Mapping[str, Any] | Scenario,
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    duration_s: float | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    quiet: bool = True,
+) -> Log:
+    """Runs a scenario live, a process per site and a recorder over Zenoh, and returns its log.
+
+    The command is `trilat demo`, which reports on the log too: `tn.report(log)`.
+
+    >>> log = tn.run("two_sites", duration_s=2)
+    >>> tn.verify(log).passed
+    True
+
+    Args:
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: overrides, as in `{"control.Kd": 5}`.
+        duration_s: the duration of the run, s; by default the scenario's.
+        seed: the seed; by default the scenario's.
+        out: folder of the log; by default the next free runs/NAME-N.
+        force: whether it may hold something already.
+        quiet: whether nothing is printed while it runs.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid.
+        RunFailed: a process failed, or the run was interrupted; it says what the log holds.
+    """
+    chosen = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
+    folder = make_results_folder(None if out is None else Path(out), chosen.name, force=force)
+    result = run_demo(chosen, folder, Console(quiet=quiet))
+    problems = ["interrupted"] if result.interrupted else result.problems
+    if problems:
+        kept = f"; {result.log} holds what there was" if result.log.exists() else ""
+        raise RunFailed("; ".join(problems) + kept)
+    log = open_log(result.log)
+    log.warn_if_diverged()
+    return log

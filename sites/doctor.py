@@ -12,34 +12,37 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from trilat_net import process
 from trilat_net.core.jit import is_core_cached
 from trilat_net.errors import RunFailed, SessionError, UsageError
-from trilat_net.net.clock import Clock
+from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
     ENCRYPTED,
     Connection,
     find_endpoint_addresses,
     is_loopback,
+    resolve_member_connection,
     secure_connection,
 )
 from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+from trilat_net.results import Result
 
-from .session_ping import PingResult, ping_session
+from .session_ping import ping_session
 
 FindingState = Literal["ok", "warn", "fail"]
 ENDS_SOON = timedelta(days=7)
 CONNECT_S = 2.0
 LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
 """Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
-STEADY_NS, STEP_NS, BOUND_NS = 100_000_000, 1_000_000, 1_000_000
+STEADY_NS, STEP_NS, BOUND_US = 100_000_000, 1_000_000, 1_000
 """How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
 PINGS = 20
 
@@ -230,19 +233,15 @@ def examine_offsets(connection: Connection, clock: Clock, session: str) -> Itera
     except (RunFailed, SessionError, UsageError) as error:
         yield DoctorFinding("clock", "fail", str(error))
         return
-    for reach in ping.reached() if ping else ():
-        yield _describe_offset(reach)
-
-
-def _describe_offset(reach: PingResult) -> DoctorFinding:
-    if reach.shared:
-        return DoctorFinding("clock", "ok", f"{reach.info.member} has the same clock")
-    if reach.estimate is None:
-        return DoctorFinding("clock", "warn", f"{reach.info.member} answered too few pings")
-    estimate = reach.estimate
-    bound_ns = estimate.bound_at(estimate.at_ns, estimate.offset_ns)
-    text = f"{reach.info.member} is {estimate.offset_ns / 1e9:+.6f} s, known to {bound_ns / 1e3:.0f} us"
-    return DoctorFinding("clock", "ok" if bound_ns <= BOUND_NS else "warn", text)
+    for facts in ping.members if ping else ():
+        if facts["same_clock"]:
+            yield DoctorFinding("clock", "ok", f"{facts['member']} has the same clock")
+        elif "offset_ns" not in facts:
+            yield DoctorFinding("clock", "warn", f"{facts['member']} answered too few pings")
+        else:
+            offset_s, bound_us = facts["offset_ns"] / 1e9, facts["bound_us"]
+            text = f"{facts['member']} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            yield DoctorFinding("clock", "ok" if bound_us <= BOUND_US else "warn", text)
 
 
 _RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
@@ -282,3 +281,56 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
         yield DoctorFinding(
             "core", "warn", "not yet compiled: the first session here begins half a minute later"
         )
+
+
+@dataclass(frozen=True, repr=False)
+class DoctorReport(Result):
+    """What stands in the way of a session on this machine, and what does not."""
+
+    findings: list[DoctorFinding]
+
+    def headline(self) -> str:
+        """Returns how many findings warn or fail."""
+        states = [finding.state for finding in self.findings]
+        return f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the findings as of `trilat doctor --json`."""
+        return {"findings": self.to_rows()}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per finding."""
+        return [finding._asdict() for finding in self.findings]
+
+
+def doctor(
+    *,
+    listen: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+    session: str | None = None,
+    folder: str | Path = "runs",
+    insecure: bool = False,
+) -> DoctorReport:
+    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat doctor`.
+
+    >>> "clock" in {finding.check for finding in tn.doctor().findings}
+    True
+
+    Args:
+        listen: endpoints to listen at.
+        connect: endpoints to connect to.
+        router: endpoints of routers.
+        keys: folder of a member's keys.
+        session: a session whose members are asked for their clocks.
+        folder: where results would go.
+        insecure: whether everybody on the network is trusted.
+
+    Raises:
+        UsageError: an endpoint or the keys cannot be used.
+    """
+    connection = resolve_member_connection(listen, connect, router)
+    place = None if keys is None else Path(keys)
+    found = examine_machine(connection, place, Path(folder), session, SystemClock(), insecure=insecure)
+    return DoctorReport(list(found))

@@ -8,7 +8,6 @@ time. What is refused is counted by reason.
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
 from trilat_net.core.ticks import tick_ns
@@ -27,14 +26,6 @@ STRONGEST = 10.0
 """Largest force that is taken, in parts of the hand's limit; up to that it is limited."""
 
 
-class HandNews(NamedTuple):
-    """Somebody took hold of the arm or let go: the tick, and the sentence."""
-
-    tick: int
-    t_ns: int
-    text: str
-
-
 class HandServer:
     """The live hand of one site.
 
@@ -46,6 +37,9 @@ class HandServer:
         inbox: the messages.
         dropped: counts what is refused.
         angles: returns the joint angles at the tick that is about to be made, rad.
+
+    Attributes:
+        news: who has taken hold and let go that no event names yet: ticks, and sentences.
     """
 
     def __init__(
@@ -65,7 +59,7 @@ class HandServer:
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)
         self._names: dict[int, str] = {}
-        self._news: list[HandNews] = []
+        self.news: list[tuple[int, str]] = []
 
     def take(self, k: int) -> list[float]:
         """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
@@ -84,14 +78,8 @@ class HandServer:
             self._dropped[reason] += 1
         for source, change in step.changes:
             name = self._names.get(source, f"hand {source:08x}")
-            text = f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"
-            self._news.append(HandNews(k, t_ns, text))
+            self.news.append((k, f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"))
         return step.vector
-
-    def take_news(self) -> list[HandNews]:
-        """Returns who has taken hold and let go since the last call."""
-        news, self._news = self._news, []
-        return news
 
     def _read(self, payload: bytes) -> HandCommand | None:
         """Returns a message as the state machine takes it; None if it is refused, which is counted."""

@@ -1,84 +1,103 @@
-"""Monitor of a live session from outside: its statistics and events, shown as a table or as lines.
+"""A session in a terminal, a row for each site: what `trilat demo` and `trilat watch` show.
 
-A terminal shows a table; other outputs get a line every two seconds.
+A terminal shows a table that is refreshed; other outputs get the same rows as lines every two seconds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
-from rich.console import Console
+from rich.box import HEAVY
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
+from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.live_hand import HandInForce
+from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.errors import WireError
 from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
 from trilat_net.net.membership import read_events, read_messages
 from trilat_net.net.messages import LinkStats, State
 from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario
 
+AGES = "age of each peer's sample"
+HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late", "overruns")
+NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
+TABLE_NS, LINES_NS = NS_PER_S // 4, 2 * NS_PER_S
+"""Between two updates of a table, and of lines."""
 LOUD_EVENTS = frozenset(
     ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
 )
 """Kinds of events that a person who watches should read."""
 
+SiteRow = Mapping[str, str]
+"""A site's row, by `HEADS`."""
 
-class SessionMonitor:
-    """The latest of every site of a session: statistics, error and torque; event texts, not yet taken."""
 
-    def __init__(self, bus: Bus, session: str, scenario: Scenario) -> None:
-        self.latest: dict[str, LinkStats] = {}
-        self.motion: dict[str, tuple[str, str]] = {}
-        self.news: list[str] = []
-        self._scenario, self._sites = scenario, scenario.names
-        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
-        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        self._states = {name: bus.inbox(topics.key(session, name, topics.STATE), 1) for name in self._sites}
-
-    def poll(self) -> None:
-        """Takes the messages that have arrived."""
-        for stats in read_messages(self._links, LinkStats):
-            if stats.site in self._sites:
-                self.latest[stats.site] = stats
-        for event in read_events(self._events):
-            if event.kind in LOUD_EVENTS:
-                self.news.append(event.text)
-        for name, states in self._states.items():
-            if (message := states.poll()) is not None:
-                with suppress(WireError):
-                    self.motion[name] = self._describe_motion(name, message[1])
-
-    def _describe_motion(self, site: str, block: bytes) -> tuple[str, str]:
-        """Returns the error and the largest torque of the last record of a block."""
-        *_, last = split_states(block)
-        record = decode(last, State, layout=self._scenario.layout(site))
+def describe_site(
+    scenario: Scenario, name: str, record: State | None, stats: LinkStats | None, *, silent: bool = False
+) -> SiteRow:
+    """Returns the row of a site by its newest record and statistics, as far as there are any."""
+    row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
+    if stats is not None:
+        aged = stats.age_us.items()
+        row |= {
+            "time": f"{stats.t_ns / NS_PER_S:.1f} s",
+            "mode": stats.mode,
+            AGES: ", ".join(
+                f"{peer} {age / 1000:.0f} ms" if age >= 0 else f"{peer} none" for peer, age in aged
+            ),
+            "late": f"{stats.late_max_us} us",
+            "overruns": f"{stats.overruns}",
+        }
+    if record is not None:
         own, desired = (np.array([v]) for v in (record.x or record.q, record.q_des))
-        e = find_task_errors(own, desired, self._scenario.arms[site].axes) if record.x else own - desired
-        error = f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}"
-        return error, f"{max(map(abs, record.tau)):.2f} N m"
+        e = find_task_errors(own, desired, scenario.arms[name].axes) if record.x else own - desired
+        hand = HandInForce.read(record.hand) if record.hand else None
+        row |= {
+            "time": f"{record.t_ns / NS_PER_S:.1f} s",
+            "mode": record.mode,
+            "angles": " ".join(f"{q:+.3f}" for q in record.q) + " rad",
+            "|e|": f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}",
+            "torque": f"{max(map(abs, record.tau)):.2f} N m",
+            "held": "" if hand is None else "yes" if hand.source else "fades" if hand.grip else "free",
+        }
+    return row | {"mode": "silent"} if silent else row
 
-    def take_news(self) -> Sequence[str]:
-        """Returns the event texts since the last call."""
-        news, self.news = self.news, []
-        return news
+
+def describe_row(row: SiteRow) -> str:
+    """Returns a site in a line of text."""
+    parts = [f"{row['site']} {row['time']} {row['mode']}", row["angles"]]
+    parts += [f"|e| {row['|e|']}", f"torque {row['torque']}", f"age {row[AGES]}"]
+    return "; ".join([*parts, *([f"hand {row['held']}"] if row["held"] else []), f"late {row['late']}"])
 
 
-LINE_EVERY = 20
-"""Without a terminal, one update in so many prints a line."""
+def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
+    """Returns a block for each alarm: red, or yellow of a site that holds and goes on by itself."""
+    blocks = []
+    for name, (word, reason, advice) in alarms:
+        colour = "red" if word in ("FAULT", "STOPPED") else "yellow"
+        text = Text.assemble(
+            (f" {name} {word} ", f"bold reverse {colour}"), f"  {reason}\n", (advice, "bold")
+        )
+        blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
+    return blocks
 
 
 class SessionDisplay:
-    """Shows the progress of a session; a context, which restores the terminal."""
+    """Shows rows of sites in a terminal; a context, which restores it."""
 
-    def __init__(self, scenario: Scenario, console: Console) -> None:
-        self._scenario, self._console = scenario, console
+    def __init__(self, console: Console, clock: Clock) -> None:
+        self._console, self._clock = console, clock
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._updates = 0
+        self._shown_ns, self._title = clock.monotonic_ns(), ""
 
     def __enter__(self) -> "SessionDisplay":
         return self
@@ -87,43 +106,66 @@ class SessionDisplay:
         if self._live:
             self._live.stop()
 
-    def update(self, monitor: SessionMonitor) -> None:
-        """Shows the latest of every site."""
-        self._updates += 1
-        if self._live:
-            self._live.start()  # not before: what ends at a signal until then could not restore the terminal
-            self._live.update(self._table(monitor), refresh=True)
-        elif monitor.latest and self._updates % LINE_EVERY == 0:
-            self._console.print(self._line(monitor), highlight=False, markup=False, soft_wrap=True)
+    @property
+    def due(self) -> bool:
+        """True if what it shows is old."""
+        return self._clock.monotonic_ns() - self._shown_ns >= (TABLE_NS if self._live else LINES_NS)
 
     def say(self, text: str) -> None:
         """Prints a line above the table."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def _table(self, monitor: SessionMonitor) -> Table:
-        table = Table(title=f"{self._scenario.name}, {self._scenario.duration_s:g} s", title_justify="left")
-        for column in ("site", "mode", "time", "|e|", "torque", "late", "overruns", "age of peers' samples"):
-            table.add_column(column, justify="left" if column[:3] in ("sit", "mod", "age") else "right")
-        for name in self._scenario.names:
-            stats, motion = monitor.latest.get(name), monitor.motion.get(name, ("", ""))
-            if stats is None:
-                table.add_row(name, "braked", *[""] * 6)
-                continue
-            ages = "  ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
-            time, late = f"{stats.t_ns / NS_PER_S:.1f} s", f"{stats.late_max_us} us"
-            table.add_row(name, escape(stats.mode), time, *motion, late, f"{stats.overruns}", escape(ages))
-        return table
-
-    def _line(self, monitor: SessionMonitor) -> str:
-        parts = []
-        for name in filter(monitor.latest.__contains__, self._scenario.names):
-            stats, (error, torque) = monitor.latest[name], monitor.motion.get(name, ("", ""))
-            ages = ", ".join(f"{peer} {_milliseconds(age)}" for peer, age in stats.age_us.items())
-            motion = f"|e| {error}, torque {torque}, " if error else ""
-            time = f"{name} {stats.mode} {stats.t_ns / NS_PER_S:.1f} s: "
-            parts.append(f"{time}{motion}late {stats.late_max_us} us (age {ages})")
-        return "; ".join(parts)
+    def show(self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()) -> None:
+        """Shows all sites, under what nobody may overlook."""
+        self._shown_ns = self._clock.monotonic_ns()
+        if self._live is None:
+            shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
+            titled, self._title = [title] if title != self._title else [], title
+            for line in [*titled, *shouted, *(describe_row(row) for row in rows if row["time"])]:
+                self.say(line)
+            return
+        table = Table(title=escape(title), title_justify="left")
+        for head in HEADS:
+            table.add_column(head, justify="right" if head in NUMBERS else "left")
+        for row in rows:
+            table.add_row(*map(escape, row.values()))
+        self._live.start()  # not before: what ends at a signal until then could not restore the terminal
+        self._live.update(Group(*frame_alarms(alarms), table), refresh=True)
 
 
-def _milliseconds(age_us: int) -> str:
-    return "none yet" if age_us < 0 else f"{age_us / 1000:.0f} ms"
+class SessionMonitor:
+    """What the sites of a session that is started here say of themselves, on a display.
+
+    Attributes:
+        latest: the newest statistics of each site.
+        records: its newest record.
+    """
+
+    def __init__(self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay) -> None:
+        self.latest: dict[str, LinkStats] = {}
+        self.records: dict[str, State] = {}
+        self._scenario, self._display = scenario, display
+        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
+        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
+        self._states = {
+            name: bus.inbox(topics.key(session, name, topics.STATE), 1) for name in scenario.names
+        }
+
+    def poll(self) -> None:
+        """Takes the messages that have arrived, and shows them when that is due."""
+        scenario = self._scenario
+        for stats in read_messages(self._links, LinkStats):
+            if stats.site in self._states:
+                self.latest[stats.site] = stats
+        for event in read_events(self._events):
+            if event.kind in LOUD_EVENTS:
+                self._display.say(event.text)
+        for name, states in self._states.items():
+            if (message := states.poll()) is not None:
+                with suppress(WireError):
+                    *_, last = split_states(message[1])
+                    self.records[name] = decode(last, State, layout=scenario.layout(name))
+        if self._display.due:
+            known = [(name, self.records.get(name), self.latest.get(name)) for name in scenario.names]
+            rows = [describe_site(scenario, *one) for one in known]
+            self._display.show(f"{scenario.name}, {scenario.duration_s:g} s", rows)

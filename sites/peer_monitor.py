@@ -52,10 +52,6 @@ class PeerMonitor:
         """True if there is a recorder that has stored all, and none is present that has not."""
         return bool(self.stored) and self.recorders <= self.stored
 
-    def admit(self, boots: Mapping[str, int]) -> None:
-        """Sets the boots that belong to the session."""
-        self.boots = boots
-
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Takes events and presence; publishes who comes, and who is lost without an end event."""
         coming = [event for inbox in self._events.values() for event in self._read(inbox, publisher, t_ns)]
@@ -72,7 +68,9 @@ class PeerMonitor:
             if known and alive:
                 self.away.pop(parts.member, None)
             elif not alive and (known or parts.member == topics.RECORDER):
-                self._lose(publisher, parts.member, t_ns)
+                publisher.publish("lost", f"{parts.member} is gone", about=parts.member, t_ns=t_ns)
+                if self._admits and parts.member in self._events:
+                    self.away[parts.member] = t_ns, f"{parts.member} is gone since t = {t_ns * 1e-9:.1f} s"
         for event in coming:
             self._consider(publisher, event, t_ns)
 
@@ -81,11 +79,6 @@ class PeerMonitor:
         since_ns, _ = self.away.get(member, (t_ns, ""))
         if t_ns - since_ns > MEET_AGAIN_NS and self.boots.get(member) not in self._ended:
             del self.away[member]
-
-    def _lose(self, publisher: EventPublisher, member: str, t_ns: int) -> None:
-        publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)
-        if self._admits and member in self._events:
-            self.away[member] = t_ns, f"{member} is gone since t = {t_ns * 1e-9:.1f} s"
 
     def _read(self, inbox: Inbox, publisher: EventPublisher, t_ns: int) -> Iterator[Event]:
         """Takes a peer's events; yields those of starts that come.

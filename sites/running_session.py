@@ -1,54 +1,64 @@
-"""A running session from Python: orders, changes and pings; and processes of a session.
+"""A running session from Python: orders, changes, pings, hands at its arms; and processes of a session.
 
 Invariant: each call connects, as its command does, and holds no connection afterwards.
 """
 
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from trilat_net.errors import RunFailed
+import numpy as np
+
+from trilat_net.core.chain import build_chain, place_end_effector, place_joints
+from trilat_net.core.vectors import Vector
+from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net.access_rules import OPERATOR
+from trilat_net.net.arm_port import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
-from trilat_net.net.discovery import REPLY_TIMEOUT_S, connect_to_session, request_change
-from trilat_net.net.member_keys import read_member_keys
-from trilat_net.net.requests import ChangeRequest, OrderName
-from trilat_net.results import Result
-from trilat_net.scenario import embedded_names_reader
+from trilat_net.net.discovery import (
+    REPLY_TIMEOUT_S,
+    connect_to_session,
+    find_members,
+    find_site_info,
+    send_change,
+)
+from trilat_net.net.messages import Info
+from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
+from trilat_net.scenario.arms import ArmModel
+from trilat_net.scenario.operators import find_live_hand
 
-from .doctor import DoctorFinding, examine_machine
-from .session_ping import PingReport, describe_ping, ping_session
-from .session_stop import order_sites, stop_session
+from .session_ping import PingReport, ping_session
 
-T = TypeVar("T")
+GATHER_NS = 500_000_000
+"""Time for further sites to answer, after the first one of a session that some may have left."""
+AHEAD_S = 0.5
+"""From the newest tick that is known to the end: sites say ten times a second where they are."""
 
 
 class RunningSession:
     """A session that runs; see `session`. Methods return what the sites answer, a sentence each."""
 
     def __init__(self, name: str, connection: Connection) -> None:
-        self.name, self._connection = name, connection
+        self.name, self._connection, self._clock = name, connection, SystemClock()
 
-    def _act(self, act: Callable[[Bus, Clock], T], *, operates: bool = True) -> T:
+    @contextmanager
+    def _reach(self, *, operates: bool = True, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
         if operates:
             self._connection.require(OPERATOR)
-        clock, names = SystemClock(), embedded_names_reader(self.name)
-        reached = connect_to_session(
-            self._connection, clock, self.name, names, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
-        )
-        with reached as bus:
+        there = self._connection, self._clock, self.name, embedded_names_reader(self.name)
+        with connect_to_session(*there, stopped=lambda: False, timeout_s=timeout_s) as bus:
             assert bus is not None  # nothing stops it
-            return act(bus, clock)
+            yield bus
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
-        replies = self._act(
-            lambda bus, clock: order_sites(bus, clock, self.name, sites, order), operates=order != "stop"
-        )
+        with self._reach(operates=order != "stop") as bus:
+            replies = order_sites(bus, self._clock, self.name, sites, order)
         if refused := [reply.text for reply in replies if not reply.accepted]:
             raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
         return [reply.text for reply in replies]
@@ -67,7 +77,8 @@ class RunningSession:
 
     def end(self) -> list[str]:
         """Ends the session in order; as `trilat stop --end`."""
-        return self._act(lambda bus, clock: stop_session(bus, clock, self.name))
+        with self._reach() as bus:
+            return stop_session(bus, self._clock, self.name)
 
     def set_link(self, link: str, **to: Any) -> str:
         """Changes keys of a link such as "m1->s", as in `delay_ms=350`; as `trilat set link`."""
@@ -78,21 +89,34 @@ class RunningSession:
         return self._change(site, dominance=site, to=dict(shares), ramp_s=ramp_s)
 
     def _change(self, site: str, **change: Any) -> str:
-        names = embedded_names_reader(self.name)
-        request = ChangeRequest(**change)
-        reply = request_change(
-            self._connection.require(OPERATOR), SystemClock(), self.name, site, request, names
-        )
+        reply = self.change(site, ChangeRequest(**change))
         if not reply.accepted:
             raise RunFailed(f"refused: {reply.text}")
         return reply.text
 
+    def change(self, site: str, request: ChangeRequest) -> ChangeReply:
+        """Requests a change from the site that carries it out, and returns its reply.
+
+        Raises:
+            SessionError: the session has no such site, has not begun, or the site does not reply.
+        """
+        with self._reach() as bus:
+            _find_running(bus, self._clock, self.name, site)
+            return send_change(bus, self._clock, self.name, site, request)
+
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
         """Measures round trips, clock offsets and links of the session; as `trilat ping`."""
-        clock = SystemClock()
-        probe = ping_session(self._connection, clock, self.name, count, timeout_s, lambda: False)
-        assert probe is not None  # nothing stops it
-        return describe_ping(self.name, probe)
+        found = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
+        assert found is not None  # nothing stops it
+        return found
+
+
+def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
+    """Returns the identity of a site of a session that runs."""
+    info = find_site_info(bus, clock, session, site, embedded_names_reader(session))
+    if not info.running:
+        raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
+    return info
 
 
 def session(
@@ -117,9 +141,8 @@ def session(
     Raises:
         UsageError: an endpoint or the keys cannot be used.
     """
-    connection = resolve_member_connection(None, connect, router, None, [], None)
-    known = None if keys is None else read_member_keys(Path(keys))
-    return RunningSession(name, secure_connection(connection, known, insecure=False))
+    connection = resolve_member_connection(None, connect, router)
+    return RunningSession(name, secure_connection(connection, keys, insecure=False))
 
 
 def start(*words: str | Path) -> "subprocess.Popen[bytes]":
@@ -137,54 +160,151 @@ def start(*words: str | Path) -> "subprocess.Popen[bytes]":
     return subprocess.Popen([sys.executable, "-m", "trilat_net", *map(str, words)])
 
 
-@dataclass(frozen=True, repr=False)
-class DoctorReport(Result):
-    """What stands in the way of a session on this machine, and what does not."""
-
-    findings: list[DoctorFinding]
-
-    def headline(self) -> str:
-        """Returns how many findings warn or fail."""
-        states = [finding.state for finding in self.findings]
-        return f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the findings as of `trilat doctor --json`."""
-        return {"findings": self.to_rows()}
-
-    def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per finding."""
-        return [finding._asdict() for finding in self.findings]
-
-
-def doctor(
+@contextmanager
+def hand(
+    session: str,
+    site: str,
     *,
-    listen: Sequence[str] | None = None,
     connect: Sequence[str] | None = None,
     router: Sequence[str] | None = None,
     keys: str | Path | None = None,
-    session: str | None = None,
-    folder: str | Path = "runs",
-    insecure: bool = False,
-) -> DoctorReport:
-    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat doctor`.
+    source: str = "",
+    timeout_s: float = 5.0,
+) -> Iterator[Hand]:
+    """Takes part in a live session as a hand at one arm; a context, which lets go at its end.
 
-    >>> "clock" in {finding.check for finding in tn.doctor().findings}
-    True
+    >>> with tn.hand("play", "m1") as hand:  # doctest: +SKIP
+    ...     hand.move(1.2, 0.4)
+    ...     hand.force, hand.pose
 
     Args:
-        listen: endpoints to listen at.
-        connect: endpoints to connect to.
-        router: endpoints of routers.
-        keys: folder of a member's keys.
-        session: a session whose members are asked for their clocks.
-        folder: where results would go.
-        insecure: whether everybody on the network is trusted.
+        session: the session's name, by default the scenario's.
+        site: the site of the arm; its scenario must have an operator of kind "live".
+        connect: endpoints, as of --connect; without them the session's default ones on this machine.
+        router: endpoints of routers to go through instead, as of --router.
+        keys: folder of the operator's keys, as of --keys.
+        source: who this is, for people.
+        timeout_s: longest wait until the session runs.
 
     Raises:
-        UsageError: an endpoint or the keys cannot be used.
+        SessionError: there is no such session, or it does not begin.
+        UsageError: nobody can hold that arm, or an endpoint cannot be used.
     """
-    connection = resolve_member_connection(listen, connect, router, None, [], None)
-    place = None if keys is None else Path(keys)
-    found = examine_machine(connection, place, Path(folder), session, SystemClock(), insecure=insecure)
-    return DoctorReport(list(found))
+    connection = secure_connection(resolve_member_connection(None, connect, router), keys, insecure=False)
+    clock = SystemClock()
+    with RunningSession(session, connection)._reach(timeout_s=timeout_s) as bus:
+        give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
+        while True:
+            try:
+                info = _find_running(bus, clock, session, site)
+                break
+            except SessionError:
+                if clock.monotonic_ns() > give_up_ns:
+                    raise
+            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
+        with open_hand(bus, clock, session, site, parse_embedded(info.scenario, session), source) as port:
+            yield port
+
+
+def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenario, source: str = "") -> Hand:
+    """Returns a hand at a site of a scenario, on a bus that reaches it.
+
+    Raises:
+        UsageError: nobody can hold that arm.
+    """
+    find_site(scenario, site)
+    live = find_live_hand(scenario.sites[site].hands)
+    if live is None:
+        able = [name for name, spec in scenario.sites.items() if find_live_hand(spec.hands) is not None]
+        others = f"; they can at {', '.join(able)}" if able else ""
+        raise UsageError(
+            f"nobody can take hold of {site}: the scenario has no operator of kind 'live' there{others}"
+        )
+    place = _find_place(scenario.arms[site]) if live.mode != "joint" else tuple
+    return Hand(bus, clock, session, site, live.actor, place, source)
+
+
+def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
+    """Returns the function that places an arm's end effector by its joint angles."""
+    if arm.chain is None:
+        return arm.end_effector
+    rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
+
+    def place(q: Vector) -> Sequence[float]:
+        """Returns the place of the end effector, m."""
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        return place_end_effector(rows, tip)
+
+    return place
+
+
+def order_sites(
+    bus: Bus, clock: Clock, session: str, sites: Sequence[str], order: OrderName
+) -> list[ChangeReply]:
+    """Gives some sites of a session an order, "stop", "enable" or "reset"; () stands for all of them.
+
+    Under `glide` these are the ones that are there: others may have left.
+
+    Raises:
+        SessionError: the session has not begun or has no such site, or a site does not answer.
+    """
+    scenario, found = _meet_sites(bus, clock, session)
+    for name in sites:
+        if name not in scenario.names:
+            raise SessionError(
+                f"session {session!r} has no site {name!r}; its sites are {', '.join(scenario.names)}"
+            )
+    asked = list(sites) or _list_present(scenario, found)
+    for name in asked:
+        if name not in found or not found[name].running:
+            raise SessionError(
+                f"session {session!r}: {name} {'has not begun' if name in found else 'did not answer'}"
+            )
+    request = ChangeRequest(order=order)
+    return [send_change(bus, clock, session, name, request) for name in asked]
+
+
+def _list_present(scenario: Scenario, found: dict[str, Info]) -> list[str]:
+    """Returns the sites of a session; of one that sites may leave, those that run, if there are any."""
+    running = [name for name in scenario.names if name in found and found[name].running]
+    return running if running and scenario.sites_may_return else list(scenario.names)
+
+
+def stop_session(bus: Bus, clock: Clock, session: str) -> list[str]:
+    """Asks every site of a session to end at one time; returns what each answers.
+
+    Raises:
+        SessionError: the session has not begun, or a site does not answer.
+    """
+    scenario, found = _meet_sites(bus, clock, session)
+    asked = _list_present(scenario, found)
+    lacking = [name for name in asked if name not in found]
+    waiting = [name for name in asked if name in found and not found[name].running]
+    if lacking:
+        raise SessionError(f"session {session!r}: {', '.join(lacking)} of its sites did not answer")
+    if waiting:
+        raise SessionError(f"session {session!r} has not begun: {', '.join(waiting)} waits for the others")
+    stop_s = max(found[name].ticks / scenario.sites[name].rate_hz for name in asked) + AHEAD_S
+    request = ChangeRequest(stop_s=stop_s)
+    return [send_change(bus, clock, session, name, request).text for name in asked]
+
+
+def _meet_sites(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, dict[str, Info]]:
+    """Returns a session's scenario, and the sites that have answered."""
+    found: dict[str, Info] = {}
+    scenario: Scenario | None = None
+    begun_ns = 0
+    for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
+        if scenario is None and info.scenario:
+            scenario = parse_embedded(info.scenario, session)
+        if scenario is not None and info.member in scenario.sites:
+            found[info.member] = info
+            begun_ns = begun_ns or clock.monotonic_ns()
+            gathered = scenario.sites_may_return and clock.monotonic_ns() - begun_ns > GATHER_NS
+            if len(found) == len(scenario.names) or gathered:
+                break
+    if scenario is None:
+        raise SessionError(
+            f"no site of session {session!r} answers; other endpoints are named with --connect"
+        )
+    return scenario, found

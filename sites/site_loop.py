@@ -9,7 +9,7 @@ arrive, before their tick, and carry the instants of their arrival, not of their
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.live_hand import HandInForce
@@ -23,6 +23,9 @@ from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, SiteTiming
 from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
+
+if TYPE_CHECKING:
+    from .site_process import RunningSite
 
 
 def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
@@ -175,31 +178,6 @@ class StateBlock:
             self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
 
 
-class LoopIO(Protocol):
-    """The loop's connection to everything outside of its ticks."""
-
-    def should_stop(self) -> bool:
-        """True if the run ends before its next tick."""
-
-    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Steps the site; None if its law failed, which ends the run."""
-
-    def publish_sample(self, payload: bytes) -> None:
-        """Publishes what peers need of a tick."""
-
-    def publish_link(self, payload: bytes) -> None:
-        """Publishes statistics."""
-
-    def attend(self, k: int, t_ns: int) -> None:
-        """Runs ten times a second, after the statistics of tick k, whose nominal time is given."""
-
-    def report(self, output: TickRecord) -> None:
-        """Runs after a tick that took a command in, or at which the mode changed."""
-
-    def use_slack(self) -> bool:
-        """Runs after a block, and again after the next tick if it returns true, in a quarter of a period."""
-
-
 def _find_newest_tick(timing: SiteTiming, k: int, now_ns: int) -> int:
     """Returns the last tick from k on whose deadline is not in the future."""
     first, after = k, k + 2
@@ -220,7 +198,7 @@ def run_loop(
     timing: SiteTiming,
     stats: LoopStats,
     states: StateBlock,
-    io: LoopIO,
+    io: "RunningSite",
     first: int = 0,
     *,
     catches_up: bool = True,

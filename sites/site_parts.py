@@ -115,8 +115,9 @@ class SiteParts:
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
         turn = scenario.names.index(name)
         single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
-        self.states = StateBlock(self.site, self.boot, self._states_publisher(), turn, single=single)
-        self.publish_link = self._keeping_publisher(topics.LINK)
+        send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
+        self.states = StateBlock(self.site, self.boot, send_states, turn, single=single)
+        self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
@@ -128,7 +129,9 @@ class SiteParts:
         measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
         if name in self.scenario.external:
             ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
-            place = " at ".join([measured, *map(str, self.options.connection.places[:1])])
+            connection = self.options.connection
+            reached = connection.reach(connection.listen or connection.connect or ())  # its own, or a router
+            place = " at ".join([measured, *map(str, reached[:1])])
             self.arm = ExternalArm(self.site, ring, self.clock, dropped, place)
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
@@ -137,25 +140,15 @@ class SiteParts:
     def _is_held(self) -> bool:
         return self.switch is None or self.switch.held
 
-    def _states_publisher(self) -> Callable[[list[bytes]], None]:
-        keep = self.buffer.channels[topics.STATE].keep
-        publish = self.bus.publisher(topics.key(self.options.session, self.name, topics.STATE))
+    def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
+        keep = self.buffer.channels[channel].keep
+        publish = self.bus.publisher(topics.key(self.options.session, self.name, channel))
 
         def keep_and_publish(payloads: list[bytes]) -> None:
             for payload in payloads:
                 keep(payload)
             for block in join_states(payloads):
                 publish(block)
-
-        return keep_and_publish
-
-    def _keeping_publisher(self, channel: str) -> Callable[[bytes], None]:
-        keep = self.buffer.channels[channel].keep
-        publish = self.bus.publisher(topics.key(self.options.session, self.name, channel))
-
-        def keep_and_publish(payload: bytes) -> None:
-            keep(payload)
-            publish(payload)
 
         return keep_and_publish
 

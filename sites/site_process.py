@@ -1,10 +1,11 @@
 """One site as one process: it joins a session, runs, and leaves.
 
 Invariant: a site declares itself alive only when its subscriptions are declared and its step is compiled.
-Until the epoch its arm is braked; at the end it stays until every recorder has all records, or for some
-seconds (`shutdown`).
+Until the epoch its arm is braked; at the end it stays until every recorder present has all messages that it
+can have, or for some seconds.
 """
 
+import signal
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 
@@ -18,12 +19,13 @@ from trilat_net.core.ticks import (
     Mode,
     TickInput,
     TickRecord,
+    describe_divergence,
     describe_mode,
     find_alarm,
     find_life_reason,
     tick_ns,
 )
-from trilat_net.errors import LawFailed, RunFailed, SessionError
+from trilat_net.errors import LawFailed, PeerLeft, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -41,7 +43,6 @@ from trilat_net.scenario.run_changes import count_skipped_ticks
 from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
-from .shutdown import LeavingSite
 from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
@@ -50,6 +51,14 @@ NOBODY = -1
 """No start of a peer that is not there yet."""
 STATUS_TICKS_S = 5
 """Between two lines that say how a site does, s."""
+LINGER_NS = 5 * NS_PER_S
+"""Longest wait after the last query of a recorder."""
+LAST_EVENT_NS = 100_000_000
+"""Wait for the last event of a recorder that is gone."""
+LEAVE_TIMEOUT_NS = 2 * NS_PER_S
+"""Wait after a recorder that has everything is gone: its process ends."""
+QUERIED_NS = NS_PER_S
+"""A recorder that has sent a query within this time is present, whatever its token says."""
 
 
 def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]) -> int:
@@ -91,57 +100,55 @@ def take_part(parts: SiteParts) -> int:
     give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
     if parts.arm is not None and not parts.arm.wait_for_first(stopped, give_up_ns, parts.say):
         return parts.interrupt.exit_code
-    running = JoiningSite(parts).join(give_up_ns)
-    return parts.interrupt.exit_code if running is None else running.run().leave()
+    running = join_session(parts, give_up_ns)
+    if running is None:
+        return parts.interrupt.exit_code
+    running.run()
+    return running.leave()
 
 
-class JoiningSite:
-    """A site that has declared itself alive and waits for the epoch."""
+def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
+    """Declares a site alive, and waits for the others and the epoch; None if a signal comes first.
 
-    def __init__(self, parts: SiteParts) -> None:
-        scenario, options = parts.scenario, parts.options
-        needs = {"needs_recorder": options.needs_recorder}
-        info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
-        late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
-        self._parts = parts
-        keep = parts.buffer.channels[topics.EVENT].keep
-        self._publisher = EventPublisher(parts.bus, options.session, info, keep)
-        meets = (parts.bus, parts.clock, options.session, self._publisher)
-        self._joining = SessionJoin(*meets, scenario.names, late)
-
-    def join(self, give_up_ns: int) -> "RunningSite | None":
-        """Waits for the others; None if a signal comes first.
-
-        Raises:
-            SessionError: the session did not begin in time, or this site cannot be part of it.
-        """
-        parts, membership, pinger = self._parts, self._joining.membership, self._joining.pinger
-        parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
-        begins = 0
-        while not parts.interrupt.requested():
-            epoch = self._joining.poll()
-            if epoch is not None:
-                return RunningSite(parts, self._publisher, pinger, epoch)
-            if self._joining.coming_at != begins:
-                begins = self._joining.coming_at
-                parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
-            now_ns = parts.clock.monotonic_ns()
-            if now_ns > give_up_ns:
-                missing = membership.missing()
-                reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
-                reason = self._joining.reason or reason
-                for member, problem in membership.unreadable.items():
-                    reason += f"; the answer of {member} cannot be read: {problem}"
-                raise SessionError(
-                    f"{parts.name} waited {parts.options.join_timeout_s:g} s in session "
-                    f"{parts.options.session!r}: {reason}"
-                )
-            parts.clock.sleep_until(now_ns + pinger.pause_ns(POLL_NS))
-        return None
+    Raises:
+        SessionError: the session did not begin in time, or this site cannot be part of it.
+    """
+    scenario, options = parts.scenario, parts.options
+    needs = {"needs_recorder": options.needs_recorder}
+    info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
+    late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
+    keep = parts.buffer.channels[topics.EVENT].keep
+    publisher = EventPublisher(parts.bus, options.session, info, keep)
+    joining = SessionJoin(parts.bus, parts.clock, options.session, publisher, scenario.names, late)
+    membership, pinger = joining.membership, joining.pinger
+    parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
+    begins = 0
+    while not parts.interrupt.requested():
+        epoch = joining.poll()
+        if epoch is not None:
+            return RunningSite(parts, publisher, pinger, epoch)
+        if joining.coming_at != begins:
+            begins = joining.coming_at
+            parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
+        now_ns = parts.clock.monotonic_ns()
+        if now_ns > give_up_ns:
+            missing = membership.missing()
+            reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+            reason = joining.reason or reason
+            for member, problem in membership.unreadable.items():
+                reason += f"; the answer of {member} cannot be read: {problem}"
+            waited = f"{parts.name} waited {options.join_timeout_s:g} s in session {options.session!r}"
+            raise SessionError(f"{waited}: {reason}")
+        parts.clock.sleep_until(now_ns + pinger.pause_ns(POLL_NS))
+    return None
 
 
 class RunningSite:
-    """A site between the epoch and its last tick; the `LoopIO` of its loop."""
+    """A site between the epoch and its last tick.
+
+    The loop calls `use_slack` after a block of records, and again after the next tick if it returns true, in
+    a quarter of a period.
+    """
 
     def __init__(self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch) -> None:
         scenario, site = parts.scenario, parts.site
@@ -155,7 +162,7 @@ class RunningSite:
         self._step = site.step if parts.watchdog is None else parts.watchdog.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
-        parts.monitor.admit(epoch.boots)
+        parts.monitor.boots = epoch.boots
         boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
         peers = [
             PeerClock(
@@ -185,7 +192,7 @@ class RunningSite:
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
         )
 
-    def run(self) -> LeavingSite:
+    def run(self) -> None:
         """Runs every tick, or until the run ends."""
         parts = self._parts
         self._publish_setup()
@@ -195,11 +202,12 @@ class RunningSite:
             ticks = parts.scenario.ticks(name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
-            output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
+            self._output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
+        output = self._output
+        self._ticks = 0 if output is None else output.tick + 1
+        self._t_ns = -1 if output is None else output.t_ns
         if output is not None:
             self._tell_skipped(output.tick, output.t_ns)
-        unheard = [meter.peer.name for meter in self._timing.meters if meter.unheard]
-        return LeavingSite(parts, self._publisher, output, self._failure, unheard)
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
@@ -228,7 +236,7 @@ class RunningSite:
             self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
-        """See `LoopIO`."""
+        """True if the run ends before its next tick."""
         parts = self._parts
         for input_ in (parts.arm, parts.switch):
             if input_ is not None:
@@ -237,7 +245,7 @@ class RunningSite:
         return bool(ended) or parts.interrupt.requested() or self._given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """See `LoopIO`."""
+        """Steps the site; None if its law failed, which ends the run."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.take(k)
@@ -249,25 +257,31 @@ class RunningSite:
         return self._output
 
     def attend(self, k: int, t_ns: int) -> None:
-        """See `LoopIO`: answers queries, follows the leader's grid, publishes news."""
+        """Answers queries, follows the leader's grid, publishes news: ten times a second, after statistics.
+
+        These are of tick k, whose nominal time is given.
+        """
         grid_ns = self._timing.schedule.deadline(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
         self._watch_members(t_ns)
         self._come_again(t_ns)
-        for news in () if self._parts.hand is None else self._parts.hand.take_news():
-            self._publisher.publish("hand", news.text, t_ns=news.t_ns, ticks=news.tick)
-            self._parts.say(news.text.partition(": ")[2])
-        for tick, text in self._parts.changes.marks:
-            at_ns = tick_ns(tick, self._parts.site.rate_hz)
-            self._publisher.publish("mark", text, t_ns=at_ns, ticks=tick)
-        self._parts.changes.marks.clear()
+        if (hand := self._parts.hand) is not None:
+            for _, text in hand.news:
+                self._parts.say(text.partition(": ")[2])
+            self._tell("hand", hand.news)
+        self._tell("mark", self._parts.changes.marks)
         self._tell_skipped(k, t_ns)
         self._tell_waiting(k, t_ns)
         if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
             self._status_s = t_ns // NS_PER_S
             self._parts.say(self._describe_status(self._output))
+
+    def _tell(self, kind: str, news: list[tuple[int, str]]) -> None:
+        for tick, text in news:
+            self._publisher.publish(kind, text, t_ns=tick_ns(tick, self._parts.site.rate_hz), ticks=tick)
+        news.clear()
 
     def _tell_skipped(self, k: int, t_ns: int) -> None:
         """Publishes which ticks up to tick k were not made."""
@@ -338,7 +352,7 @@ class RunningSite:
         )
 
     def report(self, output: TickRecord) -> None:
-        """See `LoopIO`."""
+        """Tells of a tick that took a command in, or at which the mode changed."""
         name, at = self._parts.name, {"t_ns": output.t_ns, "ticks": output.tick}
         if skipped := count_skipped_ticks(output.cmd):  # told together, in `attend`
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
@@ -368,3 +382,81 @@ class RunningSite:
         shown = (parts.options.session, parts.name, mode.name.lower(), output.mem, len(output.q_des), lost)
         if (alarm := find_alarm(*shown)) is not None:
             parts.say(f"*** {alarm}")
+
+    def leave(self) -> int:
+        """Publishes the end, waits for the recorders, and returns the exit code.
+
+        Raises:
+            RunFailed: the run ended badly, here or at a peer; as `PeerLeft`, without a peer.
+        """
+        parts, interrupt, output = self._parts, self._parts.interrupt, self._output
+        kind = "failed"
+        if output is not None and output.mode is Mode.DIVERGED:
+            kind, self._failure = "diverged", RunFailed(describe_divergence(parts.name, output))
+        if self._failure is not None:
+            self._publish(kind, str(self._failure))
+        if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
+            self._publish("law", hiccups)
+            parts.say(hiccups)
+        about, why = self._find_cause()
+        if unheard := [meter.peer.name for meter in self._timing.meters if meter.unheard]:
+            why += f"; {', '.join(unheard)} did not hear it at the end"
+        self._publish("end", f"{parts.name} made {self._ticks} ticks{why}", about=about)
+        code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
+        parts.monitor.watch(self._publisher, self._t_ns)
+        if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
+            self._await_recorders()
+        dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
+        parts.say(
+            f"{self._ticks} ticks, {parts.stats.overruns} of them late by a period or more"
+            + (f"; dropped: {dropped}" if dropped else "")
+        )
+        if self._failure is not None:
+            raise self._failure
+        if parts.monitor.ended_by:
+            raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
+        if not code and self._away:
+            raise PeerLeft(f"{parts.name} made {self._ticks} ticks; {self._away}, and did not come back")
+        return code
+
+    @property
+    def _away(self) -> str:
+        """What sites that have left said of it, "" if all are there."""
+        return "; ".join(text for _, text in self._parts.monitor.away.values())
+
+    def _find_cause(self) -> tuple[str, str]:
+        """Returns whose end it was if the run ends before its time, and why, to be put behind a sentence."""
+        parts, monitor = self._parts, self._parts.monitor
+        if self._failure is not None:
+            return parts.name, f": {self._failure}"
+        if monitor.ended_by:
+            return monitor.ended_member, f": {monitor.ended_by}"
+        if parts.changes.stopped:
+            return "", ", as many as it was asked for"
+        if self._ticks == parts.scenario.ticks(parts.name):
+            return "", ""
+        if parts.interrupt.requested():
+            return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
+        return next(iter(monitor.away), ""), f": {self._away}"
+
+    def _publish(self, kind: str, text: str, about: str = "") -> None:
+        self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
+
+    def _await_recorders(self) -> None:
+        """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""
+        parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
+        interrupted = parts.interrupt.requested
+        give_up_ns, queried_ns = clock.monotonic_ns() + LINGER_NS, 0
+        while clock.monotonic_ns() < give_up_ns and not (monitor.all_stored and interrupted()):
+            while parts.buffer.answer_query():
+                queried_ns = clock.monotonic_ns()
+                give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
+            self._publisher.answer_queries()
+            monitor.watch(self._publisher, self._t_ns)
+            gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
+            if gone and (monitor.stored or interrupted()):  # else one may come back whose connection broke
+                patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
+            if monitor.read_stored(self._ticks) and monitor.all_stored:
+                give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)

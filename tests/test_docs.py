@@ -11,7 +11,7 @@ import pytest
 
 from recorder import backfill, record_process, session_recording
 from recorder.play import pace
-from sites import change_server, external_arm, law_watchdog, retransmit_buffer, shutdown
+from sites import change_server, external_arm, law_watchdog, retransmit_buffer, site_process
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
@@ -19,7 +19,7 @@ from trilat_net.analysis.metrics import impedance, motion_metrics, static_window
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference, twins
 from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
-from trilat_net.net import offset, requests, session, site_port, timing, zenoh_config
+from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_gains, bench_tasks
@@ -59,8 +59,8 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),
     ("design.md", "an epoch 500 ms ahead", 500, session.EPOCH_AHEAD_NS / 1e6),
     ("design.md", "150 ms before the epoch", 150, session.DECIDE_NS / 1e6),
-    ("design.md", "at most 5 s from the last question", 5, shutdown.LINGER_NS / 1e9),
-    ("design.md", "and 2 s more", 2, shutdown.LEAVE_TIMEOUT_NS / 1e9),
+    ("design.md", "at most 5 s from the last question", 5, site_process.LINGER_NS / 1e9),
+    ("design.md", "and 2 s more", 2, site_process.LEAVE_TIMEOUT_NS / 1e9),
     ("design.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("design.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
@@ -69,7 +69,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("external-arm.md", "more than 20 ticks", 20, session_life.HELD_OVERRUN_TICKS),
     ("external-arm.md", "more than 200", 200, session_life.FAULT_OVERRUN_TICKS),
     ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
-    ("external-arm.md", "older than 0.1 s", 0.1, site_port.FRESH_NS / 1e9),
+    ("external-arm.md", "older than 0.1 s", 0.1, arm_port.FRESH_NS / 1e9),
     ("live-hands.md", "silent for 200 ms lets go", 200.0, live_hand.SILENCE_NS / 1e6),
     ("live-hands.md", "from 0 to 1 within 100 ms", 100.0, live_hand.GRIP_NS / 1e6),
     ("live-hands.md", "two, at most 50 ms", 50.0, live_hand.GLIDE_NS / 1e6),

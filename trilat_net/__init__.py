@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from sites.hand_session import hand
-    from sites.live_run import run
+    from sites.demo_session import run
+    from sites.doctor import doctor
     from sites.network_benchmark import ping_benchmark
-    from sites.running_session import doctor, session, start
+    from sites.running_session import hand, session, start
 
     from .analysis.twin_growth import twin
     from .api import (
@@ -104,9 +104,9 @@ _MODULES = {
     "create_keys": "trilat_net.net.member_keys",
     "create_signing_keys": "trilat_net.log.log_signature",
     "describe_scenario": "trilat_net.scenario.describe",
-    "doctor": "sites.running_session",
+    "doctor": "sites.doctor",
     "figure": "trilat_net.reporting.figures.registry",
-    "hand": "sites.hand_session",
+    "hand": "sites.running_session",
     "import_trace": "trilat_net.scenario.measured_traces",
     "list_shipped": "trilat_net.scenario",
     "load_scenario": "trilat_net.scenario",
@@ -116,7 +116,7 @@ _MODULES = {
     "read_member_keys": "trilat_net.net.member_keys",
     "read_template": "trilat_net.scenario",
     "rerun": "trilat_net.execution.rerun",
-    "run": "sites.live_run",
+    "run": "sites.demo_session",
     "session": "sites.running_session",
     "sign_log": "trilat_net.log.log_signature",
     "start": "sites.running_session",

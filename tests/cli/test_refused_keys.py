@@ -14,8 +14,7 @@ from typing import Any
 
 import pytest
 
-from sites.hand_session import hand
-from sites.running_session import session
+from sites.running_session import hand, session
 from tests.cli.running import COMMAND, PLAIN, trilat
 from trilat_net.errors import LogRefused, TrilatError, UsageError
 from trilat_net.net import member_keys

@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from random import Random
 
+from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.sites.relay import Relay
-from trilat_net.net.bus import RING_CAPACITY, Inbox, LocalBus, LocalNetwork, StampedInbox, T, matches_key
+from trilat_net.net.bus import RING_CAPACITY, Inbox, StampedInbox, T, matches_key
 
 LEASE_NS = 1_000_000_000
 """A fifth of what `trilat_net.net.zenoh_config` sets, so that connections end within a session of 5 s."""

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus, read_zenoh_file
 
 from .certificates import Certificates
+from .local_bus import LocalNetwork
 from .waiting import until
 
 SEATS = 3

@@ -8,12 +8,14 @@ import msgspec
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import WireError
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.wire import decode
+
+from .local_bus import LocalNetwork
 
 SESSION = "t"
 STEP_NS = 20_000_000

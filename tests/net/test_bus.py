@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.net.bus import Bus, Inbox, LocalNetwork, StampedInbox, StampingRing
+from trilat_net.net.bus import Bus, Inbox, StampedInbox, StampingRing
 
+from .local_bus import LocalNetwork
 from .networks import NETWORKS, Network
 from .waiting import answered, drained, received, until
 

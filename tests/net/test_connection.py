@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.connection import (
     ROUTER_POLL_NS,
     Connection,
@@ -22,11 +22,12 @@ from trilat_net.net.connection import (
     open_bus,
     reserve_session_endpoints,
     resolve_member_connection,
-    resolve_router_connection,
     run_router,
 )
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.net.zenoh_config import ZenohFile, check_zenoh_file
+
+from .local_bus import LocalNetwork
 
 HERE, THERE = ["tcp/127.0.0.1:1"], ["tcp/127.0.0.1:2"]
 A, B, C = "tcp/a:1", "tcp/b:1", "tcp/c:1"
@@ -103,15 +104,19 @@ def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
     assert member(routers=[endpoint]).connect == [endpoint]
 
 
+def router(listen: list[str] | None, connect: list[str] | None, own: ZenohFile | None) -> Connection:
+    return resolve_member_connection(listen, connect, None, own, HERE, routes=True)
+
+
 def test_a_router_listens_where_it_is_told_and_may_connect_to_others() -> None:
-    assert resolve_router_connection(None, None, None, HERE) == Connection(HERE, (), "router", {})
-    told = resolve_router_connection([A], [B], file(mode="router"), HERE)
+    assert router(None, None, None) == Connection(HERE, (), "router", {})
+    told = router([A], [B], file(mode="router"))
     assert told == Connection([A], [B], "router", {})
     places = {"router": [C], "peer": [B]}
-    assert resolve_router_connection(None, None, file(listen={"endpoints": places}), HERE).listen == [C]
+    assert router(None, None, file(listen={"endpoints": places})).listen == [C]
     for mode in ("peer", "client"):
         with pytest.raises(UsageError, match=f"mine.json5: mode: {mode} must be router here"):
-            resolve_router_connection(None, None, file(mode=mode), HERE)
+            router(None, None, file(mode=mode))
 
 
 class Answering(ManualClock):

@@ -8,13 +8,13 @@ import msgspec
 import pytest
 
 from sites.change_server import ChangeServer
+from sites.running_session import RunningSession
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, default_endpoint, find_free_endpoints
-from trilat_net.net.discovery import connect_to_session, find_members, request_change
+from trilat_net.net.discovery import connect_to_session, find_members
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
@@ -22,6 +22,7 @@ from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario import load_scenario, parse_scenario
 
+from .local_bus import LocalNetwork
 from .parties import told
 from .waiting import until
 
@@ -56,10 +57,7 @@ class Answering:
 
     def asked(self, site: str, **order: object) -> ChangeReply:
         wanted = msgspec.convert({"to": {}, **order}, ChangeRequest)
-        connection = Connection(connect=[self.endpoint])
-        return request_change(
-            connection, CLOCK, SESSION, site, wanted, lambda text: parse_scenario(text).names
-        )
+        return RunningSession(SESSION, Connection(connect=[self.endpoint])).change(site, wanted)
 
 
 @pytest.fixture(autouse=True)

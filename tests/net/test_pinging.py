@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import exact_offset
@@ -26,6 +26,7 @@ from trilat_net.net.pinging import (
 from trilat_net.net.requests import Pong
 from trilat_net.net.wire import encode
 
+from .local_bus import LocalNetwork
 from .parties import SESSION, told
 
 S = 1_000_000_000

@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
-from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.bus import Inbox
 from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import VERSION, Event, Info
 from trilat_net.net.session import DECIDE_NS, EPOCH_AHEAD_NS
 from trilat_net.net.wire import encode
 
+from .local_bus import LocalNetwork
 from .parties import SESSION, STEP_NS, Member, Party, told
 
 SITES = ("m1", "m2", "s")

@@ -13,13 +13,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from live.live_session import PageOptions
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
-from live.page_server import MOST_EXCESS, PageServer
+from live.page_server import MOST_EXCESS, PageOptions, PageServer
 from tests.cli.running import trilat
+from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
-from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
@@ -87,7 +86,7 @@ def test_it_serves_its_own_files_and_no_others(server: PageServer) -> None:
         "../pyproject.toml",
         "page_server.py",
         "report.html",
-        "%2e%2e/live_session.py",
+        "%2e%2e/page_server.py",
         "nothing.js",
     ):
         assert get(server, f"/{name}")[0] == 404, name
@@ -121,7 +120,7 @@ def test_another_address_than_loopback_demands_insecure_and_a_token(network: Loc
     with pytest.raises(UsageError, match="insecure=True"):
         PageOptions(host="0.0.0.0").check()
     PageOptions(host="0.0.0.0", insecure=True).check()
-    with PageServer(network.join(), SystemClock(), "s1", host="0.0.0.0") as server:
+    with PageServer(network.join(), SystemClock(), "s1", PageOptions(host="0.0.0.0")) as server:
         token = urlsplit(server.address).query
         assert len(token) > len("token=") + 20
         for query in ("", "?token=", "?token=guess", f"?{token}x"):

@@ -10,13 +10,14 @@ from mcap.reader import make_reader
 from recorder.inbound_queue import InboundQueue
 from recorder.session_recording import RecorderReport, Recording
 from tests.net import parties
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
-from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.bus import Inbox
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.membership import Epoch, EventPublisher, read_events
 from trilat_net.net.messages import Event, Info

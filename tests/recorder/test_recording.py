@@ -11,6 +11,7 @@ from recorder import inbound_queue as tap_module
 from recorder.record_process import Recorder
 from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
 from recorder.site_reception import EVENT_BYTES
+from tests.net.local_bus import LocalNetwork
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
@@ -18,7 +19,6 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.net import topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode, encode_state
 from trilat_net.scenario import load_scenario

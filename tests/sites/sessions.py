@@ -12,11 +12,12 @@ from recorder.record_process import Recorder
 from sites import realtime
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import take_part
+from tests.net.local_bus import LocalNetwork
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SkewedClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State

@@ -9,11 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.change_server import AHEAD_MS, MARKS_WAITING, MIN_RAMP_S, ChangeServer
+from tests.net.local_bus import LocalNetwork
 from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import CoreChange, Mode, TickInput
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Inbox, LocalNetwork
+from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario, load_scenario, parse_core_change

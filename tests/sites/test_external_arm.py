@@ -21,7 +21,8 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from sites.session_stop import order_sites
+from sites.running_session import order_sites
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
 from trilat_net.core.site_step import Site
@@ -31,11 +32,10 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.arm_port import ArmPort, EnablePort
-from trilat_net.net.bus import Bus, LocalNetwork, StampingRing
+from trilat_net.net.arm_port import FRESH_NS, ArmPort, EnablePort
+from trilat_net.net.bus import Bus, StampingRing
 from trilat_net.net.messages import VERSION, Event
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
-from trilat_net.net.site_port import FRESH_NS
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
 

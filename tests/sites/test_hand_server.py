@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sites.hand_server import MESSAGES_KEPT, HandServer
-from sites.hand_session import open_hand
+from sites.running_session import open_hand
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, free_hand
 from trilat_net.errors import UsageError
@@ -17,8 +18,8 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, LocalNetwork
-from trilat_net.net.hand_port import Hand
+from trilat_net.net.arm_port import Hand
+from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
@@ -176,6 +177,4 @@ def test_a_flood_is_read_a_little_at_a_time_and_moves_nobody() -> None:
     assert hand.source == 5
     assert hand.number == 99
     assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}
-    assert [news.text for news in served.server.take_news()] == [
-        "m1: hand 00000005 takes hold at t = 0.000 s"
-    ]
+    assert [text for _, text in served.server.news] == ["m1: hand 00000005 takes hold at t = 0.000 s"]

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 import trilat_net
-from sites.monitor import LINE_EVERY, SessionDisplay, SessionMonitor
+from sites.monitor import LINES_NS, SessionDisplay, SessionMonitor
+from tests.net.local_bus import LocalNetwork
+from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.net import topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
@@ -26,8 +27,10 @@ STATISTICS = LoopStats(SITE, 1, [1000, 1000]).take(SITE.step(TickInput(0)))
 @pytest.mark.parametrize("terminal", [False, True])
 def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     moved = trilat_net.simulate(SCENARIO, duration_s=0.01)["m1"]
-    network = LocalNetwork()
-    watch = SessionMonitor(network.join(), "t", SCENARIO)
+    network, clock = LocalNetwork(), ManualClock()
+    mine, out = network.join(), io.StringIO()
+    display = SessionDisplay(TextConsole(file=out, force_terminal=terminal, width=200), clock)
+    watch = SessionMonitor(mine, "t", SCENARIO, display)
     stranger = network.join()
 
     def say(member: str, channel: str, payload: bytes) -> None:
@@ -38,18 +41,16 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
         say("m1", topics.EVENT, junk)
         say("m1", topics.STATE, junk)
     say("m1", topics.LINK, encode(msgspec.structs.replace(STATISTICS, mode="[/red]\x1b[7mX")))
-    say("m1", topics.STATE, b"".join(moved.payloads))
+    record = msgspec.structs.replace(moved.states[-1], mode="[/red]\x1b[7mX")
+    say("m1", topics.STATE, b"".join([*moved.payloads[:-1], msgspec.msgpack.encode(record)]))
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
     say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
-    out = io.StringIO()
-    with SessionDisplay(SCENARIO, TextConsole(file=out, force_terminal=terminal, width=160)) as display:
+    with display:
         watch.poll()
         assert list(watch.latest) == ["m1"]
-        for _ in range(LINE_EVERY):
-            display.update(watch)
-        for sentence in watch.take_news():
-            display.say(sentence)
-    assert watch.take_news() == []
+        clock.sleep_until(clock.monotonic_ns() + LINES_NS)
+        watch.poll()
+    assert out.getvalue().count("s is gone") == 1
     assert "[/red] s is gone [x]" in out.getvalue()
     assert "m1" in out.getvalue()
     assert "|e|" in out.getvalue()

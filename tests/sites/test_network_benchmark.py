@@ -17,8 +17,8 @@ from sites.network_benchmark import (
 )
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
+from tests.net.local_bus import LocalNetwork
 from trilat_net.net import topics
-from trilat_net.net.bus import LocalNetwork
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.results import Result
 

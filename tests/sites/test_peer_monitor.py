@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import pytest
 
 from sites.peer_monitor import PeerMonitor
+from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.parties import told
 from trilat_net.net import topics
-from trilat_net.net.bus import LocalBus, LocalNetwork
 from trilat_net.net.membership import EventPublisher, liveliness_token, read_events
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
@@ -24,7 +24,7 @@ class Desk:
         bus = self.network.join()
         self._publisher = EventPublisher(bus, "t", told("m1", 1))
         self.company = PeerMonitor(bus, "t", "m1", ("m2", "s"))
-        self.company.admit(BOOTS)
+        self.company.boots = BOOTS
 
     def comes(self, member: str, boot: int) -> LocalBus:
         bus = self.network.join()

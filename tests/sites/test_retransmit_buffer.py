@@ -4,8 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.retransmit_buffer import EVENTS_KEPT, KEPT_S, RECORDS_KEPT, ChannelBuffer, RetransmitBuffer
+from tests.net.local_bus import LocalNetwork
 from trilat_net.net import topics
-from trilat_net.net.bus import Inbox, LocalNetwork
+from trilat_net.net.bus import Inbox
 from trilat_net.net.messages import VERSION
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, Backfill, BackfillRequest
 from trilat_net.net.wire import MAX_BYTES, decode, encode

@@ -13,10 +13,12 @@ from .visits import S, Visit, link_stats, ping_sites
 def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
     party = Party(("m", "s"))
     party.start("m", "recorder")
-    reached = Visit(party).look().reached()
-    assert [reach.info.member for reach in reached] == ["m", "recorder"]
-    assert all(len(reach.rtts_ns) >= 10 for reach in reached)
-    assert all(reach.shared and reach.estimate.bound_at(10**15, 0) == 0 for reach in reached)
+    found = Visit(party).look().report().members
+    assert [facts["member"] for facts in found] == ["m", "recorder"]
+    assert all(facts["answers"] >= 10 for facts in found)
+    assert all(
+        (facts["same_clock"], facts["offset_ns"], facts["bound_us"]) == (True, 0, 0.0) for facts in found
+    )
     assert party.members["m"].joining.membership.missing() == ["s"]
     party.start("s")
     party.agreed()
@@ -27,12 +29,16 @@ def test_a_clock_that_is_another_one_is_found() -> None:
     away = SkewedClock(party.clock, 3 * S, 50_000)
     party.start("m")
     party.start("s", on_clock=away)
-    (_, reach) = Visit(party).look().reached()
-    assert not reach.shared
+    probe = Visit(party).look()
+    (_, facts) = probe.report().members
+    assert not facts["same_clock"]
+    estimate = probe.pinger.estimate(probe.infos["s"].boot)
+    bound_us = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
+    assert (facts["offset_ns"], facts["bound_us"]) == (estimate.offset_ns, bound_us)
     now_ns = party.clock.monotonic_ns()
     truth = away.monotonic_ns() - now_ns
-    value = reach.estimate.offset_at(now_ns)
-    assert abs(truth - value) <= reach.estimate.bound_at(now_ns, value) + 2
+    value = estimate.offset_at(now_ns)
+    assert abs(truth - value) <= estimate.bound_at(now_ns, value) + 2
 
 
 def test_who_answers_no_ping_is_shown_without_any() -> None:
@@ -45,14 +51,15 @@ def test_who_answers_no_ping_is_shown_without_any() -> None:
         while (question := questions.poll()) is not None:
             question.answer(encode(told("s", 9, clock="far away")))
         party.clock.sleep_until(party.clock.monotonic_ns() + S // 10)
-    reach = visit.look().reached()[-1]
-    assert (reach.info.member, reach.rtts_ns, reach.estimate) == ("s", (), None)
+    facts = visit.look().report().members[-1]
+    assert (facts["member"], facts["answers"]) == ("s", 0)
+    assert not {"rtt_us", "jitter_us", "offset_ns", "bound_us"} & facts.keys()
 
 
 def test_nobody_there_is_over_after_the_time_that_it_was_given() -> None:
     party = Party(("m", "s"))
     probe = Visit(party).look(2 * S)
-    assert probe.reached() == []
+    assert probe.report().members == []
     assert 0 <= party.clock.monotonic_ns() - 10**9 - 2 * S <= S // 10
 
 
@@ -81,7 +88,7 @@ def test_it_waits_a_little_for_the_others() -> None:
         party.clock.sleep_until(party.clock.monotonic_ns() + 2_000_000)
         if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHER_NS // 3:
             member = party.member("s")
-    assert {reach.info.member for reach in visit.probe.reached()} == {"m", "s"}
+    assert {facts["member"] for facts in visit.probe.report().members} == {"m", "s"}
 
 
 def test_its_json_is_as_documented() -> None:

@@ -8,13 +8,15 @@ import pytest
 from rich.console import Console
 
 from live.session_frames import SessionFrames, show_event
-from live.terminal_watch import HEADS, SessionWatch, describe_row, frame_alarms
-from sites.session_stop import order_sites, stop_session
+from live.terminal_watch import SessionWatch
+from sites.monitor import SiteRow, describe_row, frame_alarms
+from sites.running_session import order_sites, stop_session
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
-from trilat_net.net.bus import Bus, LocalNetwork
+from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
@@ -26,7 +28,7 @@ LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={})
     said: list[str] = []
-    shown: list[list[list[str]]] = []
+    shown: list[list[SiteRow]] = []
     titles: list[str] = []
 
     def stop(bus: Bus, clock: RelayClock) -> None:
@@ -50,7 +52,7 @@ def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_
     assert said == [f"{name} ends at t = {ticks / 1000:.3f} s" for name in log.sites]
     assert log.complete
     assert verify(log).identical == 3 * ticks
-    last = [dict(zip(HEADS, row, strict=True)) for row in shown[-1]]
+    last = shown[-1]
     assert [row["site"] for row in last] == ["m1", "m2", "s"]
     assert last[0]["angles"] == " ".join(f"{q:+.3f}" for q in log["m1"].q[-1]) + " rad"
     assert [row["held"] for row in last] == ["free", "", ""]

@@ -1,6 +1,6 @@
 """A visitor of a party: a ping of a session that is on its way or runs, on the party's clock."""
 
-from sites.session_ping import PingReport, SessionPing, describe_ping
+from sites.session_ping import PingReport, SessionPing
 from tests.net.parties import SESSION, Party
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
@@ -46,4 +46,4 @@ def ping_sites() -> PingReport:
     party.start("s", on_clock=SkewedClock(party.clock, 3 * S, 50_000))
     visit = Visit(party)
     party.say("m", encode(link_stats()), topics.LINK)
-    return describe_ping(SESSION, visit.look())
+    return visit.look().report()

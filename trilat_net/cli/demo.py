@@ -1,6 +1,5 @@
 """`trilat demo`: runs a scenario live on this machine, a process per site and recorder, and reports."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,6 @@ if TYPE_CHECKING:
     from sites.demo_session import SessionAttendant
 
     from ..scenario import Scenario
-
-    Attend = Callable[[Callable[[str], None]], SessionAttendant] | None
 
 
 def demo_command(
@@ -33,11 +30,16 @@ def demo_command(
 
 
 def run_and_report(
-    chosen: "Scenario", folder: Path | None, attend: "Attend" = None, *, force: bool, png: bool, as_json: bool
+    chosen: "Scenario",
+    folder: Path | None,
+    attend: "SessionAttendant | None" = None,
+    *,
+    force: bool,
+    png: bool,
+    as_json: bool,
 ) -> None:
-    """Runs a scenario live, then verifies and reports; what `attend` makes may end it as planned."""
+    """Runs a scenario live, then verifies and reports; what `attend` yields may end it as planned."""
     from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
 
@@ -46,8 +48,7 @@ def run_and_report(
         terminal.print_text(chosen.title or chosen.name)
         members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
-        with SessionDisplay(chosen, terminal.out) as display:
-            outcome = run_demo(chosen, results, display, attend and attend(display.say))
+        outcome = run_demo(chosen, results, terminal.out, attend)
     for problem in outcome.problems:
         terminal.print_error(problem)
     there = outcome.log.exists()

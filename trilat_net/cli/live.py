@@ -47,10 +47,12 @@ def live_command(
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
     """
-    from live.live_session import LONGEST_S, PageOptions, attend_with_page, watch_with_page
+    from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
+    from live.terminal_watch import watch_session
 
     from ..net.clock import SystemClock
 
+    clock, say = SystemClock(), terminal.print_line
     page = PageOptions(host, port, insecure, browser)
     page.check()
     if session is not None:
@@ -61,11 +63,11 @@ def live_command(
             )
         connection = options.resolve_client_connection(connect, router, zenoh_config, keys)
         name = options.check_session_name(session)
-        code = watch_with_page(name, connection, page, SystemClock(), terminal.print_line, 10.0)
-        raise typer.Exit(code)
+        show = partial(show_on_page, page, clock, name, say)
+        raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
     if connect or router or zenoh_config or keys:
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     longest_s = LONGEST_S if duration is None else duration
     chosen = options.load_chosen_scenario(scenario, overrides, longest_s, seed)
-    attend = partial(attend_with_page, page, SystemClock())
+    attend = partial(attend_with_page, page, clock)
     run_and_report(chosen, folder, attend, force=force, png=png, as_json=as_json)

@@ -12,7 +12,6 @@ from ..errors import UsageError
 
 if TYPE_CHECKING:
     from ..net.connection import Connection
-    from ..net.member_keys import MemberKeys
     from ..scenario import Scenario
 
 
@@ -262,7 +261,7 @@ def resolve_connection(
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     connection = resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
-    return secure_connection(connection, read_keys(keys), insecure=insecure)
+    return secure_connection(connection, keys, insecure=insecure)
 
 
 def resolve_client_connection(
@@ -281,15 +280,6 @@ def resolve_client_connection(
 
     connection = resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
     return connection.require(OPERATOR) if operates else connection
-
-
-def read_keys(folder: Path | None) -> "MemberKeys | None":
-    """Returns a member's keys, None without a folder."""
-    if folder is None:
-        return None
-    from ..net.member_keys import read_member_keys
-
-    return read_member_keys(folder)
 
 
 ResultsOption = Annotated[

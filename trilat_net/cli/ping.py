@@ -76,7 +76,7 @@ def ping_command(
     if answer:
         return _answer(answer, keys, seconds, insecure=insecure)
     _refuse_others(context, "")
-    from sites.session_ping import describe_ping, ping_session
+    from sites.session_ping import ping_session
 
     from ..net.clock import make_system_clock
     from ..process import Interrupt
@@ -84,12 +84,11 @@ def ping_command(
     connection = options.resolve_client_connection(connect, router, zenoh_config, keys, operates=False)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
-        probe = ping_session(
+        found = ping_session(
             connection, clock, options.check_session_name(session), count, timeout, interrupt.requested
         )
-        if probe is None:
+        if found is None:
             raise typer.Exit(interrupt.exit_code)
-    found = describe_ping(session, probe)
     terminal.print_result(found, as_json=as_json)
     if not any(member["answers"] for member in found.members):
         raise typer.Exit(1)

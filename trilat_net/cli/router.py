@@ -37,16 +37,14 @@ def router_command(
     """
     from ..net.access_rules import ROUTER
     from ..net.clock import SystemClock
-    from ..net.connection import open_bus, resolve_router_connection, run_router, secure_connection
+    from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
     from ..process import Interrupt
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    owned = options.read_keys(keys)
-    places = [LOOPBACK if owned is None else ANY_ADDRESS]
-    connection = secure_connection(
-        resolve_router_connection(listen, connect, file, places), owned, insecure=insecure
-    ).require(ROUTER)
+    places = [LOOPBACK if keys is None else ANY_ADDRESS]
+    named = resolve_member_connection(listen, connect, None, file, places, (), routes=True)
+    connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)

@@ -104,18 +104,16 @@ def set_dominance_command(
 
 
 def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
-    from ..net.clock import SystemClock
-    from ..net.discovery import request_change
+    from sites.running_session import RunningSession
+
     from ..net.requests import ChangeRequest
-    from ..scenario import embedded_names_reader
     from ..scenario.fields import check_finite
 
     session, connection = context.obj
     check_finite(order, "")  # a message holds no others
     if session is None:
         raise UsageError("the session is missing: trilat set --session ID ...")
-    request, names = ChangeRequest(**order), embedded_names_reader(session)
-    reply = request_change(connection, SystemClock(), session, site, request, names)
+    reply = RunningSession(session, connection).change(site, ChangeRequest(**order))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
     terminal.print_text(reply.text)

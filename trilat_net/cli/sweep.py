@@ -108,15 +108,13 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
 def _run_live(name: str, scenario: "Scenario", cell: str) -> "LiveSession":
     """Runs the scenario of a cell over a network, in a folder of its own."""
     from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
     from ..studies.sweep.live_confirmation import LiveSession
 
     folder = make_results_folder(None, f"confirm-{name}-{cell}", force=False)
     terminal.print_text(f"{cell}: {scenario.duration_s:g} s live, into {folder}")
-    with SessionDisplay(scenario, terminal.out) as display:
-        outcome = run_demo(scenario, folder, display)
+    outcome = run_demo(scenario, folder, terminal.out)
     if outcome.interrupted:
         terminal.err.print("interrupted")
         raise typer.Exit(128 + outcome.interrupted)

@@ -120,7 +120,6 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":
     from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
 
     from ..files import make_results_folder
     from ..net.clock import SystemClock
@@ -134,8 +133,7 @@ def _run_live(batch: "list[Trial]") -> "TrialReport":
         folder = make_results_folder(None, f"test-{trial}", force=False)
         terminal.print_text(f"{trial}: {trial.scenario.duration_s:g} s live, into {folder}")
         began_ns = clock.monotonic_ns()
-        with SessionDisplay(trial.scenario, terminal.out) as display:
-            outcome = run_demo(trial.scenario, folder, display)
+        outcome = run_demo(trial.scenario, folder, terminal.out)
         if outcome.interrupted:
             terminal.err.print("interrupted")
             raise typer.Exit(128 + outcome.interrupted)

@@ -1,12 +1,11 @@
-"""The bus: the Protocol of a member's network connection, and an in-process implementation for tests.
+"""The bus: the Protocol of a member's network connection, and the rings in which messages wait.
 
 Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append or a short
 reply; what reads it raises nothing. Messages wait in bounded rings until the loop polls them; on overflow the
 oldest is dropped. Stamped rings count the loss; elsewhere the receiver sees it in the tick numbers. Only the
 recorder takes callbacks.
 
-`zenoh_bus` is the real implementation; `LocalBus` joins members of one process. Both pass the same contract
-tests.
+`zenoh_bus` implements it.
 """
 
 import re
@@ -14,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
 """Capacity of a ring in messages: sixteen seconds of one peer at 1 kHz."""
@@ -159,120 +158,3 @@ class StampingRing(Generic[T]):
             return self._entries.popleft() if self._entries else None
         except IndexError:  # `take` has dropped it since the look
             return None
-
-
-class _LocalQuery(NamedTuple):
-    """A query inside one process."""
-
-    key: str
-    payload: bytes
-    replies: BoundedRing[tuple[str, bytes]]
-
-    def answer(self, payload: bytes) -> None:
-        self.replies.put((self.key, payload))
-
-
-class LocalNetwork:
-    """The network of the `LocalBus`es of one process."""
-
-    def __init__(self) -> None:
-        self.members: list[LocalBus] = []
-
-    def join(self) -> "LocalBus":
-        """Returns the connection of a new member."""
-        member = LocalBus(self)
-        self.members.append(member)
-        return member
-
-
-class LocalBus:
-    """A `Bus` inside one process, without delay and without loss; made by `LocalNetwork.join`."""
-
-    def __init__(self, network: LocalNetwork) -> None:
-        self._network = network
-        self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
-        self._responders: list[tuple[str, Callable[[_LocalQuery], None]]] = []
-        self._presence_rings: list[tuple[str, BoundedRing[tuple[str, bool]]]] = []
-        self._tokens: list[str] = []
-
-    def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
-        """See `Bus`; there is always room."""
-
-        def publish(payload: bytes) -> None:
-            for member in self._network.members:
-                for expression, sink in member._sinks:
-                    if member is not self and matches_key(expression, key):
-                        sink(key, payload)
-
-        return publish
-
-    def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """See `Bus`."""
-        ring = BoundedRing[tuple[str, bytes]](capacity)
-        self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
-        return ring
-
-    def stamped(
-        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
-    ) -> StampedInbox[T]:
-        """See `Bus`."""
-        ring = StampingRing(now_ns, read, capacity)
-        self._sinks.append((key, lambda _, payload: ring.take(payload)))
-        return ring
-
-    def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """See `Bus`."""
-        self._sinks.append((key, callback))
-
-    def questions(self, key: str) -> QueryInbox:
-        """See `Bus`."""
-        ring = BoundedRing[Query]()
-        self._responders.append((key, ring.put))
-        return ring
-
-    def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """See `Bus`."""
-
-        def answer_at_once(query: _LocalQuery) -> None:
-            answered = answer(query.payload)
-            if answered is not None:
-                query.answer(answered)
-
-        self._responders.append((key, answer_at_once))
-
-    def ask(self, key: str, payload: bytes = b"") -> Inbox:
-        """See `Bus`."""
-        replies = BoundedRing[tuple[str, bytes]]()
-        for member in self._network.members:
-            for answered, take in member._responders:
-                if member is not self and matches_key(key, answered):
-                    take(_LocalQuery(answered, payload, replies))
-        return replies
-
-    def announce(self, key: str) -> None:
-        """See `Bus`."""
-        self._tokens.append(key)
-        self._notify(key, True)
-
-    def presence(self, key: str) -> PresenceInbox:
-        """See `Bus`."""
-        ring = BoundedRing[tuple[str, bool]]()
-        for member in self._network.members:
-            for token in member._tokens:
-                if member is not self and matches_key(key, token):
-                    ring.put((token, True))
-        self._presence_rings.append((key, ring))
-        return ring
-
-    def close(self) -> None:
-        """See `Bus`."""
-        if self in self._network.members:
-            self._network.members.remove(self)
-            for token in self._tokens:
-                self._notify(token, False)
-
-    def _notify(self, token: str, alive: bool) -> None:
-        for member in self._network.members:
-            for expression, ring in member._presence_rings:
-                if member is not self and matches_key(expression, token):
-                    ring.put((token, alive))

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import SessionError, UsageError
@@ -98,16 +99,16 @@ class Connection:
     own: Mapping[str, Any] = field(default_factory=dict)
     keys_of: str = ""
 
-    @property
-    def places(self) -> Sequence[Endpoint]:
-        """Endpoints at which others reach this member: its own, or the routers of a client."""
-        return self.reach(self.listen or self.connect or ())
-
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
         """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
         if not self.keys_of:
             return list(endpoints)
         return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
+
+    def open(self) -> ZenohBus:
+        """Opens it; see `ZenohBus`."""
+        listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
+        return ZenohBus(listen, connect, self.mode, self.own)
 
     def require(self, member: str) -> "Connection":
         """Returns itself.
@@ -122,13 +123,19 @@ class Connection:
         return self
 
 
-def secure_connection(connection: Connection, keys: "MemberKeys | None", *, insecure: bool) -> Connection:
-    """Returns a connection with a member's keys; without any it must not be open to a network.
+def secure_connection(
+    connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
+) -> Connection:
+    """Returns a connection with a member's keys, or those of a folder; else it must not be open to a network.
 
     Raises:
-        UsageError: an endpoint is not encrypted, or reached from other machines without keys, or the user's
-            own settings contradict the keys.
+        UsageError: an endpoint is not encrypted, or reached from other machines without keys, the user's own
+            settings contradict the keys, or these cannot be used.
     """
+    if isinstance(keys, str | Path):
+        from .member_keys import read_member_keys  # loads what makes certificates
+
+        keys = read_member_keys(keys)
     own, named = connection.own, (*connection.listen, *(connection.connect or ()))
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
@@ -187,11 +194,13 @@ def resolve_member_connection(
     listen: Sequence[str] | None,
     connect: Sequence[str] | None,
     routers: Sequence[str] | None,
-    file: ZenohFile | None,
-    listen_else: Sequence[str],
-    connect_else: Sequence[str] | None,
+    file: ZenohFile | None = None,
+    listen_else: Sequence[str] = (),
+    connect_else: Sequence[str] | None = None,
+    *,
+    routes: bool = False,
 ) -> Connection:
-    """Returns the connection of a site, a recorder or a tool.
+    """Returns the connection of a site, a recorder or a tool; or of a router, which `routes`.
 
     With a router, named by `--router` or by a file of mode "client", a member listens nowhere and connects to
     nothing else. `listen_else` and `connect_else` hold where neither an option nor the file names endpoints.
@@ -200,6 +209,10 @@ def resolve_member_connection(
         UsageError: options and file contradict each other.
     """
     file = file or ZenohFile("")
+    if routes:
+        if file.mode not in ("", "router"):
+            raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
+        return _join_options(listen, connect, file, "router", listen_else, ())
     if file.mode == "router":
         raise UsageError(f"{file.source}: mode: router is for `trilat router`; here it is peer or client")
     if not routers and file.mode != "client":
@@ -220,23 +233,6 @@ def resolve_member_connection(
     if not chosen:
         raise UsageError(f"{where}: there is no router to connect to; name it with --router")
     return Connection((), chosen, "client", file.settings)
-
-
-def resolve_router_connection(
-    listen: Sequence[str] | None,
-    connect: Sequence[str] | None,
-    file: ZenohFile | None,
-    listen_else: Sequence[str],
-) -> Connection:
-    """Returns the connection of a router; arguments as for `resolve_member_connection`.
-
-    Raises:
-        UsageError: options and file contradict each other.
-    """
-    file = file or ZenohFile("")
-    if file.mode not in ("", "router"):
-        raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
-    return _join_options(listen, connect, file, "router", listen_else, ())
 
 
 def _join_options(
@@ -283,10 +279,7 @@ def open_bus(
     begun_ns, printed = clock.monotonic_ns(), False
     while not stopped():
         try:
-            listen, connect = (
-                connection.reach(side or ()) for side in (connection.listen, connection.connect)
-            )
-            return ZenohBus(listen, connect, connection.mode, connection.own)
+            return connection.open()
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None

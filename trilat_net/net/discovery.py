@@ -117,24 +117,6 @@ def _ask_for_sites(
     )
 
 
-def request_change(
-    connection: Connection, clock: Clock, session: str, site: str, request: ChangeRequest, names: SiteNamesOf
-) -> ChangeReply:
-    """Requests a change from the site that carries it out and returns its reply; see `connect_to_session`.
-
-    Raises:
-        SessionError: the session has no such site, has not begun, or the site does not reply.
-    """
-    with connect_to_session(
-        connection, clock, session, names, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S
-    ) as bus:
-        assert bus is not None  # nothing stops it
-        info = find_site_info(bus, clock, session, site, names)
-        if not info.running:
-            raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
-        return send_change(bus, clock, session, site, request)
-
-
 def send_change(bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest) -> ChangeReply:
     """Sends a request to a site of a session that runs, and returns its reply; any member may ask to stop.
 

@@ -13,13 +13,14 @@ from recorder.play.message_source import MessageSource
 from recorder.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions, map_key_to_session
 from recorder.play.player import PlayProgress
 from recorder.play.session_reader import PlaySelection, preload_messages
+from tests.net.local_bus import LocalNetwork
 from tests.net.parties import told
 from tests.net.waiting import drained
 from trilat_net.errors import SessionError
 from trilat_net.execution.virtual import virtual_boot
 from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.net import topics
-from trilat_net.net.bus import Bus, Inbox, LocalNetwork
+from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.discovery import refuse_running_session
 from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
 from trilat_net.net.messages import Event, Info, State

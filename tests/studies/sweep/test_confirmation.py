@@ -182,11 +182,9 @@ def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(scenario: Scenario
     from rich.console import Console
 
     from sites.demo_session import run_demo
-    from sites.monitor import SessionDisplay
 
     def run(wanted: Scenario, _: str) -> LiveSession:
-        with SessionDisplay(wanted, Console(quiet=True)) as display:
-            outcome = run_demo(wanted, tmp_path, display)
+        outcome = run_demo(wanted, tmp_path, Console(quiet=True))
         return LiveSession(outcome.log, outcome.problems)
 
     found = confirm_cell(cell(scenario), run)
