@@ -72,10 +72,9 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
     sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, uses)
     decisive = sampled or compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
     root, verdict, about = decisive.rightmost, decisive.verdict, decisive.basis
-    exact = decisive.deviation_per_s is None
-    if sampled is None:  # in continuous time alone
-        exact = not (conditions.varying or mean_s)
-        about = ", in continuous time" if exact else ", in continuous time, of the mean ages"
+    if sampled is None:  # a law in continuous time, whose ticks are left out
+        about = ", in continuous time" + ", of the mean ages" * bool(conditions.varying or mean_s)
+    exact = sampled is not None and sampled.deviation_per_s is None
     if root is None:
         return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
