@@ -29,7 +29,10 @@ OF_LOGS: dict[str, Callable[[Path], Result]] = {
 EXTERNAL = GOLDEN.parents[1] / "examples" / "external_arm.toml"
 """A scenario of which theory knows no delay margin."""
 OTHERS: dict[str, Callable[[Path], list[Result]]] = {
-    "linear": lambda _: [tn.linear("p_d_margin", over=["control.d=0.3:1"])],
+    "linear": lambda _: [
+        tn.linear("p_d_margin", over=["control.d=0.3:1"]),
+        tn.linear("jitter", {"rate_hz": 200}, pose=(0.1, 0.2), over=["control.d=0.1:0.4"]),
+    ],
     "twin": lambda _: [tn.twin(LOGS[1]), tn.twin(LOGS[1], delta="1e-9:1e-3")],
     "test": lambda _: [tn.check("free", jobs=1)],
     "sweep": lambda folder: [

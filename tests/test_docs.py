@@ -28,11 +28,11 @@ from trilat_net.studies.tuning import final_posture, pareto_search, search_space
 from trilat_net.theory import (
     characteristic_roots,
     equilibrium,
+    floquet,
     linear_analysis,
     linear_edge,
     port_response,
     port_transparency,
-    tick_map,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -131,7 +131,8 @@ STATED: list[tuple[str, str, float, float]] = [
     ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * integrity.MIN_COVERAGE),
     ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
     ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
-    ("linear.md", "Up to 600 numbers", 600, tick_map.MAX_COMPANION_SIZE),
+    ("linear.md", "of at most 60 s", 60, floquet.MAX_PERIOD_S),
+    ("linear.md", "30 s of the draws", 30, floquet.DRAWN_SPAN_S),
     ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),
     ("linear.md", "to a residual of 1e-10", 1e-10, equilibrium.MAX_EQUILIBRIUM_RESIDUAL),
     ("linear.md", "1e-12 of the terms' size", 1e-12, characteristic_roots.ROOT_RESIDUAL_TOLERANCE),

@@ -7,7 +7,7 @@ import pytest
 
 import trilat_net as tn
 from trilat_net.analysis.envelope_trend import EnvelopeTrend
-from trilat_net.analysis.run_end import Stability, classify_log_end
+from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
 from trilat_net.analysis.twin_growth import PushedTwins, TwinGrowth, judge_end_by_twins, judge_twins
 from trilat_net.execution.twins import Push, TwinPath, Twins
 from trilat_net.scenario import load_scenario
@@ -67,6 +67,16 @@ def test_a_run_is_not_stable_where_its_twins_grow() -> None:
         for rate in (-0.55, 0.0, 0.2)
     }
     assert judged == {-0.55: Stability.STABLE, 0.0: Stability.OPEN, 0.2: Stability.NOT_STABLE}
+
+
+@pytest.mark.parametrize(("speed_rad_s", "rate_per_s"), [(1e-4, -0.55), (5e-3, -0.55), (1e-4, 0.0)])
+def test_what_is_left_at_rest_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
+    """1e-4 rad/s are 1 mrad in 10 s; 5e-3 rad/s may be a drift, and what keeps a push may keep going."""
+    end = classify_log_end(tn.simulate("two_sites"))
+    slow = end._replace(behaviour=EndBehaviour.UNDECIDED, end_speed_rad_s=speed_rad_s)
+    judged = judge_end_by_twins(slow, grown(rate_per_s), settles=None, rises=False).stability
+    settled = speed_rad_s < 1e-3 and rate_per_s < 0.0
+    assert judged is (Stability.STABLE if settled else Stability.OPEN)
 
 
 def test_twins_tell_what_is_linear_from_what_is_not() -> None:

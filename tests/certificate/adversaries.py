@@ -349,7 +349,7 @@ ROWS = (
         "1.56 s, d 2.6, if a sample is lost",
         _margin(LOSSY, d=2.6, T_ms=1560.0, duration_s=120.0),
         NEVER_STABLE,
-        "of the mean ages",
+        "of the delays in use",
     ),
     Row("F5=", "1.56 s, d 16, the same", _margin(LOSSY, d=16.0, T_ms=1560.0, duration_s=120.0), STABLE),
     Row("F6", "two pairs that hardly hear of each other", _pairs(*LEARNT, 1e-6), NEVER_STABLE, "apart"),
@@ -409,7 +409,7 @@ class Truth(NamedTuple):
 def find_truth(drawn: Drawn) -> Truth:
     """The truth by the rightmost root and by a run eight times as long, in which operators let go.
 
-    Of random links the roots are those of mean ages, and the longer run alone decides.
+    Of random links the longer run alone decides.
     See `find_wide_truth` for whatever was drawn widely.
     """
     if drawn.wide:

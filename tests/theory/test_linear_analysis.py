@@ -1,6 +1,7 @@
 """What linear analysis says of a scenario, in Python, in words, and as facts."""
 
 import json
+import math
 
 import pytest
 
@@ -8,11 +9,13 @@ from trilat_net.errors import UsageError
 from trilat_net.reporting.figures.root_map import draw_root_map
 from trilat_net.reporting.linear_text import (
     describe_delay_margin,
+    describe_effective_delays,
     describe_equilibrium,
     describe_linear_verdict,
     describe_zero_roots,
     tabulate_roots,
 )
+from trilat_net.scenario import load_scenario
 from trilat_net.theory import LinearAnalysis, analyse_linear_loop
 from trilat_net.theory.linear_analysis import linear_to_json
 
@@ -75,11 +78,51 @@ def test_the_map_has_every_root_and_its_conjugate(calm: LinearAnalysis) -> None:
     assert "zero by structure (2)" in lines
 
 
-def test_several_rates_are_told() -> None:
-    found = analyse_linear_loop("two_sites", ["sites.s.rate_hz=500"], pose=POSE)
-    assert found.sampled is None
-    assert found.verdict == found.continuous.verdict
-    assert any("several rates" in note for note in found.notes)
+def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
+    """Two sites at 40 and 30 Hz that the continuous loop, at the mean ages, calls stable."""
+    given = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
+    control = {"control": {"law": "p_d", "K": 50.0, "d": 2.0}}
+    pair = load_scenario(load_scenario("two_sites", control), given)
+    found = analyse_linear_loop(pair, pose=(0.0, math.pi))
+    assert (found.continuous.verdict, found.verdict) == ("stable", "unstable")
+    assert describe_linear_verdict(found) == (
+        "unstable: the slowest motion goes as exp(0.1802 t / s) at 9.955 rad/s, as computed over the period "
+        "of 0.1 s"
+    )
+    assert any("ticks and delays decide" in note for note in found.notes)
+    assert tabulate_roots(found).rows[0][0] == "0.1802"
+    told = linear_to_json(found)
+    assert told["as_computed"]["span_s"] == 0.1
+    assert told["as_computed"]["deviation_per_s"] is told["continuous"]["span_s"] is None
+
+
+def test_delays_that_are_drawn_tell_how_well_their_roots_are_known() -> None:
+    found = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
+    assert found.sampled is not None
+    assert found.sampled.deviation_per_s is not None
+    words = f"over 30 s of the delays in use, +- {found.sampled.deviation_per_s:.1g} /s"
+    assert describe_linear_verdict(found).endswith(words)
+    assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(found))
+
+
+def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
+    """Over wave lines with springs, the common speed of two joints; the others decay."""
+    control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
+    found = analyse_linear_loop("two_sites", {"scheme": "digital", "control": control}, pose=POSE)
+    text = describe_linear_verdict(found)
+    assert text.startswith(
+        "at the edge: 2 motions keep their speed, and the slowest of the others goes as exp(-0."
+    )
+
+
+def test_a_line_without_losses_has_no_margin() -> None:
+    """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
+    control = {"law": "wave", "b": 60.0, "K": 0.0}
+    given = {"scheme": "digital", "control": control}
+    found = analyse_linear_loop("two_sites", given, pose=POSE, ports=True)
+    assert (found.verdict, found.margin.lossless, found.margin.crossings) == ("at the edge", True, ())
+    assert found.margin.words.startswith("none: waves run along lines without losses")
+    assert found.ports is not None
 
 
 @pytest.mark.parametrize("roots", [0, -1, 61])

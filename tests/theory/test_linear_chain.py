@@ -33,6 +33,7 @@ from trilat_net.theory import LinearLoop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import predict_equilibrium
+from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
@@ -42,7 +43,6 @@ from trilat_net.theory.site_dynamics import (
     differentiate_site_rates,
     evaluate_site_rates,
 )
-from trilat_net.theory.tick_map import compute_sampled_spectrum
 
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]
@@ -165,7 +165,7 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     edge = found.roots[2].s.real - 0.05
     right = sum(2 if root.s.imag else 1 for root in found.roots)
     assert roots_within(loop, complex(edge, -60.0), complex(20.0, 60.0)) == right + 6
-    sampled = compute_sampled_spectrum(case.conditions, case.rest, np.array([r.s for r in found.roots]), 3)
+    sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
     assert sampled is not None
     assert (sampled.zeros, sampled.drifting) == (found.zeros, 0)
     for one, other in zip(sampled.roots, found.roots, strict=True):
@@ -211,8 +211,7 @@ def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
     """Late in a run of 200 Hz one mode is left: its root is fitted to joint 2, a recurrence of two steps."""
     pushed = {"sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(), "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist()}
     case = six(law, rate_hz=200, **pushed)
-    near = np.array([root.s for root in compute_delay_spectrum(case.loop(), 4).roots])
-    found = compute_sampled_spectrum(case.conditions, case.rest, near, 2)
+    found = compute_sampled_spectrum(case.conditions, case.rest, 2)
     assert found is not None
     root, following = (one.s for one in found.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left

@@ -8,6 +8,7 @@ import pytest
 from tests.core.chain_references import ARMS
 from tests.task_arms import planar_task, posed_arms
 from tests.theory.loops import Array
+from tests.theory.tick_recursion import build_recursion
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.reporting.port_text import describe_ports
@@ -16,11 +17,11 @@ from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import find_mean_pose
+from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import derive_operating_conditions
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.theory.port_response import build_admittance
-from trilat_net.theory.tick_map import build_companion_matrix, build_tick_pencil, compute_sampled_spectrum
 
 SLIDERS = """<robot name="sliders"><link name="base"/>
 {links}
@@ -82,8 +83,7 @@ def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
         conditions = derive_operating_conditions(scenario)
         loop = linearise_loop(conditions, rest)
         spectrum = compute_delay_spectrum(loop, 12)
-        near = np.array([root.s for root in spectrum.roots])
-        sampled = compute_sampled_spectrum(conditions, rest, near, 12)
+        sampled = compute_sampled_spectrum(conditions, rest, 12)
         Y = build_admittance(linearise_teleoperator(conditions, rest))(np.array([0.1, 3.0, 40.0]))
         found.append((rest.q, loop, spectrum, sampled, Y))
     (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = found
@@ -157,8 +157,7 @@ def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(name: str) -> None:
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
     angles = [f"{site}.q{n + 1}" for site, n in zip(scenario.names, counts, strict=True) for n in range(n)]
     off = {angle: size * rng.normal() for angle in angles}
-    pencil, names, _ = build_tick_pencil(derive_operating_conditions(scenario), rest)
-    whole, late = build_companion_matrix(pencil), pencil.delayed_states
+    whole, names, late, _ = build_recursion(derive_operating_conditions(scenario), rest)
     start = np.array([off.get(name, 0.0) for name in names])
     X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
     learnt, torques = ([n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau"))
@@ -177,7 +176,7 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
     scenario, rest = settled(name)
     conditions = derive_operating_conditions(scenario)
     near = compute_delay_spectrum(linearise_loop(conditions, rest), 14)
-    found = compute_sampled_spectrum(conditions, rest, np.array([r.s for r in near.roots]), 14)
+    found = compute_sampled_spectrum(conditions, rest, 14)
     assert found is not None
     assert found.verdict == near.verdict == "stable"
     swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]

@@ -14,9 +14,9 @@ from trilat_net.core.vectors import Array
 from trilat_net.errors import ScenarioError
 from trilat_net.theory.characteristic_roots import Spectrum
 from trilat_net.theory.equilibrium import find_equilibrium, follow_equilibrium
+from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_analysis import LinearAnalysis
 from trilat_net.theory.operating_point import derive_operating_conditions
-from trilat_net.theory.tick_map import compute_decisive_spectrum
 
 POSE = (0.3, 0.2)
 
@@ -68,8 +68,8 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
-    found = roots(compute_decisive_spectrum(derive_operating_conditions(theirs), same, 6, 8))
-    known = roots(compute_decisive_spectrum(derive_operating_conditions(ours), rest, 6, 8))
+    found = roots(compute_sampled_spectrum(derive_operating_conditions(theirs), same))
+    known = roots(compute_sampled_spectrum(derive_operating_conditions(ours), rest))
     same_bits = scheme == "second_order"
     assert np.allclose(found[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2)
 

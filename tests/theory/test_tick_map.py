@@ -8,29 +8,24 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.theory.loops import Array
+from tests.theory.tick_recursion import build_recursion
 from tests.virtual_runs import trajectories
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory import find_equilibrium
 from trilat_net.theory.characteristic_roots import Spectrum, compute_delay_spectrum
+from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
-from trilat_net.theory.tick_map import (
-    build_companion_matrix,
-    build_tick_pencil,
-    compute_sampled_spectrum,
-    discretise_zero_order_hold,
-)
+from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.theory.tick_map import discretise_zero_order_hold
 
 POSE = (-0.1729, 0.0874)
-NOTHING = np.zeros(0, dtype=np.complex128)
 
 
 def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
     """Continuous and as computed, about one pose."""
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
-    near = np.array([root.s for root in continuous.roots])
-    found = compute_sampled_spectrum(now, rest, near, wanted)
+    found = compute_sampled_spectrum(now, rest, wanted)
     assert found is not None
     return continuous, found
 
@@ -76,10 +71,9 @@ def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(law: str, scheme: str
     now = derive_operating_conditions(scenario)
     rest = find_equilibrium(scenario, POSE)
     assert rest.residual < 1e-10
-    pencil, names, _ = build_tick_pencil(now, rest)
-    whole = build_companion_matrix(pencil)
+    whole, names, late, _ = build_recursion(now, rest)
     start = {f"{site}.q{j + 1}": off[i, j] for (i, site), j in itertools.product(enumerate("ms"), range(2))}
-    X = begun(whole, pencil.delayed_states, names, np.array([start.get(name, 0.0) for name in names]))
+    X = begun(whole, late, names, np.array([start.get(name, 0.0) for name in names]))
     run = trajectories(scenario)
     q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(POSE, 2)
     places = [names.index(f"{site}.q{j + 1}") for site in "ms" for j in range(2)]
@@ -138,7 +132,7 @@ def test_a_swing_that_grows_is_that_of_a_run() -> None:
         },
     )
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3005, 0.0))
-    found = compute_sampled_spectrum(now, rest, NOTHING, 2)
+    found = compute_sampled_spectrum(now, rest, 2)
     assert found is not None
     root = found.roots[0].s
     run = trajectories(scenario).sites["m"]
@@ -148,26 +142,6 @@ def test_a_swing_that_grows_is_that_of_a_run() -> None:
     peaks = [apart[k : k + half].max() for k in range(0, len(apart) - half, half)]
     slope, _ = np.polyfit(np.arange(len(peaks)) * half / 50, np.log(peaks), 1)
     assert slope == pytest.approx(root.real, rel=0.03)
-
-
-def test_long_delays_give_the_roots_of_the_whole_companion_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = load_scenario("p_d_margin_two", {"rate_hz": 200, "link.delay_ms": 200.0})
-    now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.0))
-    near = np.array([root.s for root in compute_delay_spectrum(linearise_loop(now, rest), 4).roots])
-    whole = compute_sampled_spectrum(now, rest, NOTHING, 4)
-    monkeypatch.setattr("trilat_net.theory.tick_map.MAX_COMPANION_SIZE", 50)
-    found = compute_sampled_spectrum(now, rest, near, 4)
-    assert whole is not None
-    assert found is not None
-    assert (found.zeros, len(found.roots)) == (whole.zeros, len(whole.roots))
-    for one, other in zip(found.roots, whole.roots, strict=True):
-        assert abs(one.s - other.s) < 1e-9
-
-
-def test_several_rates_have_no_one_period() -> None:
-    scenario = load_scenario("two_sites", {"sites.s.rate_hz": 500})
-    rest = Equilibrium(np.tile(POSE, (2, 1)), np.tile(scenario.sites["s"].arm.theta, (2, 1)), "", 0.0)
-    assert compute_sampled_spectrum(derive_operating_conditions(scenario), rest, NOTHING) is None
 
 
 def test_a_held_push_moves_a_mass_by_half_h_squared() -> None:

@@ -40,12 +40,8 @@ from ..results import Result
 from ..scenario import Scenario
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .json_values import finite_or_none
-from .run_end import (
-    EndBehaviour,
-    RunEnd,
-    Stability,
-    find_coupled_sites,
-)
+from .run_end import EndBehaviour, RunEnd, Stability, find_coupled_sites
+from .site_signals import SETTLED_ERROR_RAD
 
 TWINS = 8
 """Twins of a run, unless asked for others."""
@@ -223,6 +219,7 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
 
     What grows away from its twins is not stable, wherever it is; what comes together with them is not said to
     grow. A stable run needs pushes that die away; where small motions are known to settle, none that grows.
+    Arms too slow to get anywhere, all of whose pushes die away, need no trend of the motion that is left.
 
     Args:
         end: the end of the run.
@@ -248,7 +245,9 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
         alone = end.behaviour is EndBehaviour.GROWS and trend is not EnvelopeTrend.GROWS and not rises
         return TwinVerdict(Stability.OPEN, twins.text) if dies or alone else TwinVerdict(own)
     trendless = end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED) and not end.missing_sites
-    if trendless and dies and settles and not (end.reasons or end.operator_acts):
+    stays = end.end_speed_rad_s * (twins.to_s - twins.from_s) <= SETTLED_ERROR_RAD
+    rests = stays and trend is EnvelopeTrend.DECAYS
+    if trendless and dies and (settles or rests) and not (end.reasons or end.operator_acts):
         return TwinVerdict(Stability.STABLE)
     return TwinVerdict(own)
 

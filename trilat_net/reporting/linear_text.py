@@ -63,21 +63,26 @@ def _list_numbers(values: Array) -> str:
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields the effective delays, in one line if they are equal."""
+    """Yields the effective delays, in one line if they are equal; the means of those that vary."""
     names, age_s = analysis.scenario.names, analysis.conditions.age_s
+    what = "mean delay in use" if analysis.conditions.varying else "delay in use"
     links = list(zip(*np.nonzero(analysis.conditions.alpha), strict=True))
     values = {float(age_s[i, j]) for i, j in links}
     if len(values) == 1:
-        yield f"delay in use on every link: {1e3 * values.pop():.4g} ms"
+        yield f"{what} on every link: {1e3 * values.pop():.4g} ms"
         return
     for i, j in links:
-        yield f"delay in use on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
+        yield f"{what} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
 
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
-    """Returns the rightmost roots, with those of the sampled loop next to them if any differs."""
-    roots = analysis.continuous.roots
-    sampled = [analysis.find_sampled_root(root) for root in roots]
+    """Returns the rightmost roots, with those of the sampled loop next to them if any differs.
+
+    Those of the sampled loop alone where ticks differ from each other: the continuous loop has mean delays.
+    """
+    spanned = analysis.decisive.span_s is not None
+    roots = analysis.decisive.roots if spanned else analysis.continuous.roots
+    sampled = [None if spanned else analysis.find_sampled_root(root) for root in roots]
     differ = any(other is not None for other in sampled)
     rows = []
     for root, other in zip(roots, sampled, strict=True):
@@ -97,7 +102,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
     """Returns the number of roots that are zero by structure, in words."""
-    count = analysis.continuous.zeros
+    count = analysis.decisive.zeros
     if not count:
         return "no root at zero"
     are = "root is" if count == 1 else "roots are"
@@ -107,13 +112,16 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns the verdict with the growth rate and frequency of the rightmost root."""
-    rightmost = analysis.decisive.rightmost
+    rightmost, drifting = analysis.decisive.rightmost, analysis.decisive.drifting
+    keeps = f"{drifting} {'motions keep their' if drifting > 1 else 'motion keeps its'} speed"
     if rightmost is None:
-        return f"{analysis.verdict}: nothing moves"
+        return f"{analysis.verdict}: {keeps if drifting else 'nothing moves'}"
     rate = f"exp({rightmost.s.real:.4g} t / s)"
     at = f" at {rightmost.s.imag:.4g} rad/s" if rightmost.s.imag else ""
-    which = "" if analysis.sampled is None else ", as computed tick by tick"
-    return f"{analysis.verdict}: the slowest motion goes as {rate}{at}{which}"
+    computed = analysis.decisive.basis or " tick by tick"
+    which = "" if analysis.sampled is None else f", as computed{computed.removeprefix(',')}"
+    slowest = f"{keeps}, and the slowest of the others" if drifting else "the slowest motion"
+    return f"{analysis.verdict}: {slowest} goes as {rate}{at}{which}"
 
 
 def describe_delay_margin(analysis: LinearAnalysis) -> str:

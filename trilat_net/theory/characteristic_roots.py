@@ -19,7 +19,6 @@ hundred rows out to all cores and busy-waits, which takes a hundred times as lon
 core.
 """
 
-import cmath
 import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -96,20 +95,18 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
 
 
 class Pencil(NamedTuple):
-    """Delta(s) = s I - A - sum_k A_k exp(-s T_k), or (z I - A - sum_k A_k z^-d_k) / h with z = exp(s h).
+    """Delta(s) = s E - A - sum_k A_k exp(-s T_k).
 
     Attributes:
         A: shape (n, n).
-        delays: T_k, s, or d_k, ticks, shape (K,).
+        delays: T_k, s, shape (K,).
         Ad: A_k, shape (K, n, n).
-        period_s: h of a sampled loop, s; None: a continuous one.
         E: 1 of each state that has a rate, 0 of one that the others give at once; None: all have one.
     """
 
     A: Array
     delays: NDArray[Any]
     Ad: Array
-    period_s: float | None = None
     E: Array | None = None
 
     @property
@@ -119,26 +116,21 @@ class Pencil(NamedTuple):
 
     def at(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative, shape (n, n) each."""
-        h_s, eye = self.period_s or 1.0, self.rates
-        lead, slope = (s, 1.0) if self.period_s is None else (cmath.exp(s * h_s),) * 2
-        delayed = np.exp(-s * h_s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
-        delta = (lead * eye - self.A - delayed.sum(axis=0)) / h_s
-        derivative = slope * eye + (self.delays[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
+        delayed = np.exp(-s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
+        delta = s * self.rates - self.A - delayed.sum(axis=0)
+        derivative = self.rates + (self.delays[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def size(self, s: complex) -> float:
         """Returns the sum of the norms of the terms of Delta(s): residuals are relative to it."""
-        h_s = self.period_s or 1.0
-        lead = abs(s) if self.period_s is None else math.exp(s.real * h_s)
-        delayed = np.exp(-s.real * h_s * self.delays) @ np.linalg.norm(self.Ad, axis=(1, 2))
-        return float((lead + np.linalg.norm(self.A) + delayed) / h_s)
+        delayed = np.exp(-s.real * self.delays) @ np.linalg.norm(self.Ad, axis=(1, 2))
+        return float(abs(s) + np.linalg.norm(self.A) + delayed)
 
     def taylor(self, power: int) -> Array:
         """Returns the coefficient of s^power of Delta about 0, shape (n, n)."""
-        lead = 1.0 if self.period_s is not None or power == 1 else 0.0
-        own = lead * self.rates - (self.A if power == 0 else 0.0)
-        scale = (self.period_s or 1.0) ** (power - 1) / math.factorial(power)
-        coefficient: Array = scale * (own - np.einsum("k,kab->ab", (-self.delays) ** power, self.Ad))
+        own = {0: -self.A, 1: self.rates}.get(power, 0.0)
+        late = np.einsum("k,kab->ab", (-self.delays) ** power, self.Ad) / math.factorial(power)
+        coefficient: Array = own - late
         return coefficient
 
     @property
@@ -163,8 +155,7 @@ class MovingPart(NamedTuple):
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     """Returns the part of a loop that moves."""
-    still = 0.0 if pencil.period_s is None else np.eye(len(names))
-    effects = np.abs(pencil.A - still) + np.abs(pencil.Ad).sum(axis=0)  # of state j on the rate of state i
+    effects = np.abs(pencil.A) + np.abs(pencil.Ad).sum(axis=0)  # of state j on the rate of state i
     kept = list(range(len(names)))
     while True:
         inner = effects[np.ix_(kept, kept)]
@@ -217,6 +208,9 @@ class Spectrum(NamedTuple):
         drifting: number of those without a vector of their own, which grow with t.
         dropped: number of candidates that led to no root.
         order: of the discretisation that gave the candidates; 0 if none was needed.
+        span_s: the period of delays and tick rates over which they are computed, or the span of delays that
+            do not repeat, s; None if each tick is like the one before.
+        deviation_per_s: of the rightmost root, if delays do not repeat, by the parts of the span, 1/s.
     """
 
     roots: tuple[CharacteristicRoot, ...]
@@ -224,6 +218,17 @@ class Spectrum(NamedTuple):
     drifting: int
     dropped: int
     order: int
+    span_s: float | None = None
+    deviation_per_s: float | None = None
+
+    @property
+    def basis(self) -> str:
+        """What it is computed over, in words; "" if each tick is like the one before."""
+        if self.span_s is None:
+            return ""
+        if self.deviation_per_s is None:
+            return f", over the period of {self.span_s:.6g} s"
+        return f", over {self.span_s:.4g} s of the delays in use, +- {self.deviation_per_s:.1g} /s"
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
@@ -234,14 +239,13 @@ class Spectrum(NamedTuple):
     def verdict(self) -> str:
         """stable, unstable, or at the edge."""
         re = self.roots[0].s.real if self.roots else -math.inf
-        if re > STABILITY_EDGE_PER_S:
+        edge_per_s = max(STABILITY_EDGE_PER_S, self.deviation_per_s or 0.0)
+        if re > edge_per_s:
             return "unstable"
-        return "at the edge" if re >= -STABILITY_EDGE_PER_S or self.drifting else "stable"
+        return "at the edge" if re >= -edge_per_s or self.drifting else "stable"
 
 
-def _solve_for_root(
-    pencil: Pencil, first: complex, names: Sequence[str], period_rad_s: float
-) -> CharacteristicRoot | None:
+def _solve_for_root(pencil: Pencil, first: complex, names: Sequence[str]) -> CharacteristicRoot | None:
     """Returns the root that Newton's method finds from a first guess, 1/s, or None if it finds none."""
     s = complex(first)
     with np.errstate(all="ignore"):
@@ -266,10 +270,9 @@ def _solve_for_root(
         shares = _measure_participation(pencil, s)
     if shares is None:
         return None
-    imag = math.remainder(s.imag, period_rad_s) if math.isfinite(period_rad_s) else s.imag
     states = np.round(shares[1] / shares[1].max(), 6)  # equal ones stay in their order
     order = [int(n) for n in np.argsort(-states, kind="stable") if states[n] >= _NAMED_SHARE]
-    rounded = complex(s.real, abs(imag) if abs(imag) > SAME_ROOT_TOLERANCE else 0.0)
+    rounded = complex(s.real, abs(s.imag) if abs(s.imag) > SAME_ROOT_TOLERANCE else 0.0)
     return CharacteristicRoot(rounded, shares[0], tuple(names[n] for n in order))
 
 
@@ -315,38 +318,26 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 
 
 def refine_roots(
-    pencil: Pencil,
-    candidates: Complex,
-    names: Sequence[str],
-    wanted: int,
-    tries: int | None = None,
-    period_rad_s: float = math.inf,
+    pencil: Pencil, candidates: Complex, names: Sequence[str], wanted: int
 ) -> tuple[list[CharacteristicRoot], int]:
     """Returns the rightmost `wanted` roots near some candidates, and the number of candidates dropped.
 
-    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after `tries` roots the others
-    are skipped, by default two more than wanted, because Newton's method may change their order. Imaginary
-    parts that differ by `period_rad_s` are the same, as those of sampled loops are.
+    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after two more than wanted the
+    others are skipped, because Newton's method may change their order.
     """
     found: list[CharacteristicRoot] = []
     dropped = 0
     for guess in candidates:
         if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
             continue
-        if len(found) >= (tries or wanted + 2):
+        if len(found) >= wanted + 2:
             break
-        root = _solve_for_root(pencil, complex(guess), names, period_rad_s)
+        root = _solve_for_root(pencil, complex(guess), names)
         if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
             dropped += 1
         elif all(abs(root.s - one.s) >= SAME_ROOT_TOLERANCE * (1.0 + abs(root.s)) for one in found):
             found.append(root)
-    return sorted(found, key=lambda one: -one.s.real)[:wanted], dropped
-
-
-def sort_root_guesses(values: Complex, zeros: int) -> Complex:
-    """Returns eigenvalues without the `zeros` smallest ones, which stand for zeros, by falling real part."""
-    kept = values[np.argsort(np.abs(values), kind="stable")][zeros:]
-    return kept[np.lexsort((np.abs(kept.imag), -kept.real))]
+    return sorted(found, key=lambda one: (-round(one.s.real, 9), one.s.imag))[:wanted], dropped
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
@@ -370,8 +361,10 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
             matrix = discretise_generator(pencil, order) if has_delays else pencil.A
             if pencil.E is not None:
                 matrix = _eliminate_states(matrix, pencil.E)
-            guesses = sort_root_guesses(np.linalg.eigvals(matrix).astype(np.complex128), zeros)
-            roots, dropped = refine_roots(pencil, guesses, names, wanted)
+            values = np.linalg.eigvals(matrix).astype(np.complex128)
+            values = values[np.argsort(np.abs(values), kind="stable")][zeros:]  # the smallest stand for zeros
+            falling = np.lexsort((np.abs(values.imag), -np.round(values.real, 9)))
+            roots, dropped = refine_roots(pencil, values[falling], names, wanted)
             too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
             if not has_delays or too_large or (before is not None and _agree(before, roots)):
                 return Spectrum(tuple(roots), constant + zeros, drifting, dropped, order)

@@ -30,6 +30,8 @@ _POINTS = 600
 _LOWEST = 1e-4
 """The lowest frequency, relative to the highest at which a crossing is possible."""
 _BISECTIONS = 60
+_OUTSIDE = 1.0 + 1e-9
+"""A modulus below this may be 1 but for rounding, as that of a line without losses is at every frequency."""
 
 
 class AxisCrossing(NamedTuple):
@@ -78,14 +80,18 @@ class DelayMargin(NamedTuple):
     Attributes:
         intervals: by rising delay; none if it is unstable for every delay.
         crossings: all up to `MAX_COMMON_DELAY_S`, by rising delay.
+        lossless: True if waves run without losses: roots are on the axis for every delay.
     """
 
     intervals: tuple[DelayInterval, ...]
     crossings: tuple[AxisCrossing, ...]
+    lossless: bool = False
 
     @property
     def words(self) -> str:
         """The delays for which the loop is stable, in words."""
+        if self.lossless:
+            return "none: waves run along lines without losses, and roots are on the axis for every delay"
         if not self.intervals:
             return f"unstable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
         texts = [interval.words for interval in self.intervals]
@@ -108,7 +114,9 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     """Returns the common delays for which a loop is stable; its own delays do not count."""
-    crossings = find_axis_crossings(loop)
+    crossings, lossless = find_axis_crossings(loop)
+    if lossless:
+        return DelayMargin((), (), lossless)
     first_s = min((crossing.delay_s for crossing in crossings), default=0.2)
     count = _count_unstable_roots(set_common_delay(loop, 0.5 * min(first_s, 0.2)))
     intervals: list[DelayInterval] = []
@@ -137,18 +145,23 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
         wanted *= 2
 
 
-def find_axis_crossings(loop: LinearLoop) -> list[AxisCrossing]:
-    """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`."""
+def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
+    """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`.
+
+    And whether roots are on it for every delay, as G has an eigenvalue of modulus 1 at every frequency.
+    """
     pencil = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0)).pencil
     if not len(pencil.delays):
-        return []
+        return [], False
     with characteristic_roots.limit_blas_threads():
         sweep = _FrequencySweep(pencil)
         grid = sweep.grid()
-        crossings = []
-        for place in np.flatnonzero(np.diff(sweep.count_outside(grid))):
+        crossings, moduli = [], np.abs(sweep.eigenvalues(grid))
+        if ((moduli <= _OUTSIDE) & (moduli >= 2.0 - _OUTSIDE)).any(axis=1).all():
+            return [], True
+        for place in np.flatnonzero(np.diff((moduli > _OUTSIDE).sum(axis=1))):
             crossings += sweep.search(float(grid[place]), float(grid[place + 1]))
-    return _merge(crossings)
+    return _merge(crossings), False
 
 
 def _merge(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
@@ -195,7 +208,7 @@ class _FrequencySweep:
 
     def count_outside(self, omega: Array) -> NDArray[np.int64]:
         """Returns the number of eigenvalues with a modulus above 1, shape (K,)."""
-        counts: NDArray[np.int64] = (np.abs(self.eigenvalues(omega)) > 1.0).sum(axis=1)
+        counts: NDArray[np.int64] = (np.abs(self.eigenvalues(omega)) > _OUTSIDE).sum(axis=1)
         return counts
 
     def search(self, low: float, high: float) -> list[AxisCrossing]:

@@ -1,12 +1,15 @@
 """The loop linearised where a recorded run ended, beside the certificate of its log.
 
 Invariant: the roots are those at the log's own end pose and estimates, under the conditions at its end; they
-speak of small motions there. Where a delay varies, or was measured, they are those of the mean age that the
-records have. Only twins are executed.
+speak of small motions there. Where delays are drawn or measured they are those over the very samples that the
+last quarter of the records has in use; mean ages serve for laws that are linearised in continuous time alone.
+Only twins are executed.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import msgspec
 import numpy as np
@@ -22,10 +25,12 @@ from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from ..scenario.delay_models import ConstantDelay
+from .characteristic_roots import compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows
+from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
 from .linear_edge import find_deepest_contact
-from .operating_point import Equilibrium, derive_operating_conditions, is_constant_link
-from .tick_map import compute_decisive_spectrum
+from .linear_loop import linearise_loop
+from .operating_point import Equilibrium, derive_operating_conditions
 
 _ROOTS = 2
 """Roots that are looked for: the rightmost ones."""
@@ -55,7 +60,7 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _no_roots("the run diverged")
     if any(log.changes(site) for site in log.sites):
         return _no_roots("commands changed the loop while it ran")
-    scenario, mean_s = _fix_delays(log)
+    scenario, uses, mean_s = _fix_delays(log)
     try:
         conditions = derive_operating_conditions(scenario, own_laws=False)
         for at, age_s in mean_s.items():
@@ -64,33 +69,47 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
     except ScenarioError as error:
         return _no_roots(error.problem)
-    decisive = compute_decisive_spectrum(conditions, rest, _ROOTS, _ROOTS)
-    root, verdict, exact = decisive.rightmost, decisive.verdict, not (conditions.varying or mean_s)
+    sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, uses)
+    decisive = sampled or compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
+    root, verdict, about = decisive.rightmost, decisive.verdict, decisive.basis
+    if sampled is None:  # a law in continuous time, whose ticks are left out
+        about = ", in continuous time" + ", of the mean ages" * bool(conditions.varying or mean_s)
+    exact = sampled is not None and sampled.deviation_per_s is None
     if root is None:
         return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    mean = "" if exact else ", of the mean ages"
-    return EndPoseRoots(
-        verdict, root.s.real, exact, f"this rest: {verdict}, {root.s.real:+.3g} /s{omega}{mean}"
-    )
+    drift = f"{decisive.drifting} of its motions keep their speed, the others " * bool(decisive.drifting)
+    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{about}"
+    return EndPoseRoots(verdict, root.s.real, exact, text)
 
 
-def _fix_delays(log: Log) -> tuple[Scenario, dict[tuple[int, int], float]]:
-    """Returns the scenario that a log ran, with constant delays in place of those that vary or were measured.
+def _fix_delays(log: Log) -> tuple[Scenario, SamplesInUse | None, dict[tuple[int, int], float]]:
+    """Returns the scenario that a log ran, with constant delays where its records alone know them.
 
-    And per (receiver, sender) of such a link the mean age of the sample in use over the last quarter, s.
+    And if there are such links the samples in use in its last quarter, a missing tick's being those before,
+    and per (receiver, sender) of such a link their mean age, s.
     """
-    names, mean_s, links = log.scenario.names, {}, dict(log.scenario.links)
-    for name in (name for name, link in links.items() if not is_constant_link(link)):
-        peer, site = name.split("->")
-        used = log[site].used[peer]
-        rows = (used >= 0) & (log[site].t_s >= 0.75 * log[site].t_s[-1])
-        if rows.any():
-            age_s = log[site].t_s[rows] - used[rows] / log[peer].rate_hz
-            at = names.index(site), names.index(peer)
-            mean_s[at] = float(age_s.mean())
-            links[name] = ConstantDelay(delay_ms=1e3 * mean_s[at])
-    return msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log), links=links), mean_s
+    known = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
+    unknown = [one.random or one.measured or one.points is not None for one in known.links.values()]
+    if not any(unknown):
+        return known, None, {}
+    sites, links = [log[name] for name in known.names], dict(known.links)
+    common_hz = math.gcd(*(site.rate_hz for site in sites))
+    end = max(1, min(int(site.tick[-1]) * common_hz // site.rate_hz for site in sites))
+    start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
+    used, mean_s = {}, {}
+    for (i, own), (j, peer) in permutations(enumerate(sites), 2):
+        ticks = np.arange(start * own.rate_hz // common_hz, end * own.rate_hz // common_hz)
+        rows = np.maximum(np.searchsorted(own.tick, ticks, side="right") - 1, 0)
+        samples, name = own.used[peer.name][rows], f"{peer.name}->{own.name}"
+        if samples.min() < 0:  # of a peer that never sent, or not yet
+            return known, None, {}
+        used[i, j] = samples - start * peer.rate_hz // common_hz
+        if unknown[[*links].index(name)]:
+            mean_s[i, j] = float((ticks / own.rate_hz - samples / peer.rate_hz).mean())
+            links[name] = ConstantDelay(delay_ms=1e3 * mean_s[i, j])
+    fixed = msgspec.structs.replace(known, links=links)
+    return fixed, SamplesInUse((end - start) / common_hz, used), mean_s
 
 
 def _no_roots(why: str) -> EndPoseRoots:

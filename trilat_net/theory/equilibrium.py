@@ -130,7 +130,6 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
-    """Returns what is in the loop of all states of every site, one site after the other."""
     masks = linear_loop.find_loop_states(conditions)
     return np.concatenate([own[mask] for own, mask in zip(states, masks, strict=True)])
 
@@ -152,7 +151,8 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
         effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
         # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
-        free = [n for n, name in enumerate(loop.names) if not _is_speed(name) and np.any(effects[n])]
+        speeds = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
+        free = np.flatnonzero(effects.any(axis=1) & ~np.array(speeds))
         step = np.zeros(len(loop.names))
         step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
         share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
@@ -166,11 +166,6 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
             break
         rest, residual = tried, after
     return rest._replace(residual=float(np.abs(residual).max()))
-
-
-def _is_speed(state: str) -> bool:
-    """True of the name of a joint's velocity, as "m1.qd2"."""
-    return state.rpartition(".")[2].rstrip("0123456789") == "qd"
 
 
 def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:

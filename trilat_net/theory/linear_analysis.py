@@ -1,7 +1,7 @@
 """Linear analysis of a scenario: equilibrium, roots, delay margin, verdict and notes, also as JSON values.
 
-Invariant: the verdict is that of the sampled loop where all sites have one rate, of the continuous loop
-otherwise. It holds for small motions about the equilibrium only.
+Invariant: the verdict is that of the sampled loop, at any tick rates and delays; of the continuous loop where
+a law is linearised in continuous time alone. It holds for small motions about the equilibrium only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +19,13 @@ from ..scenario.describe import IRREVERSIBLE_SHARES, describe_law_conditions, la
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium
+from .floquet import compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, linearise_loop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .site_dynamics import share_own_pose
-from .tick_map import compute_sampled_spectrum, find_common_rate_hz
 
 DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
@@ -43,7 +43,7 @@ class LinearAnalysis(Result):
         rest: the equilibrium.
         loop: the linear loop there.
         continuous: roots of the delay-differential equation.
-        sampled: roots of the sampled loop; None if the sites have several rates.
+        sampled: roots of the sampled loop; None if a law is linearised in continuous time alone.
         margin: the common delays for which the continuous loop is stable.
         scans: where stability changes along keys, of `analyse_linear_loop`.
         ports: the haptic ports of the operators, likewise; None if nobody asked.
@@ -83,12 +83,11 @@ class LinearAnalysis(Result):
     def notes(self) -> tuple[str, ...]:
         """Remarks on conditions, equilibrium and roots."""
         notes = [*self.conditions.notes, *self.rest.notes]
-        if find_common_rate_hz(self.conditions) is None:
-            notes.append("sites tick at several rates: only the continuous loop is linearised")
-        elif self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
+        if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
+            decides = "the tick rate decides" if self.sampled.span_s is None else "ticks and delays decide"
             notes.append(
                 f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
-                f"{self.sampled.verdict}: the tick rate decides"
+                f"{self.sampled.verdict}: {decides}"
             )
         if self.decisive.drifting:
             notes.append(
@@ -157,8 +156,7 @@ def analyse_linear_loop(
     rest = find_equilibrium(scenario, pose)
     loop = linearise_loop(conditions, rest)
     continuous = compute_delay_spectrum(loop, roots)
-    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    sampled = compute_sampled_spectrum(conditions, rest, near, roots)
+    sampled = compute_sampled_spectrum(conditions, rest, roots)
     found = LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
     scans = tuple(
         EdgeScan(key, low, high, tuple(iterate_linear_edges(scenario, key, low, high, rest)))
@@ -224,4 +222,6 @@ def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
         "of_those_drifting": spectrum.drifting,
         "dropped_candidates": spectrum.dropped,
         "order": spectrum.order,
+        "span_s": spectrum.span_s,
+        "deviation_per_s": spectrum.deviation_per_s,
     }

@@ -19,15 +19,13 @@ from ..errors import ScenarioError, UsageError
 from ..scenario import Scenario, load_scenario
 from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
 from .equilibrium import choose_equilibrium, find_equilibrium, find_mean_pose, follow_equilibrium
+from .floquet import compute_sampled_spectrum
 from .linear_loop import linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import place_arm
-from .tick_map import compute_decisive_spectrum
 
 EDGE_SCAN_POINTS = 24
 EDGE_TOLERANCE = 1e-6
-_CONTINUOUS_GUESSES = 4
-"""Number of continuous roots from which the sampled ones are sought."""
 _LOGARITHMIC = 20.0
 """A range with a larger ratio of its ends is scanned in equal steps of the logarithm."""
 _LEAST_PER_S = -1e3
@@ -45,11 +43,10 @@ def find_rightmost_root(
 ) -> CharacteristicRoot | None:
     """Returns the rightmost root about an equilibrium; None if there are only those at zero.
 
-    It is of the sampled loop if asked for, and if the sites have one rate.
+    It is of the sampled loop if asked for, and unless a law is linearised in continuous time alone.
     """
-    if sampled:
-        return compute_decisive_spectrum(conditions, rest, 1, _CONTINUOUS_GUESSES).rightmost
-    return compute_delay_spectrum(linearise_loop(conditions, rest), 1).rightmost
+    spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
+    return (spectrum or compute_delay_spectrum(linearise_loop(conditions, rest), 1)).rightmost
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:

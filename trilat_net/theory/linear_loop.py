@@ -125,7 +125,6 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 
 
 def _share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns what each site shares of its pose at an equilibrium."""
     return [
         site_dynamics.share_own_pose(site, q[: site.layout.joints])
         for site, q in zip(conditions.sites, rest.q, strict=True)

@@ -96,7 +96,6 @@ class NumericLaw:
         return x[memory]
 
     def _lay_out(self, setup: SiteSetup) -> Array:
-        """Returns the arguments at the start."""
         n, start = self._layout.joints, np.array(setup.q0)
         rest = np.zeros(n)
         peers = [np.r_[link.q0, rest, rest] for link in setup.links]
@@ -149,7 +148,6 @@ class NumericLaw:
 
 
 def _name_memory(law: Any, count: int) -> tuple[str, ...]:
-    """Returns the names of what a law remembers."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
     sizes = {name: np.size(getattr(law, name)) for name in list_remembered(law)}

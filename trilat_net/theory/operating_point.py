@@ -9,7 +9,8 @@ as a run makes.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,6 +70,7 @@ class OperatingConditions(NamedTuple):
         notes: remarks on what was left out or fixed.
         varying: True if ages vary, and `age_s` holds their means.
         laws: the control of each site.
+        links: the link from j to i in force and the key of its draws, by (i, j).
     """
 
     sites: tuple[SiteSetup, ...]
@@ -77,6 +79,7 @@ class OperatingConditions(NamedTuple):
     notes: tuple[str, ...]
     varying: bool = False
     laws: tuple[Any, ...] = ()
+    links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
         """Returns what laws add to their gains in small motions, with the inertia of their arms."""
@@ -105,14 +108,14 @@ class OperatingConditions(NamedTuple):
         return tuple(site.name for site in self.sites)
 
     @property
-    def digital(self) -> bool:
-        """True if the controllers are plain digital ones, which the continuous loop only approximates."""
-        return self.sites[0].scheme is Scheme.DIGITAL
-
-    @property
     def held(self) -> bool:
-        """True if the sampled loop alone tells what the tick does: digital controllers, sampled actors."""
-        return self.digital or any(actor.sampled for site in self.sites for actor in site.actors)
+        """True if the sampled loop alone tells what the tick does: digital controllers, sampled actors.
+
+        Or what ages do that vary and are not drawn.
+        """
+        known = self.varying and not any(link.random for link, _ in self.links.values())
+        digital = self.sites[0].scheme is Scheme.DIGITAL
+        return known or digital or any(actor.sampled for site in self.sites for actor in site.actors)
 
     def rates(self, x: Sequence[Array]) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
@@ -145,21 +148,25 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
         pairs = [(i, j) for i in range(len(alpha)) for j in range(len(alpha)) if i != j]
     if conditions.has_forms:
         notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
+    links = {}
     for i, j in pairs:
-        age = _final_age(scenario, scenario.names[j], scenario.names[i], notes)
+        peer, own = scenario.names[j], scenario.names[i]
+        link = _find_final_link(scenario, f"{peer}->{own}", notes)
+        links[i, j] = link, link_key(scenario.seed, f"{peer}->{own}")
+        age = compute_effective_delay(scenario, peer, own, link)
         age_s[i, j] = age.mean_s
-        if age.most_s > age.least_s:
+        if age.most_s > age.least_s + 1e-8:  # more than ticks in whole ns
             varying.append(age)
     if varying:
         least, most = 1e3 * min(age.least_s for age in varying), 1e3 * max(age.most_s for age in varying)
-        links = "one link" if len(varying) == 1 else f"{len(varying)} links"
+        where = "one link" if len(varying) == 1 else f"{len(varying)} links"
         notes.append(
-            f"the age of the samples in use varies on {links}, {least:.4g} to {most:.4g} ms: linearised at "
-            "the mean of each; the effect of the variation itself is left out"
+            f"the age of the samples in use varies on {where}, {least:.4g} to {most:.4g} ms: the continuous "
+            "loop is linearised at the mean of each, and leaves out the effect of the variation itself"
         )
     if any(site.on_stale.action is not StaleAction.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
-    return conditions._replace(notes=tuple(dict.fromkeys(notes)), varying=bool(varying))
+    return conditions._replace(notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links)
 
 
 def is_constant_link(link: LinkBase) -> bool:
@@ -201,8 +208,8 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
     return found
 
 
-def _final_age(scenario: Scenario, peer: str, site: str, notes: list[str]) -> EffectiveDelay:
-    name, end_ns = f"{peer}->{site}", round(scenario.duration_s * 1e9)
+def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBase:
+    end_ns = round(scenario.duration_s * 1e9)
     link: LinkBase = scenario.links[name]
     for from_ns, later in scheduled_links(scenario.timeline, name):
         link = later if from_ns <= end_ns else link
@@ -216,7 +223,7 @@ def _final_age(scenario: Scenario, peer: str, site: str, notes: list[str]) -> Ef
         notes.append(f"link {name} changes during the run: taken as it is at the end, {link.describe()}")
     if link.outages_s:
         notes.append(f"the outages of link {name} are left out")
-    return compute_effective_delay(scenario, peer, site, link)
+    return link
 
 
 def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: LinkBase) -> EffectiveDelay:
@@ -233,19 +240,9 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
         age_s = max(1, -(-delay_us * own_hz // 1_000_000)) / own_hz
         return EffectiveDelay(age_s, age_s, age_s)
     duration_s = min(scenario.duration_s, 2.0 + 2e-6 * model.location) if constant else scenario.duration_s
-    age = _count_ages(link, link_key(scenario.seed, f"{peer}->{site}"), own_hz, peer_hz, duration_s)
-    if age is None:
-        raise ScenarioError("no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name)
-    return age
-
-
-def _count_ages(
-    link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
-) -> EffectiveDelay | None:
-    """Returns the ages from the first sample in use on."""
-    used = draw_uses(link, key, own_hz, peer_hz, duration_s)
+    used = draw_uses(link, link_key(scenario.seed, f"{peer}->{site}"), own_hz, peer_hz, duration_s)
     if used[-1] < 0:
-        return None
+        raise ScenarioError("no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name)
     first = int(np.argmax(used >= 0))
     now_ns = np.arange(first, len(used)) * NS_PER_S // own_hz
     ages_s = (now_ns - used[first:] * NS_PER_S // peer_hz) * 1e-9

@@ -231,7 +231,6 @@ def analyse_ports(
 
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
-    """Returns the place of the site of each port among the sites of the ports."""
     sites = port_response.list_port_sites(loop)
     return np.array(
         [sites.index(port_response.parse_port_site(port)) for port in loop.inputs], dtype=np.int64

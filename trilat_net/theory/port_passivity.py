@@ -167,6 +167,7 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     shape = np.broadcast_to(_LOG_REACH**2 * free * np.eye(free), (count, free, free)).copy()
     margin = np.full(count, -np.inf)
     active = np.arange(count)
+    most = 2.0 * np.trace(scaled, axis1=1, axis2=2).real / scaled.shape[1]  # their mean, whatever the weights
     for _ in range(_MAX_ROUNDS):
         value, slope = _value_and_slope(scaled[active], centre[active], owner)
         better = value > margin[active]
@@ -174,6 +175,7 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
         along = np.einsum("fij,fj->fi", shape[active], slope)
         gain = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, along), 0.0))  # at most
         more = gain > _WEIGHT_TOLERANCE * np.maximum(np.abs(margin[active]), 1e-6)
+        more &= most[active] - margin[active] > EIGENVALUE_ROUNDING
         active, along = active[more], (along[more] / gain[more, np.newaxis])
         if not len(active) or free == 0:
             break

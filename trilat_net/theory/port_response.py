@@ -201,7 +201,6 @@ def _find_angles(loop: LinearLoop, ports: list[int]) -> list[int]:
 
 
 def _add_spring(loop: LinearLoop, site: str, load: PortLoad) -> LinearLoop:
-    """Returns the loop with an additional u = -K q - B qd at a site."""
     ports = find_site_ports(loop, site)
     back = np.zeros((len(loop.inputs), len(loop.names)))
     back[ports] = load.B_nm_s_rad * loop.C[ports]

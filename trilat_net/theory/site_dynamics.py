@@ -192,7 +192,6 @@ def has_estimate(site: SiteSetup) -> bool:
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
-    """Returns a vector repeated in as many columns as `like` has."""
     column = np.asarray(values, dtype=np.float64)
     return column.reshape(column.shape + (1,) * (like.ndim - 1)) + np.zeros(like.shape[1:])
 

@@ -218,7 +218,6 @@ class PlacedChain:
             self._links.append(PlacedLink(X, S, J, R_base, place_m))
 
     def _per_joint(self, name: str) -> Numbers:
-        """Returns a number of every joint, shape (n, 1, ...)."""
         values = np.array([getattr(joint, name) for joint in self._chain.joints])
         return values.reshape(-1, *(1,) * (self._q.ndim - 1))
 

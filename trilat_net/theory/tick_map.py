@@ -1,9 +1,9 @@
-"""The sampled loop, linearised tick by tick, and its roots s = ln(z) / h.
+"""The sampled loop, linearised tick by tick: each site over a period of its own rate.
 
-    X_{k+1} = S X_k + sum_d S_d X_{k-d},    z = exp(s h)
+    X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m],    m the sample of j that is in use
 
 Invariant: the arm is exact between ticks under a held torque (zero-order hold); the controller runs its
-stages in their order; a sample of tick m is in use d = max(1, ceil(T / h)) ticks later.
+stages in their order.
 
 `second_order`: theta_k = theta_{k-1} + h/2 (f_{k-1} + f_k) with f the rate of the estimate, and the torque
 on the arm is 1.5 tau_k - 0.5 tau_{k-1}. With eta_k = theta_{k-1} + h/2 f_{k-1} that is
@@ -12,22 +12,17 @@ eta_{k+1} = eta_k + h f_k, and the torque on the arm is tau_k. The memory of a l
 h f = m_k - m_{k-1} it is what the law makes of it.
 """
 
-import itertools
-import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
 from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array
-from . import characteristic_roots
-from .linear_loop import SiteJacobian, couple_sites, differentiate_rates, linearise_loop
+from .characteristic_roots import Pencil, extract_moving_part
+from .linear_loop import SiteJacobian, couple_sites, differentiate_rates
 from .operating_point import Equilibrium, OperatingConditions
-
-MAX_COMPANION_SIZE = 600
-"""The largest companion matrix whose eigenvalues are computed; beyond it Newton's method starts from the
-continuous roots."""
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
@@ -96,93 +91,45 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> 
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
 
 
-def find_common_rate_hz(conditions: OperatingConditions) -> int | None:
-    """Returns the tick rate of all sites, Hz; None if they have several."""
-    rates = {site.rate_hz for site in conditions.sites}
-    return rates.pop() if len(rates) == 1 else None
+class CoupledTicks(NamedTuple):
+    """The sites over a period each, and the effect of what one was on what another is a tick later.
 
-
-def compute_sampled_spectrum(
-    conditions: OperatingConditions, rest: Equilibrium, near: characteristic_roots.Complex, wanted: int = 6
-) -> characteristic_roots.Spectrum | None:
-    """Returns the rightmost roots s = ln(z) / h of the sampled loop; None if the sites have several rates.
-
-    Also where a law has states or waves of its own, which is linearised in continuous time alone.
-
-    If delays are long Newton's method starts `near` the roots of the continuous loop.
+    Attributes:
+        S: of each site by itself, on the diagonal, shape (n, n).
+        effects: of site j on site i, where there is one, shape (n, n) each, by (i, j).
+        names: of the states.
+        owners: the site that each state is of, shape (n,).
+        constant: number of states left out since nothing changes them, or they change nothing.
     """
-    if find_common_rate_hz(conditions) is None or conditions.has_forms:
-        return None
-    pencil, names, constant = build_tick_pencil(conditions, rest)
-    h_s = 1.0 / conditions.sites[0].rate_hz
 
-    def logarithms(matrix: Array) -> characteristic_roots.Complex:
-        """Returns ln(z) / h of the eigenvalues that are not next to zero, 1/s."""
-        z = np.linalg.eigvals(matrix).astype(np.complex128)
-        return (np.log(z[np.abs(z) > 1e-8]) / h_s).astype(np.complex128)
-
-    with characteristic_roots.limit_blas_threads():
-        zeros, drifting = characteristic_roots.count_zero_roots(pencil)
-        size = len(names) + int(pencil.delays.max(initial=0)) * len(pencil.delayed_states)
-        if size <= MAX_COMPANION_SIZE:
-            guesses = characteristic_roots.sort_root_guesses(
-                logarithms(build_companion_matrix(pencil)), zeros
-            )
-            tries = wanted + 2
-        else:
-            guesses = np.concatenate(
-                [near, logarithms(pencil.A), logarithms(pencil.A + pencil.Ad.sum(axis=0))]
-            )
-            guesses = characteristic_roots.sort_root_guesses(guesses[np.abs(guesses) > 1e-6], 0)
-            tries = len(guesses)
-        roots, dropped = characteristic_roots.refine_roots(
-            pencil, guesses, names, wanted, tries, 2.0 * math.pi / h_s
-        )
-    return characteristic_roots.Spectrum(tuple(roots), constant + zeros, drifting, dropped, 0)
+    S: Array
+    effects: dict[tuple[int, int], Array]
+    names: tuple[str, ...]
+    owners: NDArray[np.int64]
+    constant: int
 
 
-def compute_decisive_spectrum(
-    conditions: OperatingConditions, rest: Equilibrium, wanted: int, guesses: int
-) -> characteristic_roots.Spectrum:
-    """Returns the rightmost roots of the sampled loop; of the continuous one if there are several rates.
-
-    The sampled ones are sought near `guesses` roots of the continuous loop.
-    """
-    continuous = characteristic_roots.compute_delay_spectrum(linearise_loop(conditions, rest), guesses)
-    near = np.array([root.s for root in continuous.roots], dtype=np.complex128)
-    return compute_sampled_spectrum(conditions, rest, near, wanted) or continuous
-
-
-def build_companion_matrix(pencil: characteristic_roots.Pencil) -> Array:
-    """Returns the matrix that carries the state, and the past of its delayed part, from tick to tick."""
-    n, delayed = len(pencil.A), pencil.delayed_states
-    depth, c = int(pencil.delays.max(initial=0)), len(delayed)
-    whole = np.zeros((n + depth * c, n + depth * c))
-    whole[:n, :n] = pencil.A
-    for d, Sd in zip(pencil.delays, pencil.Ad, strict=True):
-        whole[:n, n + (d - 1) * c : n + d * c] += Sd[:, delayed]
-    if depth:
-        whole[n + np.arange(c), delayed] = 1.0
-        whole[n + c :, n : n + (depth - 1) * c] = np.eye((depth - 1) * c)
-    return whole
-
-
-def build_tick_pencil(conditions: OperatingConditions, rest: Equilibrium) -> characteristic_roots.MovingPart:
-    """Returns the part of the sampled loop that moves; all sites must have one rate."""
-    h_s = 1.0 / conditions.sites[0].rate_hz
+def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
+    """Returns what moves of the sites over a period of their own rates, and their effects on each other."""
     sites = differentiate_rates(conditions, rest)
-    maps = [linearise_site_tick(*one, h_s) for one in zip(conditions.sites, sites, strict=True)]
-    ends = np.cumsum([0, *(len(one.P) for one in maps)])
-    at = [slice(a, b) for a, b in itertools.pairwise(ends)]
-    S = block_diag(*(one.P for one in maps))
-    Sd: dict[int, Array] = {}
-    for (i, j), coupling in couple_sites(conditions, rest, sites).items():
-        d = max(1, round(float(conditions.age_s[i, j]) / h_s))
-        S_d = Sd.setdefault(d, np.zeros_like(S))
-        S_d[at[i], at[j]] += maps[i].Q @ coupling @ maps[j].sent
-    ticks = np.array(sorted(Sd), dtype=np.int64)
-    delayed = np.array([Sd[int(d)] for d in ticks]).reshape(-1, *S.shape)
-    moving = characteristic_roots.extract_moving_part(
-        characteristic_roots.Pencil(S, ticks, delayed, h_s), [name for one in maps for name in one.names]
+    maps = [
+        linearise_site_tick(site, own, 1.0 / site.rate_hz)
+        for site, own in zip(conditions.sites, sites, strict=True)
+    ]
+    owners = np.repeat(np.arange(len(maps)), [len(one.P) for one in maps])
+    couplings = couple_sites(conditions, rest, sites)
+    effects = np.zeros((len(couplings), len(owners), len(owners)))
+    for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
+        effect[np.ix_(owners == i, owners == j)] = maps[i].Q @ coupling @ maps[j].sent
+    # what moves is told by the changes; the numbers of the pairs stand for their delays
+    changes = block_diag(*(one.P for one in maps)) - np.eye(len(owners))
+    names = [name for one in maps for name in one.names]
+    moving, kept, constant = extract_moving_part(Pencil(changes, np.arange(len(effects)), effects), names)
+    pairs = list(couplings)
+    return CoupledTicks(
+        moving.A + np.eye(len(kept)),
+        {pairs[int(n)]: effect for n, effect in zip(moving.delays, moving.Ad, strict=True)},
+        kept,
+        owners[[names.index(name) for name in kept]],
+        constant + sum(one.left_out for one in sites),
     )
-    return moving._replace(constant=moving.constant + sum(one.left_out for one in sites))

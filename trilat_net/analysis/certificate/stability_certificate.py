@@ -108,7 +108,7 @@ class EndPoseRoots(NamedTuple):
     Attributes:
         verdict: stable, unstable or at the edge, of small motions there; "" if there is no such loop.
         rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None without one.
-        exact: False if ages vary, and the roots are those of their means: no proof then, but a doubt.
+        exact: True of the sampled loop where delays repeat; else the roots are no proof, but may be a doubt.
         text: the rest and its roots, or why there are none.
     """
 
@@ -181,7 +181,7 @@ class Certificate(Result):
 
     @property
     def _roots_refuted(self) -> bool:
-        """True if roots of mean ages are unstable, and pushes die away that had the very ages of the run."""
+        """True if roots that are no proof are unstable, and pushes die away in the very ticks of the run."""
         roots, twins = self.roots, self.twins
         if roots is None or roots.exact or twins is None or roots.rate_per_s is None:
             return False
