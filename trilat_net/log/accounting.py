@@ -265,6 +265,10 @@ def parse_counts(account: str) -> dict[str, int]:
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
 
 
+MIN_COVERAGE = 0.999
+"""Least share of every site's ticks that must be judged, by default."""
+
+
 class Coverage(NamedTuple):
     """How much of a run there is, or was judged: ticks by site, the judged ones and all."""
 

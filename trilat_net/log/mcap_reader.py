@@ -49,6 +49,8 @@ _NAME_BYTES, _NAME_RATIO = 600, 20
 
 Progress = Callable[[int, int], None]
 """Takes how much of something is done: (bytes so far, bytes in all)."""
+Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
+"""Takes a record of a file: its place, its content, and what a chunk holds (empty if it is unreadable)."""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -105,6 +107,9 @@ class McapReader:
         size: bytes of the file.
         offset: first byte of the record of the file that is being read.
         complete: True once all was read, to the end mark's last byte: the file was finished.
+        scanner: finds its records.
+        watch: takes every record of the file before its messages, if it is set. It goes on where the reader
+            gives up, after `MAX_DAMAGED_PARTS`.
     """
 
     def __init__(
@@ -119,27 +124,28 @@ class McapReader:
         self.offset = 0
         self.complete = False
         self._chain = DigestChain()
-        self._scanner = mcap_records.RecordScanner(stream)
-        self.size = self._scanner.size
+        self.scanner = mcap_records.RecordScanner(stream)
+        self.size = self.scanner.size
         self._source = name
         self._progress = progress
+        self.watch: Watch | None = None
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._ours: set[int] = set()
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._room is None else CHANNEL_SHARE * self._room
         self._shares: defaultdict[int, float] = defaultdict(lambda: share)  # what is left, by channel
-        self._cut_short: list[mcap_records.Damage] = []
+        self._more_damage: list[mcap_records.Damage] = []
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
         """Parts that could not be read, so far, and channels that were read in part."""
-        return self._scanner.damaged + self._cut_short
+        return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
         """The end that was cut off; None in a finished file, and before it was reached."""
-        return self._scanner.torn
+        return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in file order.
@@ -147,28 +153,43 @@ class McapReader:
         Raises:
             LogError: the file is no MCAP file, or holds absurdly much for its size.
         """
-        scanner = self._scanner
+        scanner = self.scanner
         if not scanner.begins:
             empty = "is empty" if not self.size else "does not begin as one does"
             raise LogError(f"{self._source}: is no MCAP file: it {empty}")
         for frame in scanner.frames():
             self.offset = frame.offset
-            if frame.opcode in _READ:
+            if frame.opcode in _READ or self.watch is not None:
                 try:
-                    yield from self._read_records(self._unpack(frame), frame)
+                    yield from self._read_records(self._open(frame), frame)
                 except mcap_records.UnreadableRecord as error:
-                    scanner.damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
+                    found = scanner.damaged if self.watch is None else self._more_damage
+                    found.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
-        self.complete = scanner.finished
+        self.complete = scanner.finished and not self._gave_up
 
-    def _unpack(self, frame: mcap_records.RecordFrame) -> bytes:
-        """Returns the records with messages and channels in a record of the file; stores other contents."""
-        content = self._scanner.content(frame)
+    @property
+    def _gave_up(self) -> bool:
+        return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
+
+    def _open(self, frame: mcap_records.RecordFrame) -> bytes:
+        """Returns the records with messages and channels in a record of the file."""
+        content, data = self.scanner.content(frame), b""
+        try:
+            if frame.opcode in _READ and not self._gave_up:
+                data = self._unpack(frame, content)
+        finally:
+            if self.watch is not None:
+                self.watch(frame, content, data)
+        return data
+
+    def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
+        """Returns the same; stores other contents."""
         match frame.opcode:
             case Opcode.CHUNK:
                 data = mcap_records.unpack_chunk(content)
-                self.chunks[self._scanner.head(frame).compression] += 1
+                self.chunks[self.scanner.head(frame).compression] += 1
                 self.packed_bytes += len(content)
                 self.unpacked_bytes += len(data)
                 return data
@@ -249,7 +270,7 @@ class McapReader:
             self._shares[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
             text = f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
-            self._cut_short.append(mcap_records.Damage(frame.offset, frame.size, text))
+            self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
         """Takes memory for what is kept; raises `LogError` if there is not so much."""
