@@ -213,7 +213,6 @@ class Recording:
             )
 
     def _take_own(self, arrived: InboundMessage, since_ns: int, log_time_ns: int) -> None:
-        """Writes the recorder's own message."""
         account = self._own[arrived.key]
         if arrived.key.endswith(topics.STATS):
             stats = decode(arrived.payload, RecorderStats)

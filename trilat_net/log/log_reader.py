@@ -78,6 +78,7 @@ class Log(Result, Mapping[str, SiteLog]):
         scenario_text, scenario_sha256: its text, as it is in the file, and the hash of that.
         events: the events, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
+        chain: agreement with the digest chain of its files, the worst of several.
         unreadable: channels some of whose messages cannot be read, a sentence each.
 
     Raises:
@@ -86,7 +87,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def __init__(self, contents: LogContents) -> None:
         self.source, self.sources = contents.source, contents.sources
-        self.session, self.damaged = contents.session, contents.damaged
+        self.session, self.damaged, self.chain = contents.session, contents.damaged, contents.chain
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
             self.scenario_text = contents.scenario.decode()
@@ -237,11 +238,6 @@ class Log(Result, Mapping[str, SiteLog]):
         """Its number among the parts of a log; 0 of several parts, and of a log without parts."""
         number = self._contents.metadata.get(PART, {}).get("index", "0")
         return int(number) if len(self.sources) == 1 and number.isdecimal() and len(number) < 10 else 0
-
-    @property
-    def chain(self) -> Integrity:
-        """Agreement with the digest chain of its files, the worst of several."""
-        return self._contents.chain
 
     @cached_property
     def accounts(self) -> dict[str, str]:

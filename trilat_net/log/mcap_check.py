@@ -60,23 +60,22 @@ class FileCheck:
         self._findings[check].add(self._file, offset, text)
 
     def _take_content(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        opcode = frame.opcode
-        if opcode == Opcode.CHUNK:
-            self._take_chunk(frame, content, data)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._take_message_index(frame, content)
-        elif opcode == mcap_records.OP_MESSAGE:
-            self._take_message(frame, content, 0, len(content))
-        elif opcode in mcap_records.DEFINITIONS:
-            self._define(frame, opcode, content)
-        elif opcode in _OTHERS:
-            self._take_other(frame, content)
-        elif opcode < 0x80:
-            self._add("records", frame.offset, f"a record of kind {opcode} is none of the format")
+        match frame.opcode:
+            case Opcode.CHUNK:
+                self._take_chunk(frame, content, data)
+            case Opcode.MESSAGE_INDEX:
+                self._take_message_index(frame, content)
+            case Opcode.MESSAGE:
+                self._take_message(frame, content, 0, len(content))
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                self._define(frame, frame.opcode, content)
+            case kind if kind in mcap_records.KINDS:
+                self._take_other(frame, content, mcap_records.parse_record(kind, content))
+            case kind if kind < 0x80:
+                self._add("records", frame.offset, f"a record of kind {kind} is none of the format")
 
-    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes, record: Any) -> None:
         """Takes metadata, an attachment, or a record of the end; those of the index by what they name."""
-        record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.METADATA:
                 self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
@@ -224,12 +223,6 @@ def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 
 
-_OTHERS = frozenset(Opcode) - {
-    Opcode.CHUNK,
-    mcap_records.OP_MESSAGE,
-    Opcode.MESSAGE_INDEX,
-    *mcap_records.DEFINITIONS,
-}
 _INDEXED_NAMES: dict[int, str] = {
     Opcode.CHUNK_INDEX: "chunk",
     Opcode.ATTACHMENT_INDEX: "attachment",

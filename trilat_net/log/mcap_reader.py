@@ -22,16 +22,14 @@ from . import mcap_records
 from .digest_chain import CHAIN, DigestChain, Integrity
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 
-_READ = frozenset(
-    {
-        Opcode.CHUNK,
-        Opcode.MESSAGE,
-        *mcap_records.DEFINITIONS,
-        Opcode.METADATA,
-        Opcode.ATTACHMENT,
-        Opcode.HEADER,
-    }
-)
+_READ = {
+    *mcap_records.DEFINITIONS,
+    Opcode.CHUNK,
+    Opcode.MESSAGE,
+    Opcode.METADATA,
+    Opcode.ATTACHMENT,
+    Opcode.HEADER,
+}
 """Records that are read; indexes are of no use to a reader of the whole file."""
 
 KEPT_BYTES = 64 << 20
@@ -109,7 +107,7 @@ class McapReader:
         complete: True once all was read, to the end mark's last byte: the file was finished.
         scanner: finds its records.
         watch: takes every record of the file before its messages, if it is set. It goes on where the reader
-            gives up, after `MAX_DAMAGED_PARTS`.
+            gives up, after `MAX_DAMAGED_PARTS`, and takes a file that begins otherwise as well.
     """
 
     def __init__(
@@ -154,7 +152,7 @@ class McapReader:
             LogError: the file is no MCAP file, or holds absurdly much for its size.
         """
         scanner = self.scanner
-        if not scanner.begins:
+        if not scanner.begins and self.watch is None:
             empty = "is empty" if not self.size else "does not begin as one does"
             raise LogError(f"{self._source}: is no MCAP file: it {empty}")
         for frame in scanner.frames():
@@ -174,7 +172,6 @@ class McapReader:
         return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _open(self, frame: mcap_records.RecordFrame) -> bytes:
-        """Returns the records with messages and channels in a record of the file."""
         content, data = self.scanner.content(frame), b""
         try:
             if frame.opcode in _READ and not self._gave_up:
@@ -185,7 +182,7 @@ class McapReader:
         return data
 
     def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
-        """Returns the same; stores other contents."""
+        """Returns the records with messages and channels in a record of the file; stores other contents."""
         match frame.opcode:
             case Opcode.CHUNK:
                 data = mcap_records.unpack_chunk(content)
@@ -360,13 +357,16 @@ def read_contents(
     """
     reader = McapReader(stream, name, progress, kept=not own)
     channels: dict[str, ChannelMessages] = {}
-    adders: dict[str, Callable[[bytes, int, int], None]] = {}
+    taken: dict[str, ChannelMessages | None] = {}
     for topic, payload, log_ns, publish_ns, _ in reader.messages():
         try:
-            add = adders[topic]
+            channel = taken[topic]
         except KeyError:
-            add = adders[topic] = _make_adder(topic, channels)
-        add(payload, log_ns, publish_ns)
+            key = topics.parse_key(topic.removeprefix("/"))
+            is_ours = key is not None and key.channel in CHANNEL_TYPES
+            channel = taken[topic] = channels.setdefault(topic, ChannelMessages()) if is_ours else None
+        if channel is not None:
+            channel.add(payload, log_ns, publish_ns)
     session = reader.metadata.get(SESSION, {})
     lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
     if lacking:
@@ -378,11 +378,3 @@ def read_contents(
     text, chain = reader.attachments[SCENARIO], reader.judge_chain()
     ended = reader.complete
     return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
-
-
-def _make_adder(topic: str, channels: dict[str, ChannelMessages]) -> Callable[[bytes, int, int], None]:
-    """Returns a function that keeps a topic's messages, or drops those that are not the log's own."""
-    key = topics.parse_key(topic.removeprefix("/"))
-    if key is None or key.channel not in CHANNEL_TYPES:
-        return lambda payload, log_ns, publish_ns: None  # noqa: ARG005
-    return channels.setdefault(topic, ChannelMessages()).add

@@ -306,7 +306,7 @@ def has_right_crc(attachment: bytes) -> bool:
 def parse_record(opcode: int, content: bytes) -> Any:
     """Returns a record of the `mcap` package: any but a message, a message index or a chunk."""
     try:
-        return _KINDS[opcode].read(_Content(BytesIO(content)))
+        return KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
         why = str(error) or type(error).__name__
         raise UnreadableRecord(f"a record ({_opcode_name(opcode)}) cannot be read: {why}") from None
@@ -327,7 +327,8 @@ def _opcode_name(opcode: int) -> str:
 
 
 _OPCODES = frozenset(Opcode)
-_KINDS: dict[int, Any] = {
+KINDS: dict[int, Any] = {
     kind: getattr(records, kind.name.title().replace("_", ""))
     for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }
+"""Kinds of records that `parse_record` reads."""
