@@ -127,10 +127,8 @@ class ChannelCheck:
         self.heard: dict[tuple[str, int], int] = {}
         self.skips: dict[int, list[tuple[int, int]]] = defaultdict(list)
         self._findings = findings
-        self._epoch_ns, self._version = (
-            _parse_number(about, "epoch_unix_ns"),
-            _parse_number(about, "schema_version"),
-        )
+        self._epoch_ns = _parse_number(about, "epoch_unix_ns")
+        self._version = _parse_number(about, "schema_version")
         self._in_file: dict[int, Account] = self.accounts
         self._file, self._log_ns = "", 0
 
