@@ -43,6 +43,11 @@ class Finding:
     places: list[ProblemPlace] = field(default_factory=list)
     wrong: int = 0
 
+    @property
+    def label(self) -> str:
+        """Its name, as in a line of `trilat verify`."""
+        return self.check
+
     def add(self, file: str, offset: int | None, text: str) -> None:
         """Adds a problem."""
         self.passed = False
@@ -61,7 +66,7 @@ class Finding:
 
     def line(self) -> dict[str, Any]:
         """Returns it as a line, ready for JSON."""
-        return {"label": self.check, "text": self.text, "passed": self.passed, "judged": self.judged}
+        return {"label": self.label, "text": self.text, "passed": self.passed, "judged": self.judged}
 
 
 class Findings(dict[str, Finding]):
