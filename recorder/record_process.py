@@ -138,7 +138,6 @@ class Recorder:
             recording.presence(*change)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
-        """Writes until the session is over."""
         flushed_ns = self._clock.monotonic_ns()
         while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
             self._publisher.answer_queries()

@@ -111,7 +111,9 @@ class Recording:
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in list(self._repairs.items()):
             self._sites[name].since_ns = now_ns - self.epoch.mono_ns
-            for channel, message, payload in repair.poll(now_ns, alive=self._is_present(name, now_ns)):
+            silent_ns = self._silent_since_ns(name, now_ns)
+            alive = silent_ns is None or silent_ns > self._gone_ns[name]
+            for channel, message, payload in repair.poll(now_ns, alive=alive):
                 key = topics.key(self.session, name, channel)
                 sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
                 self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
@@ -213,7 +215,6 @@ class Recording:
             )
 
     def _take_own(self, arrived: InboundMessage, since_ns: int, log_time_ns: int) -> None:
-        """Writes the recorder's own message."""
         account = self._own[arrived.key]
         if arrived.key.endswith(topics.STATS):
             stats = decode(arrived.payload, RecorderStats)
@@ -250,10 +251,6 @@ class Recording:
         gone_ns = self._gone_ns.setdefault(site, now_ns)
         heard_ns = self._sites[site].heard_ns
         return gone_ns if heard_ns is None or heard_ns < gone_ns + UNDER_WAY_NS else heard_ns
-
-    def _is_present(self, site: str, now_ns: int) -> bool:
-        since_ns = self._silent_since_ns(site, now_ns)
-        return since_ns is None or since_ns > self._gone_ns[site]
 
     def over(self, now_ns: int) -> bool:
         """True once every site has all its messages stored, or is gone for good."""

@@ -120,7 +120,6 @@ class SiteReception:
 
     @property
     def _possible_ticks(self) -> int:
-        """How many ticks a site can have made by now."""
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
         return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
@@ -204,7 +203,6 @@ class SiteReception:
 
 
 def _count_ticks(content: State | LinkStats | Event) -> int:
-    """Returns how many ticks a message says that its site has made."""
     if isinstance(content, Event):
         return content.ticks if content.kind in ("join", "end") else 0
     return content.tick + 1

@@ -18,7 +18,7 @@ from trilat_net.analysis.certificate import stability_certificate as certificate
 from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference, twins
-from trilat_net.log import accounting, integrity, log_file, mcap_reader, mcap_records, site_log
+from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
@@ -124,11 +124,11 @@ STATED: list[tuple[str, str, float, float]] = [
     ("certificate.md", "up to 1e-4 of the largest energy", 1e-4, certificates.SAMPLING_RISE_SHARE),
     ("certificate.md", "more than 1e-2 of the largest energy", 1e-2, certificates.COARSE_TOLERANCE_SHARE),
     ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
-    ("certificate.md", "`--min-coverage` (0.999)", 0.999, integrity.MIN_COVERAGE),
+    ("certificate.md", "`--min-coverage` (0.999)", 0.999, accounting.MIN_COVERAGE),
     ("definitions.md", "<= 0.01 rad/s in", 0.01, run_end.SETTLED_SPEED_RAD_S),
     ("definitions.md", "and a tenth of the run", 0.1, run_end.LEAST_JUDGED_SHARE),
     ("definitions.md", "largest values of 50 ms", 50, 1e3 / ticks.BUCKETS_PER_S),
-    ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * integrity.MIN_COVERAGE),
+    ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * accounting.MIN_COVERAGE),
     ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
     ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
     ("linear.md", "of at most 60 s", 60, floquet.MAX_PERIOD_S),

@@ -16,7 +16,7 @@ from .errors import UsageError
 from .execution.log_checks import LogCheckReport, run_log_checks
 from .execution.virtual import SimulatedLog, simulate_scenario
 from .files import make_results_folder
-from .log.integrity import MIN_COVERAGE
+from .log.accounting import MIN_COVERAGE
 from .log.log_reader import Log, open_log
 from .log.recover import Recovery, recover_log
 from .log.session_check import LogCheckResult, check_log

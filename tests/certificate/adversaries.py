@@ -37,9 +37,8 @@ from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.log.accounting import Coverage
+from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.digest_chain import ChainState, Integrity
-from trilat_net.log.integrity import MIN_COVERAGE
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.cell_result import classify_cell

@@ -12,11 +12,11 @@ from tests.analysis.certificate import runs
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_summary import summarise_run
-from trilat_net.execution.log_checks import CheckLine
+from trilat_net.log.findings import Finding
 from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures, write_report_figures
 from trilat_net.reporting.page import render_report, write_report
 
-VERDICTS = [CheckLine("records", "all <b>there</b>", True), CheckLine("executed again", "differs", False)]
+VERDICTS = [Finding("records", "all <b>there</b>", True), Finding("executed again", "differs", False)]
 
 
 class Page(HTMLParser):
@@ -60,7 +60,7 @@ def test_a_report_is_a_page_and_numbers_and_pictures_that_are_asked_for(tmp_path
     assert {path.stem for path in pictures} == wanted | {"hands_moved"}
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     facts = json.loads(paths[1].read_text())
-    assert facts["checks"] == [verdict._asdict() for verdict in VERDICTS]
+    assert facts["checks"] == [verdict.line() for verdict in VERDICTS]
     assert facts["certificate"]["verdict"] == "rose"
     html, data = read(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000

@@ -6,10 +6,11 @@ Invariant: every claim rests on an execution made just now.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import LawWithheld, ScenarioError
-from ..log.integrity import MIN_COVERAGE
+from ..log.accounting import MIN_COVERAGE
+from ..log.findings import Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..results import Result
@@ -19,19 +20,7 @@ from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 
-class CheckLine(NamedTuple):
-    """The result of one check of a log, in words: its subject, its outcome, and whether it passed.
-
-    It did not if it was not `judged`, since it needs code from outside that nobody allowed to run.
-    """
-
-    label: str
-    text: str
-    passed: bool
-    judged: bool = True
-
-
-def choose_exit_code(lines: Sequence[CheckLine]) -> int:
+def choose_exit_code(lines: Sequence[Finding]) -> int:
     """Returns the exit code of checks: 1 if one failed, else that of `LawWithheld` if one was not judged."""
     failed = any(line.judged and not line.passed for line in lines)
     return 1 if failed else 0 if all(line.passed for line in lines) else LawWithheld.exit_code
@@ -47,7 +36,7 @@ class LogCheckReport(Result):
 
     log: Log
     result: VerifyResult
-    lines: list[CheckLine]
+    lines: list[Finding]
 
     @property
     def records(self) -> int:
@@ -66,7 +55,7 @@ class LogCheckReport(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
-        return [line._asdict() for line in self.lines]
+        return [line.line() for line in self.lines]
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat verify --json`: every gap, the first difference."""
@@ -113,7 +102,7 @@ def run_log_checks(
     return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 
-def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawConsents) -> list[CheckLine]:
+def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawConsents) -> list[Finding]:
     """Returns a line per check of a log in files, in a worker where `allowed` laws may run.
 
     A user law that cannot be made fails one.
@@ -123,29 +112,29 @@ def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawCon
     try:
         return run_log_checks(log, virtual=True, min_coverage=min_coverage).lines
     except ScenarioError as error:
-        return [CheckLine("executed again", f"cannot be: {error}", False)]
+        return [Finding("executed again", f"cannot be: {error}", False)]
 
 
 def _checks(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None = None
-) -> Iterator[CheckLine]:
+) -> Iterator[Finding]:
     others = [name for name in log.sites if name not in log.executed_sites]  # of an open-loop rerun
     recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
     yield _records_line(log, result)
-    yield CheckLine("integrity", result.integrity.text, result.integrity.passed)
+    yield Finding("integrity", result.integrity.text, result.integrity.passed)
     for law in find_user_laws(log.scenario):
-        yield CheckLine("user law", str(law), law.allowed, law.allowed)
+        yield Finding("user law", str(law), law.allowed, law.allowed)
     yield _verify_line(result, recorded)
     if log.session.get("scenario_sha256") != log.scenario_sha256:
-        yield CheckLine("scenario", "is not the one whose hash the log names: it was changed", False)
+        yield Finding("scenario", "is not the one whose hash the log names: it was changed", False)
     if virtual and result.withheld:
         why = f"the law of {' and '.join(result.withheld)} may not run"
-        yield CheckLine("virtual time", f"not compared: {why}", False, judged=False)
+        yield Finding("virtual time", f"not compared: {why}", False, judged=False)
     elif virtual and recorded:
-        yield CheckLine("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
+        yield Finding("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
     elif virtual and log.absences:
         away = " and ".join(log.absences)
-        yield CheckLine("virtual time", f"is another run: {away} left, or came while it ran", True)
+        yield Finding("virtual time", f"is another run: {away} left, or came while it ran", True)
     elif virtual:
         twins = compare_with_virtual(log, progress)
         gap = min((first for _, first, _ in result.gaps), default=None)  # what arrived there is unknown
@@ -153,7 +142,7 @@ def _checks(
         why = "a link was measured, not modelled" if log.scenario.measured else ""
         why = "an arm was external" if log.scenario.external else why
         if why and log.driver != "virtual":
-            yield CheckLine("plain virtual time", f"is another run: {why}", True)
+            yield Finding("plain virtual time", f"is another run: {why}", True)
             return
         late, gone = twins.late, twins.lost
         came = f"{len(late)} late samples" + (f", the first: {late[0]}" if late else "")
@@ -161,7 +150,7 @@ def _checks(
         yield _virtual_line(f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from)
 
 
-def _records_line(log: Log, result: VerifyResult) -> CheckLine:
+def _records_line(log: Log, result: VerifyResult) -> Finding:
     have, coverage = sum(len(log[name]) for name in result.coverage.expected), result.coverage
     made = {event.member for event in log.events if event.kind == "end"}
     silent = [name for name in log.sites if name not in made]
@@ -175,10 +164,10 @@ def _records_line(log: Log, result: VerifyResult) -> CheckLine:
     elif not log.complete:
         text += "; the file was not finished"
     passed = (not coverage.expected or coverage.share >= result.min_coverage) and not log.damaged
-    return CheckLine("records", text, passed)
+    return Finding("records", text, passed)
 
 
-def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
+def _verify_line(result: VerifyResult, recorded: str) -> Finding:
     how = "whole runs, bit for bit" if result.whole_run else "tick by tick to 1e-9: another platform made it"
     text = f"{result.identical}/{result.records} records identical ({how})"
     if result.gaps:
@@ -194,8 +183,8 @@ def _verify_line(result: VerifyResult, recorded: str) -> CheckLine:
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
     if not result.records:
-        return CheckLine("executed again", "no records to execute", False, not result.withheld)
-    return CheckLine("executed again", text, result.agreed)
+        return Finding("executed again", "no records to execute", False, not result.withheld)
+    return Finding("executed again", text, result.agreed)
 
 
 def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
@@ -211,11 +200,11 @@ def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
     return "; ".join(texts) + more
 
 
-def _virtual_line(label: str, comparison: RecordComparison, excused_from: int | None) -> CheckLine:
+def _virtual_line(label: str, comparison: RecordComparison, excused_from: int | None) -> Finding:
     """Excuses a difference only from the tick at which the first late or lost sample was due."""
     first = comparison.first
     text = f"{comparison.identical}/{comparison.records} records identical"
     if first is None:
-        return CheckLine(label, text, True)
+        return Finding(label, text, True)
     excused = excused_from is not None and first.tick >= excused_from
-    return CheckLine(label, f"{text}; the first that differs: {first}", excused)
+    return Finding(label, f"{text}; the first that differs: {first}", excused)

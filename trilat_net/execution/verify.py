@@ -22,10 +22,9 @@ from ..core.site_setup import StaleAction
 from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
-from ..log.accounting import Coverage
+from ..log.accounting import MIN_COVERAGE, Coverage
 from ..log.digest_chain import Integrity
-from ..log.integrity import MIN_COVERAGE, judge_integrity
-from ..log.log_reader import Log, open_log
+from ..log.log_reader import Log, judge_integrity, open_log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..net.messages import State

@@ -240,9 +240,8 @@ class StartGap:
 
     def __init__(self, account: Account, under_way: int) -> None:
         self._account, self._under_way, self._heard = account, under_way, 0
-        self._silent = self._begin = (
-            self._first
-        ) = -1  # first that did not come, was not made, of the later start
+        # first that did not come, was not made, of the later start
+        self._silent = self._begin = self._first = -1
 
     def begin_anew(self, first: int, made: int) -> None:
         """The later start begins with a number; the one before stated how many messages it made, or 0."""
@@ -263,6 +262,10 @@ class StartGap:
 def parse_counts(account: str) -> dict[str, int]:
     """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
+
+
+MIN_COVERAGE = 0.999
+"""Least share of every site's ticks that must be judged, by default."""
 
 
 class Coverage(NamedTuple):

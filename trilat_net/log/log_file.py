@@ -223,7 +223,6 @@ class LogFile:
             raise
 
     def _put(self) -> None:
-        """Writes pending data, or the rest of them."""
         while self._done < len(self._pending):
             taken = self._raw.write(memoryview(self._pending)[self._done :])
             if not taken:

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from ..errors import LogError, UsageError
 from ..files import open_regular, refuse_existing, write_whole
 from .digest_chain import CHAIN, ChainState, Integrity
-from .mcap_check import CheckFinding, ProblemList
+from .findings import Finding
 from .mcap_reader import McapReader, Progress
 
 SUFFIX = ".sig"
@@ -102,19 +102,19 @@ def sign_log(
     return made
 
 
-def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress | None = None) -> CheckFinding:
+def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress | None = None) -> Finding:
     """Checks that files are what the owner of a public key signed.
 
     Raises:
         LogError: a log cannot be read.
         UsageError: the key is none.
     """
-    key, problems = _load_public_key(key_file), ProblemList()
+    key, found = _load_public_key(key_file), Finding("signature")
     for path in paths:
         if problem := _find_problem(path, key, progress):
-            problems.add(str(path), None, problem)
+            found.add(str(path), None, problem)
     files = "file is" if len(paths) == 1 else f"{len(paths)} files are"
-    return problems.finding("signature", f"the {files} as the owner of {key_file} signed")
+    return found.tell(f"the {files} as the owner of {key_file} signed")
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:

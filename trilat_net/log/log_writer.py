@@ -342,7 +342,6 @@ class LogParts:
         self._begin()
 
     def _begin(self) -> None:
-        """Begins a part."""
         path = log_layout.part_path(self._storage.path, self._number)
         part = {"index": str(self._number), "previous": self._previous} if self._number else {}
         if self._previous_digest:
@@ -357,7 +356,6 @@ class LogParts:
         self._previous = path.name
 
     def _roll(self) -> None:
-        """Ends a part and begins the next one."""
         self._writer.finish(self.so_far())
         self._previous_digest = self._writer.records_digest
         self._before_bytes += self._writer.written_bytes

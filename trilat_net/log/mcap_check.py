@@ -1,4 +1,4 @@
-"""Check of the bytes of MCAP files: checksums, records, and an index that agrees with them.
+"""Check of the bytes of an MCAP file: checksums, records, and an index that agrees with them.
 
 Invariant: each problem is reported once, with its place; its consequences are not. An index is compared
 with the records in the file, never followed. Any MCAP file is accepted. Conformance with every rule of the
@@ -7,129 +7,34 @@ format is left to other programs (`pymcap-cli doctor`).
 
 from array import array
 from collections import Counter
-from dataclasses import dataclass, field
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from . import mcap_records
-from .mcap_reader import Progress
+from .findings import Findings
 
-MAX_LISTED_PROBLEMS = 1000
-"""Problems that a finding keeps; more are counted."""
 _INDEX_HEAD_BYTES = 6  # of a message index: channel, length of its entries
 
 
-class ProblemPlace(NamedTuple):
-    """A problem of a file, at a byte or in the chunk that begins there; None if the whole file is meant."""
+class FileCheck:
+    """Check of one file, record by record.
 
-    file: str
-    offset: int | None
-    text: str
-
-    def __str__(self) -> str:
-        return self.text if self.offset is None else f"byte {self.offset}: {self.text}"
-
-
-class CheckFinding(NamedTuple):
-    """Result of one check.
+    Args:
+        file: its name.
+        scanner: finds its records.
+        findings: receives the problems, as "whole", "checksums", "records" and "index".
 
     Attributes:
-        check: its name: "whole", "checksums", "records", "index"; of a trilat-net log also "sequence",
-            "accounts", "chain", "schema", "times", "rates", "scenario".
-        passed: True if it passed.
-        text: the result in one line.
-        places: problems, at most `MAX_LISTED_PROBLEMS`.
-        wrong: number of problems.
+        counts: its bytes, chunks and messages, and the checksums that were compared.
     """
 
-    check: str
-    passed: bool
-    text: str
-    places: list[ProblemPlace]
-    wrong: int
-
-
-@dataclass(slots=True)
-class ProblemList:
-    """Problems of one check: the first of them, and their number."""
-
-    places: list[ProblemPlace] = field(default_factory=list)
-    wrong: int = 0
-
-    def add(self, file: str, offset: int | None, text: str) -> None:
-        """Adds a problem."""
-        self.wrong += 1
-        if len(self.places) < MAX_LISTED_PROBLEMS:
-            self.places.append(ProblemPlace(file, offset, text))
-
-    def summary(self) -> str:
-        """Returns the first problem, and the number of others."""
-        return f"{self.places[0]}; and {self.wrong - 1} more" if self.wrong > 1 else str(self.places[0])
-
-    def finding(self, check: str, text: str) -> CheckFinding:
-        """Returns the result of a check: `text` if there is no problem, else their summary."""
-        return CheckFinding(
-            check, not self.wrong, self.summary() if self.wrong else text, self.places, self.wrong
-        )
-
-
-class McapCheck:
-    """Check of one or more files.
-
-    Attributes:
-        whole, checksums, records, index: the problems of each check.
-    """
-
-    def __init__(self) -> None:
-        self.whole, self.checksums, self.records, self.index = (ProblemList() for _ in range(4))
-        self._totals: Counter[str] = Counter()  # bytes, chunks, messages, checksums that were compared
-
-    def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> bool:
-        """Checks every byte of a file; returns False if it does not begin as an MCAP file."""
-        scanner = mcap_records.RecordScanner(stream)
-        self._totals["bytes"] += scanner.size
-        if not scanner.begins:
-            self.whole.add(file, 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
-            return False
-        one = _FileCheck(file, scanner, self)
-        end = 0
-        for frame in scanner.frames():
-            one.take(frame)
-            end = frame.end + len(mcap_records.MAGIC)
-            if progress is not None:
-                progress(frame.end, scanner.size)
-        for damage in scanner.damaged:
-            self.whole.add(file, damage.offset, str(damage))
-        if scanner.torn is not None:
-            self.whole.add(file, scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
-        elif scanner.finished and 0 < end < scanner.size:
-            self.whole.add(file, end, f"{scanner.size - end} bytes follow the end mark")
-        if scanner.finished and not scanner.damaged:
-            one.compare_end()
-        self._totals += one.counts
-        return True
-
-    def findings(self) -> list[CheckFinding]:
-        """Returns the results, a check each."""
-        totals = self._totals
-        built = f"{totals['messages']} messages in {totals['chunks']} chunks, built as the format says"
-        return [
-            self.whole.finding("whole", f"finished, {totals['bytes'] / 1e6:.1f} MB"),
-            self.checksums.finding("checksums", f"{totals['crcs']} compared, all agree"),
-            self.records.finding("records", built),
-            self.index.finding("index", "is what is there"),
-        ]
-
-
-class _FileCheck:
-    """Check of one file; `counts` what it compares."""
-
-    def __init__(self, file: str, scanner: mcap_records.RecordScanner, problems: McapCheck) -> None:
-        self.counts: Counter[str] = Counter()
-        self._file, self._scanner, self._problems = file, scanner, problems
+    def __init__(self, file: str, scanner: mcap_records.RecordScanner, findings: Findings) -> None:
+        self.counts = Counter(bytes=scanner.size)
+        self._file, self._scanner, self._findings = file, scanner, findings
+        self._end = 0
         self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
         self._found: dict[tuple[int, int], Any] = {}  # what an index should name: by its opcode and place
         self._indexed: dict[tuple[int, int], Any] = {}  # what the index names
@@ -139,39 +44,38 @@ class _FileCheck:
         self._entries: dict[int, array[int]] = {}  # of the last chunk: log times and places, by channel
         self._unreadable = False  # something unreadable may have named a channel
 
-    def take(self, frame: mcap_records.RecordFrame) -> None:
-        """Checks one record of the file."""
+    def take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+        """Checks one record of the file; `data` is what a chunk holds, empty if it cannot be unpacked."""
+        self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
-            self._add_records_problem(frame, "the first record is no header")
+            self._add("records", frame.offset, "the first record is no header")
         try:
-            self._take_content(frame, self._scanner.content(frame))
+            self._take_content(frame, content, data)
         except mcap_records.UnreadableRecord as error:
-            text = str(error)
-            problems = self._problems.checksums if "CRC" in text else self._problems.records
-            problems.add(self._file, frame.offset, text)
+            check = "checksums" if "CRC" in str(error) else "records"
+            self._add(check, frame.offset, str(error))
             self._unreadable = True
 
-    def _add_records_problem(self, frame: mcap_records.RecordFrame, text: str) -> None:
-        self._problems.records.add(self._file, frame.offset, text)
+    def _add(self, check: str, offset: int, text: str) -> None:
+        self._findings[check].add(self._file, offset, text)
 
-    def _take_content(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        opcode = frame.opcode
-        if opcode == Opcode.CHUNK:
-            self._take_chunk(frame, content)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._take_message_index(frame, content)
-        elif opcode == mcap_records.OP_MESSAGE:
-            self._take_message(frame, content, 0, len(content))
-        elif opcode in mcap_records.DEFINITIONS:
-            self._define(frame, opcode, content)
-        elif opcode in _OTHERS:
-            self._take_other(frame, content)
-        elif opcode < 0x80:
-            self._add_records_problem(frame, f"a record of kind {opcode} is none of the format")
+    def _take_content(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+        match frame.opcode:
+            case Opcode.CHUNK:
+                self._take_chunk(frame, content, data)
+            case Opcode.MESSAGE_INDEX:
+                self._take_message_index(frame, content)
+            case Opcode.MESSAGE:
+                self._take_message(frame, content, 0, len(content))
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                self._define(frame, frame.opcode, content)
+            case kind if kind in mcap_records.KINDS:
+                self._take_other(frame, content, mcap_records.parse_record(kind, content))
+            case kind if kind < 0x80:
+                self._add("records", frame.offset, f"a record of kind {kind} is none of the format")
 
-    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes, record: Any) -> None:
         """Takes metadata, an attachment, or a record of the end; those of the index by what they name."""
-        record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.METADATA:
                 self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
@@ -194,11 +98,11 @@ class _FileCheck:
         record = mcap_records.parse_record(opcode, content)
         name = "schema" if opcode == Opcode.SCHEMA else "channel"
         if self._defined.setdefault((opcode, record.id), record) != record:
-            self._add_records_problem(frame, f"{name} {record.id} is not what it was before")
+            self._add("records", frame.offset, f"{name} {record.id} is not what it was before")
         schema = record.schema_id if opcode == Opcode.CHANNEL else 0
         if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._unreadable:
             text = f"channel {record.id} names schema {schema}, which comes nowhere before"
-            self._add_records_problem(frame, text)
+            self._add("records", frame.offset, text)
 
     def _take_message(
         self, frame: mcap_records.RecordFrame, data: bytes, begin: int, end: int
@@ -211,15 +115,15 @@ class _FileCheck:
             self._unknown.add(channel)
             if not self._unreadable:
                 text = f"messages of channel {channel}, which comes nowhere before"
-                self._add_records_problem(frame, text)
+                self._add("records", frame.offset, text)
         self.counts["messages"] += 1
         return channel, log_ns
 
-    def _take_chunk(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+    def _take_chunk(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
         self._indexes = None
         head = self._scanner.head(frame)
         self.counts["chunks"] += 1
-        data = mcap_records.unpack_chunk(content)
+        data = data or mcap_records.unpack_chunk(content)
         self.counts["crcs"] += bool(head.crc)
         self._entries.clear()
         for opcode, begin, end in mcap_records.iterate_records(data):
@@ -231,7 +135,7 @@ class _FileCheck:
             elif opcode in mcap_records.DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
-                self._add_records_problem(frame, f"a chunk holds a record of kind {opcode}")
+                self._add("records", frame.offset, f"a chunk holds a record of kind {opcode}")
         self._indexes = {}
         found = frame.size, head.start_ns, head.end_ns, self._indexes
         self._found[Opcode.CHUNK_INDEX, frame.offset] = found
@@ -249,36 +153,50 @@ class _FileCheck:
         self._indexes[channel] = frame.offset
         if not np.array_equal(_sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))):
             text = f"the index of channel {channel} in a chunk is not what is there"
-            self._problems.index.add(self._file, frame.offset, text)
+            self._add("index", frame.offset, text)
 
-    def compare_end(self) -> None:
-        """Compares the end of a finished file with its data, and the checksums there."""
+    def finish(self) -> None:
+        """Takes the damaged parts; compares the end of a finished file with its data, and checksums there."""
+        scanner = self._scanner
+        if not scanner.begins:
+            self._add("whole", 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
+            return
+        for damage in scanner.damaged:
+            self._add("whole", damage.offset, str(damage))
+        if scanner.torn is not None:
+            self._add("whole", scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
+        elif scanner.finished and 0 < self._end < scanner.size:
+            self._add("whole", self._end, f"{scanner.size - self._end} bytes follow the end mark")
+        if scanner.finished and not scanner.damaged:
+            self._compare_end()
+
+    def _compare_end(self) -> None:
         if not self._unreadable:
             self._compare_index()
             self._compare_statistics()
         footer = self._scanner.footer()
         if Opcode.DATA_END not in self._ends:
-            self._problems.records.add(self._file, self._scanner.size, "there is no end of the data")
+            self._add("records", self._scanner.size, "there is no end of the data")
             return
         offset, data_end = self._ends[Opcode.DATA_END]
         self.counts["crcs"] += bool(data_end.data_section_crc)
         if data_end.data_section_crc and self._scanner.crc(0, offset) != data_end.data_section_crc:
-            self._problems.checksums.add(self._file, offset, "the CRC of the data differs")
+            self._add("checksums", offset, "the CRC of the data differs")
         if footer is not None and footer.summary_crc:
             self.counts["crcs"] += 1
             if not self._scanner.is_summary_intact(footer):
                 offset, _ = self._ends[Opcode.FOOTER]
-                self._problems.checksums.add(self._file, offset, "the CRC of the index differs")
+                self._add("checksums", offset, "the CRC of the index differs")
 
     def _compare_index(self) -> None:
         kinds = {opcode for opcode, _ in self._indexed}
         for (opcode, offset), entry in sorted(self._found.items()):
             if opcode in kinds and self._indexed.pop((opcode, offset), None) != entry:
                 text = f"the {_INDEXED_NAMES[opcode]} that begins here is not in the index as it is"
-                self._problems.index.add(self._file, offset, text)
+                self._add("index", offset, text)
         for opcode, offset in sorted(self._indexed):
             text = f"the index names {_INDEXED_NAMES[opcode]} that is not there"
-            self._problems.index.add(self._file, offset, text)
+            self._add("index", offset, text)
 
     def _compare_statistics(self) -> None:
         if Opcode.STATISTICS not in self._ends:
@@ -296,7 +214,7 @@ class _FileCheck:
         for name, (stated, there) in counts.items():
             if stated != there:
                 text = f"the statistics say {stated} {name}, there are {there}"
-                self._problems.index.add(self._file, offset, text)
+                self._add("index", offset, text)
 
 
 def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
@@ -305,12 +223,6 @@ def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 
 
-_OTHERS = frozenset(Opcode) - {
-    Opcode.CHUNK,
-    mcap_records.OP_MESSAGE,
-    Opcode.MESSAGE_INDEX,
-    *mcap_records.DEFINITIONS,
-}
 _INDEXED_NAMES: dict[int, str] = {
     Opcode.CHUNK_INDEX: "chunk",
     Opcode.ATTACHMENT_INDEX: "attachment",

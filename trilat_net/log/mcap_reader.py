@@ -22,16 +22,14 @@ from . import mcap_records
 from .digest_chain import CHAIN, DigestChain, Integrity
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 
-_READ = frozenset(
-    {
-        Opcode.CHUNK,
-        Opcode.MESSAGE,
-        *mcap_records.DEFINITIONS,
-        Opcode.METADATA,
-        Opcode.ATTACHMENT,
-        Opcode.HEADER,
-    }
-)
+_READ = {
+    *mcap_records.DEFINITIONS,
+    Opcode.CHUNK,
+    Opcode.MESSAGE,
+    Opcode.METADATA,
+    Opcode.ATTACHMENT,
+    Opcode.HEADER,
+}
 """Records that are read; indexes are of no use to a reader of the whole file."""
 
 KEPT_BYTES = 64 << 20
@@ -49,6 +47,8 @@ _NAME_BYTES, _NAME_RATIO = 600, 20
 
 Progress = Callable[[int, int], None]
 """Takes how much of something is done: (bytes so far, bytes in all)."""
+Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
+"""Takes a record of a file: its place, its content, and what a chunk holds (empty if it is unreadable)."""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -105,6 +105,9 @@ class McapReader:
         size: bytes of the file.
         offset: first byte of the record of the file that is being read.
         complete: True once all was read, to the end mark's last byte: the file was finished.
+        scanner: finds its records.
+        watch: takes every record of the file before its messages, if it is set. It goes on where the reader
+            gives up, after `MAX_DAMAGED_PARTS`, and takes a file that begins otherwise as well.
     """
 
     def __init__(
@@ -119,27 +122,28 @@ class McapReader:
         self.offset = 0
         self.complete = False
         self._chain = DigestChain()
-        self._scanner = mcap_records.RecordScanner(stream)
-        self.size = self._scanner.size
+        self.scanner = mcap_records.RecordScanner(stream)
+        self.size = self.scanner.size
         self._source = name
         self._progress = progress
+        self.watch: Watch | None = None
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._ours: set[int] = set()
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._room is None else CHANNEL_SHARE * self._room
         self._shares: defaultdict[int, float] = defaultdict(lambda: share)  # what is left, by channel
-        self._cut_short: list[mcap_records.Damage] = []
+        self._more_damage: list[mcap_records.Damage] = []
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
         """Parts that could not be read, so far, and channels that were read in part."""
-        return self._scanner.damaged + self._cut_short
+        return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
         """The end that was cut off; None in a finished file, and before it was reached."""
-        return self._scanner.torn
+        return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in file order.
@@ -147,28 +151,42 @@ class McapReader:
         Raises:
             LogError: the file is no MCAP file, or holds absurdly much for its size.
         """
-        scanner = self._scanner
-        if not scanner.begins:
+        scanner = self.scanner
+        if not scanner.begins and self.watch is None:
             empty = "is empty" if not self.size else "does not begin as one does"
             raise LogError(f"{self._source}: is no MCAP file: it {empty}")
         for frame in scanner.frames():
             self.offset = frame.offset
-            if frame.opcode in _READ:
+            if frame.opcode in _READ or self.watch is not None:
                 try:
-                    yield from self._read_records(self._unpack(frame), frame)
+                    yield from self._read_records(self._open(frame), frame)
                 except mcap_records.UnreadableRecord as error:
-                    scanner.damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
+                    found = scanner.damaged if self.watch is None else self._more_damage
+                    found.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
-        self.complete = scanner.finished
+        self.complete = scanner.finished and not self._gave_up
 
-    def _unpack(self, frame: mcap_records.RecordFrame) -> bytes:
+    @property
+    def _gave_up(self) -> bool:
+        return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
+
+    def _open(self, frame: mcap_records.RecordFrame) -> bytes:
+        content, data = self.scanner.content(frame), b""
+        try:
+            if frame.opcode in _READ and not self._gave_up:
+                data = self._unpack(frame, content)
+        finally:
+            if self.watch is not None:
+                self.watch(frame, content, data)
+        return data
+
+    def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
         """Returns the records with messages and channels in a record of the file; stores other contents."""
-        content = self._scanner.content(frame)
         match frame.opcode:
             case Opcode.CHUNK:
                 data = mcap_records.unpack_chunk(content)
-                self.chunks[self._scanner.head(frame).compression] += 1
+                self.chunks[self.scanner.head(frame).compression] += 1
                 self.packed_bytes += len(content)
                 self.unpacked_bytes += len(data)
                 return data
@@ -249,7 +267,7 @@ class McapReader:
             self._shares[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
             text = f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
-            self._cut_short.append(mcap_records.Damage(frame.offset, frame.size, text))
+            self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
         """Takes memory for what is kept; raises `LogError` if there is not so much."""
@@ -339,13 +357,16 @@ def read_contents(
     """
     reader = McapReader(stream, name, progress, kept=not own)
     channels: dict[str, ChannelMessages] = {}
-    adders: dict[str, Callable[[bytes, int, int], None]] = {}
+    taken: dict[str, ChannelMessages | None] = {}
     for topic, payload, log_ns, publish_ns, _ in reader.messages():
         try:
-            add = adders[topic]
+            channel = taken[topic]
         except KeyError:
-            add = adders[topic] = _make_adder(topic, channels)
-        add(payload, log_ns, publish_ns)
+            key = topics.parse_key(topic.removeprefix("/"))
+            is_ours = key is not None and key.channel in CHANNEL_TYPES
+            channel = taken[topic] = channels.setdefault(topic, ChannelMessages()) if is_ours else None
+        if channel is not None:
+            channel.add(payload, log_ns, publish_ns)
     session = reader.metadata.get(SESSION, {})
     lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
     if lacking:
@@ -357,11 +378,3 @@ def read_contents(
     text, chain = reader.attachments[SCENARIO], reader.judge_chain()
     ended = reader.complete
     return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
-
-
-def _make_adder(topic: str, channels: dict[str, ChannelMessages]) -> Callable[[bytes, int, int], None]:
-    """Returns a function that keeps a topic's messages, or drops those that are not the log's own."""
-    key = topics.parse_key(topic.removeprefix("/"))
-    if key is None or key.channel not in CHANNEL_TYPES:
-        return lambda payload, log_ns, publish_ns: None  # noqa: ARG005
-    return channels.setdefault(topic, ChannelMessages()).add

@@ -13,6 +13,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
@@ -266,16 +267,11 @@ class RecordScanner:
             window = self.read(at, _SCAN_BYTES + lead + 8)  # holds the name of one that begins in it
             for match in _COMPRESSION_NAME.finditer(window):
                 start = at + match.start() - lead
-                if start >= offset and self._is_chunk(start):
-                    return start
+                with suppress(UnreadableRecord):
+                    if start >= offset and (frame := self._frame_at(start)).opcode == Opcode.CHUNK:
+                        self.head(frame)
+                        return start
         return None
-
-    def _is_chunk(self, offset: int) -> bool:
-        try:
-            frame = self._frame_at(offset)
-            return frame.opcode == Opcode.CHUNK and bool(self.head(frame))
-        except UnreadableRecord:
-            return False
 
     def crc(self, begin: int, end: int) -> int:
         """Returns the CRC-32 of a part of the file, from one byte to before another."""
@@ -306,7 +302,7 @@ def has_right_crc(attachment: bytes) -> bool:
 def parse_record(opcode: int, content: bytes) -> Any:
     """Returns a record of the `mcap` package: any but a message, a message index or a chunk."""
     try:
-        return _KINDS[opcode].read(_Content(BytesIO(content)))
+        return KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
         why = str(error) or type(error).__name__
         raise UnreadableRecord(f"a record ({_opcode_name(opcode)}) cannot be read: {why}") from None
@@ -327,7 +323,8 @@ def _opcode_name(opcode: int) -> str:
 
 
 _OPCODES = frozenset(Opcode)
-_KINDS: dict[int, Any] = {
+KINDS: dict[int, Any] = {
     kind: getattr(records, kind.name.title().replace("_", ""))
     for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }
+"""Kinds of records that `parse_record` reads."""

@@ -28,6 +28,7 @@ from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
 from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
 from .mcap_reader import McapReader, Progress
+from .mcap_records import UnreadableRecord
 from .mcap_writer import McapWriter
 
 MAX_LISTED_LOSSES = 20
@@ -160,21 +161,15 @@ def recover_log(
 
 
 def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None) -> Recovery:
-    scanner = mcap_records.RecordScanner(stream)
-    survey = _Survey(scanner)
+    reader = McapReader(stream, str(result.path), progress, kept=False)
+    survey = _Survey(reader.scanner)
     if survey.why_empty:
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
-    if SESSION in survey.metadata:
-        stream.seek(0)
-        reader, result.chain = McapReader(stream, str(result.path), kept=False), ChainState.OPEN
-        with suppress(LogError):
-            deque(reader.messages(), maxlen=0)
-            result.chain = reader.judge_chain().state
     file = LogFile(result.output, force=force, working=working)
     try:
-        _FileCopy(scanner, file, survey, result).run(progress)
+        _FileCopy(reader, file, survey, result).run()
         file.close()
     except BaseException:
         file.discard()
@@ -212,7 +207,7 @@ class _Survey:
                 entry = frame.opcode, scanner.content(frame)
                 found[frame.offset >= summary_offset, frame.opcode].append(entry)
             elif frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.STATISTICS):
-                with suppress(mcap_records.UnreadableRecord):
+                with suppress(UnreadableRecord):
                     self._take(frame.opcode, mcap_records.parse_record(frame.opcode, scanner.content(frame)))
         if summary_offset == scanner.size:
             self.count = None
@@ -241,14 +236,14 @@ class _Survey:
 class _FileCopy:
     """Copy of one file into another; of a number's definitions the first one holds."""
 
-    def __init__(
-        self, scanner: mcap_records.RecordScanner, file: LogFile, survey: _Survey, result: Recovery
-    ) -> None:
-        self._scanner, self._survey, self._result = scanner, survey, result
+    def __init__(self, reader: McapReader, file: LogFile, survey: _Survey, result: Recovery) -> None:
+        reader.watch = self._copy
+        self._reader, self._scanner, self._survey, self._result = reader, reader.scanner, survey, result
         by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
         self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
-        self._data_end = scanner.size + 1
+        self._data_end = reader.size + 1
+        self._reported = 0  # damaged parts that are among the losses
         self._defined: dict[tuple[int, int], Any] = {}  # schemas and channels, by opcode and number
         self._contradicted: set[int] = set()  # numbers that have two definitions
         self._new_schemas: dict[int, int] = {}
@@ -258,47 +253,44 @@ class _FileCopy:
         for opcode, content in survey.definitions:
             try:
                 self._define(opcode, content)
-            except mcap_records.UnreadableRecord as error:
+            except UnreadableRecord as error:
                 result.lose(f"a definition: {error}", len(content))
         for kind, number in sorted(self._defined):
             if kind == Opcode.CHANNEL:  # with or without messages
                 self._open_channel(number)
 
-    def run(self, progress: Progress | None) -> None:
+    def run(self) -> None:
         """Copies all that can be read, and writes the end of the file."""
-        scanner = self._scanner
-        reported = 0
-        for frame in scanner.frames():
-            reported = self._report_damaged(reported)
-            try:
-                self._take(frame)
-            except mcap_records.UnreadableRecord as error:
-                self._result.lose(f"{frame.size} bytes at byte {frame.offset}: {error}", frame.size)
-            if progress is not None:
-                progress(frame.end, scanner.size)
-        self._report_damaged(reported)
-        if scanner.torn is not None:
-            self._take_torn(scanner.torn)
+        deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
+        self._report_damaged()
+        if self._scanner.torn is not None:
+            self._take_torn(self._scanner.torn)
         self._out.flush()
         self._report_unnamed()
         self._finish()
 
-    def _report_damaged(self, reported: int) -> int:
-        for damage in self._scanner.damaged[reported:]:
+    def _copy(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+        self._report_damaged()
+        try:
+            self._take(frame, content, data)
+        except UnreadableRecord as error:
+            self._result.lose(f"{frame.size} bytes at byte {frame.offset}: {error}", frame.size)
+
+    def _report_damaged(self) -> None:
+        for damage in self._scanner.damaged[self._reported :]:
             if damage.offset <= self._data_end:
                 self._result.lose(str(damage), damage.length)
-        return len(self._scanner.damaged)
+        self._reported = len(self._scanner.damaged)
 
-    def _take(self, frame: mcap_records.RecordFrame) -> None:
-        """Copies one record of the file."""
+    def _take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+        """Copies one record of the file; `data` is what a chunk holds, empty if it cannot be unpacked."""
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
             return
-        content = self._scanner.content(frame)
         if opcode in _MADE_AGAIN:
             self._pass_over(frame, content)
         elif opcode == Opcode.CHUNK:
-            data = mcap_records.unpack_chunk(content)
+            data = data or mcap_records.unpack_chunk(content)
             for inner, begin, end in mcap_records.iterate_records(data):
                 self._take_inner(inner, data[begin:end])
         elif opcode == mcap_records.OP_MESSAGE:
@@ -314,7 +306,7 @@ class _FileCopy:
                 self._result.lose(f"attachment {one.name}: its CRC differs; it is kept as it is")
             self._out.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
         else:
-            raise mcap_records.UnreadableRecord(f"a record of kind {opcode} is unknown here")
+            raise UnreadableRecord(f"a record of kind {opcode} is unknown here")
 
     def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Leaves out what is made again; raises if it is something else whose kind was damaged."""
@@ -323,9 +315,9 @@ class _FileCopy:
         elif frame.opcode == Opcode.MESSAGE_INDEX:
             size = int.from_bytes(content[2:6], "little")
             if size != len(content) - 6 or size % 16:
-                raise mcap_records.UnreadableRecord("a record (message index) is none")
+                raise UnreadableRecord("a record (message index) is none")
         elif frame.offset < self._data_end:
-            raise mcap_records.UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
+            raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
     def _take_inner(self, opcode: int, content: bytes) -> None:
         """Takes a record of a chunk, or a message outside of chunks."""
@@ -333,7 +325,7 @@ class _FileCopy:
             self._define(opcode, content)
         elif opcode == mcap_records.OP_MESSAGE:
             if len(content) < mcap_records.MESSAGE_HEAD.size:
-                raise mcap_records.UnreadableRecord("a message is too short")
+                raise UnreadableRecord("a message is too short")
             number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
             new = self._new_channels.get(number) or self._open_channel(number)
             if new is None:
@@ -377,9 +369,7 @@ class _FileCopy:
             return
         before = self._out.messages
         content = self._scanner.read(torn.offset + mcap_records.RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
-        with suppress(
-            mcap_records.UnreadableRecord
-        ):  # what follows makes no sense, and is lost with the rest
+        with suppress(UnreadableRecord):  # what follows makes no sense, and is lost with the rest
             for entry in _salvage_records(content):
                 self._take_inner(*entry)
         self._result.salvaged = self._out.messages - before
@@ -406,6 +396,8 @@ class _FileCopy:
         result, accounts = self._result, self._accounts
         result.finished = self._scanner.finished
         result.messages, result.duration_s = self._out.messages, self._out.duration_s
+        if SESSION in self._survey.metadata:
+            result.chain = self._reader.judge_chain().state if self._scanner.begins else ChainState.OPEN
         if accounts is not None:
             result.missing = list(accounts.missing())
             result.coverage = accounts.coverage()
@@ -433,9 +425,7 @@ def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
         waiting += piece
         limit -= len(piece)
         done = 0
-        with suppress(
-            mcap_records.UnreadableRecord
-        ):  # the rest of the last record comes with the next pieces
+        with suppress(UnreadableRecord):  # the rest of the last record comes with the next pieces
             for opcode, begin, end in mcap_records.iterate_records(waiting):
                 if not opcode:
                     return

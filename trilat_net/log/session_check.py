@@ -8,13 +8,12 @@ its own content, its scenario and the messages before it. Nothing is executed: t
 import hashlib
 import json
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
-from ..core.site_setup import Layout
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
@@ -25,12 +24,12 @@ from ..results import Result
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
 from .accounting import LAST, Account, parse_counts
+from .findings import Finding, Findings
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
-from .mcap_check import CheckFinding, McapCheck, ProblemList
+from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
 from .ros2 import cdr
 
-ProblemLists = Mapping[str, ProblemList]
 MAX_AHEAD_NS = 10 * NS_PER_S
 """No message is sent more than this after it came, whatever the clocks."""
 MAX_BOOTS = 64
@@ -54,7 +53,7 @@ class LogCheckResult(Result):
     """
 
     files: list[str]
-    findings: list[CheckFinding]
+    findings: list[Finding]
     ours: bool
 
     @property
@@ -69,7 +68,9 @@ class LogCheckResult(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
-        return [{**one._asdict(), "places": [at._asdict() for at in one.places]} for one in self.findings]
+        keys = "check", "passed", "text", "places", "wrong"
+        rows = [{key: getattr(one, key) for key in keys} for one in self.findings]
+        return [{**row, "places": [at._asdict() for at in row["places"]]} for row in rows]
 
 
 def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogCheckResult:
@@ -78,56 +79,30 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     Raises:
         LogError: a file cannot be read, or is of another session than the files before it.
     """
-    files, session = McapCheck(), SessionCheck()
+    check = SessionCheck()
     try:
-        total = 2 * sum(path.stat().st_size for path in paths)
-        before = 0
+        total, before = sum(path.stat().st_size for path in paths), 0
         for path in sorted(paths, key=lambda path: path.name):
-            size = path.stat().st_size
             with open_regular(path) as stream:
-                if files.read(str(path), stream, shift_progress(progress, before, total)):
-                    stream.seek(0)
-                    session.read(str(path), stream, shift_progress(progress, before + size, total))
-            before += 2 * size
+                check.read(str(path), stream, shift_progress(progress, before, total))
+            before += path.stat().st_size
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    return LogCheckResult(
-        [str(path) for path in paths], [*files.findings(), *session.findings()], session.ours
-    )
-
-
-class MessageIdentity(NamedTuple):
-    """What a message says that it is.
-
-    Attributes:
-        member: its sender.
-        boot: which start of it.
-        number: its number in its channel, -1 for none.
-        sequence: the number that the file should state.
-        sent_ns: when it was sent, ns since the epoch; None if it does not state that.
-    """
-
-    member: str
-    boot: int
-    number: int
-    sequence: int
-    sent_ns: int | None
+    return LogCheckResult([str(path) for path in paths], list(check.findings()), check.ours)
 
 
 class ChannelCheck:
     """Check of one channel, message by message: numbering, schema and time stamps.
 
     Args:
-        member: its sender.
-        kind: "state", "link", "event" or "stats".
-        rate_hz: tick rate of the member; 0 of the recorder.
-        epoch_ns: Unix time of tick 0.
-        version: schema version of the session.
-        layout: how many numbers the vectors of its records have; None of the recorder.
-        problems: receives the problems, by check.
+        key: its member, and its kind: "state", "link", "event" or "stats".
+        about: metadata of the session.
+        scenario: its scenario; None if it cannot be read.
+        findings: receives the problems.
 
     Attributes:
+        rate_hz: tick rate of the member; 0 of the recorder.
         accounts: received and missing messages, by the member's boot.
         first, last: number and publish time of the messages with the lowest and the highest number.
         ends: by boot how many ticks the member made, of those that have stated it.
@@ -137,16 +112,13 @@ class ChannelCheck:
     """
 
     def __init__(
-        self,
-        member: str,
-        kind: str,
-        rate_hz: int,
-        epoch_ns: int,
-        version: int,
-        layout: Layout | None,
-        problems: ProblemLists,
+        self, key: topics.KeyParts, about: Mapping[str, str], scenario: Scenario | None, findings: Findings
     ) -> None:
-        self.member, self.kind, self.rate_hz, self._layout = member, kind, rate_hz, layout
+        self.member, self.kind = key.member, key.channel
+        self.rate_hz, self._layout = 0, None
+        if scenario is not None and key.member in scenario.sites:
+            self.rate_hz = scenario.sites[key.member].rate_hz
+            self._layout = scenario.layout(key.member)
         self.accounts: dict[int, Account] = defaultdict(Account)
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
@@ -154,7 +126,9 @@ class ChannelCheck:
         self.joins: dict[int, int] = {}
         self.heard: dict[tuple[str, int], int] = {}
         self.skips: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        self._epoch_ns, self._version, self._problems = epoch_ns, version, problems
+        self._findings = findings
+        self._epoch_ns = _parse_number(about, "epoch_unix_ns")
+        self._version = _parse_number(about, "schema_version")
         self._in_file: dict[int, Account] = self.accounts
         self._file, self._log_ns = "", 0
 
@@ -239,31 +213,38 @@ class ChannelCheck:
         except WireError as error:
             self._add("schema", offset, str(error))
             return
-        identity = self._identify(message)
+        sender, number, sequence, sent_ns = self._identify(message)
         if message.v != self._version:
             text = f"a message of version {message.v} in a log of version {self._version}"
             self._add("schema", offset, text)
-        if identity.member != self.member:
-            self._add("schema", offset, f"a message says that it is of {identity.member[:40]!r}")
+        if sender != self.member:
+            self._add("schema", offset, f"a message says that it is of {sender[:40]!r}")
         if isinstance(message, messages.State) and (skipped := count_skipped_ticks(message.cmd)):
             self.skips[message.boot].append((message.tick, skipped))
-        if identity.number >= 0:  # events have numbers from version 3 on
-            self._check_number(stored, identity, offset)
-        self._check_times(stored, identity, offset)
+        if number >= 0:  # events have numbers from version 3 on
+            if stored.sequence != sequence & 0xFFFFFFFF:
+                self._add("sequence", offset, f"number {sequence} is stored as {stored.sequence}")
+            self._count(message.boot, number, stored.publish_time_ns, offset)
+        self._check_times(stored, number, sent_ns, offset)
 
     def _add(self, check: str, offset: int | None, text: str) -> None:
-        self._problems[check].add(self._file, offset, f"{self.name}: {text}")
+        self._findings[check].add(self._file, offset, f"{self.name}: {text}")
 
     def _identify(
         self, message: messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
-    ) -> MessageIdentity:
+    ) -> tuple[str, int, int, int | None]:
+        """Returns what a message says that it is, and notes what an event says of starts.
+
+        That is its sender, its number in its channel (-1 for none), the number that the file should state,
+        and when it was sent, ns since the epoch; None if it does not state that.
+        """
         match message:
             case messages.State():
                 sent_ns = message.sent_ns if message.v >= messages.SENT_TIME_SINCE else message.t_ns
-                return MessageIdentity(message.site, message.boot, message.tick, message.tick, sent_ns)
+                return message.site, message.tick, message.tick, sent_ns
             case messages.LinkStats():
                 number = number_message(self.kind, message.tick, self.rate_hz)
-                return MessageIdentity(message.site, message.boot, number, message.tick, message.t_ns)
+                return message.site, number, message.tick, message.t_ns
             case messages.Event():
                 stated = {"end": self.ends, "join": self.joins}.get(message.kind, {})
                 if message.boot in stated or len(stated) < MAX_BOOTS:
@@ -274,15 +255,12 @@ class ChannelCheck:
                 # a recorder's own events are stamped as it hears them; before the epoch there is no time
                 stamped = message.t_ns >= 0 and message.member != topics.RECORDER
                 event_ns = message.t_ns if stamped else None
-                return MessageIdentity(message.member, message.boot, message.n, max(0, message.n), event_ns)
+                return message.member, message.n, max(0, message.n), event_ns
         account = self.accounts.get(message.boot)
         number = 0 if account is None else account.expected
-        return MessageIdentity(topics.RECORDER, message.boot, number, number, None)
+        return topics.RECORDER, number, number, None
 
-    def _check_number(self, stored: McapMessage, identity: MessageIdentity, offset: int) -> None:
-        number, boot = identity.number, identity.boot
-        if stored.sequence != identity.sequence & 0xFFFFFFFF:
-            self._add("sequence", offset, f"number {identity.sequence} is stored as {stored.sequence}")
+    def _count(self, boot: int, number: int, publish_ns: int, offset: int) -> None:
         if boot not in self.accounts and len(self.accounts) >= MAX_BOOTS:
             self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
             return
@@ -291,19 +269,19 @@ class ChannelCheck:
             new = self._in_file[boot].take(number)
         if not new:
             self._add("sequence", offset, f"number {number} is there twice")
-        place = (number, stored.publish_time_ns)
+        place = (number, publish_ns)
         self.first = place if self.first is None else min(self.first, place)
         self.last = place if self.last is None else max(self.last, place)
 
-    def _check_times(self, stored: McapMessage, identity: MessageIdentity, offset: int) -> None:
-        number, log_ns, publish_ns = identity.number, stored.log_time_ns, stored.publish_time_ns
+    def _check_times(self, stored: McapMessage, number: int, stated_ns: int | None, offset: int) -> None:
+        log_ns, publish_ns = stored.log_time_ns, stored.publish_time_ns
         if log_ns < self._log_ns:
             text = f"log_time goes back by {self._log_ns - log_ns} ns at number {number}"
             self._add("times", offset, text)
         self._log_ns = log_ns
         sent_ns = publish_ns
-        if identity.sent_ns is not None:
-            sent_ns = min(max(0, self._epoch_ns + identity.sent_ns), MAX_TIME_NS)
+        if stated_ns is not None:
+            sent_ns = min(max(0, self._epoch_ns + stated_ns), MAX_TIME_NS)
         if publish_ns != sent_ns:
             self._add("times", offset, f"number {number} was sent at {sent_ns} ns, not {publish_ns}")
         elif publish_ns > log_ns + MAX_AHEAD_NS:
@@ -311,8 +289,14 @@ class ChannelCheck:
             self._add("times", offset, f"number {number} came {ahead_s:.1f} s before it was sent")
 
 
+def _parse_number(about: Mapping[str, str], key: str) -> int:
+    """Returns a number in the metadata of a session; 0 if it is none."""
+    text = about.get(key, "")
+    return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
+
+
 class SessionCheck:
-    """Check of the messages of one session, in one file or in its parts.
+    """Check of one session, in one file or in its parts.
 
     Attributes:
         ours: True if there is a trilat-net log at all.
@@ -322,21 +306,30 @@ class SessionCheck:
     def __init__(self) -> None:
         self.ours = False
         self.channels: dict[str, ChannelCheck] = {}
-        self._problems: ProblemLists = defaultdict(ProblemList)
+        self._findings = Findings()
+        self._counts: Counter[str] = Counter()
         self._scenario: Scenario | None = None
         self._about: dict[str, str] = {}
         self._accounts: dict[str, str] = {}  # of the last file
         self._first_part = False  # the files begin with the session
-        self._views = 0
+        self._views = self._version = 0
         self._file = self._chain_text = ""
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
-        """Checks all messages of a file.
+        """Checks every byte of a file, and its messages.
 
         Raises:
             LogError: it is of another session than the files before it.
         """
         reader = McapReader(stream, file, progress, kept=False)
+        structure = FileCheck(file, reader.scanner, self._findings)
+        reader.watch = structure.take
+        if reader.scanner.begins:
+            self._read_messages(file, reader)
+        structure.finish()
+        self._counts += structure.counts
+
+    def _read_messages(self, file: str, reader: McapReader) -> None:
         checks: dict[str, ChannelCheck | None] = {}
         self._file, begun = file, False
         for message in reader.messages():
@@ -355,14 +348,14 @@ class SessionCheck:
             elif topic.startswith(VIZ_ROOT):
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
-                    self._problems["schema"].add(file, reader.offset, f"{topic[:80]}: a message is no CDR")
+                    self._findings["schema"].add(file, reader.offset, f"{topic[:80]}: a message is no CDR")
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
         chain = reader.judge_chain()
         self._chain_text = chain.text
         if not chain.passed:
-            self._problems["chain"].add(file, None, self._chain_text)
+            self._findings["chain"].add(file, None, self._chain_text)
 
     def _begin(self, reader: McapReader) -> None:
         about = reader.metadata.get(SESSION, {})
@@ -373,65 +366,59 @@ class SessionCheck:
         same = ("session", "epoch_unix_ns", "scenario_sha256")
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
             raise LogError(f"{self._file}: is of another session; look at it alone")
-        self.ours, self._about = True, about
+        self.ours, self._about, self._version = True, about, _parse_number(about, "schema_version")
         self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
         self._check_scenario(reader.attachments[SCENARIO])
 
     def _check_scenario(self, text: bytes) -> None:
-        problems, about = self._problems["scenario"], self._about
+        finding, about = self._findings["scenario"], self._about
         digest, stated = hashlib.sha256(text).hexdigest(), about.get("scenario_sha256", "")
         if digest != stated:
-            problems.add(self._file, None, f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}")
+            finding.add(self._file, None, f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}")
         try:
             self._scenario = scenario = parse_embedded(text.decode(), "scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
-            problems.add(self._file, None, f"cannot be read: {error}")
+            finding.add(self._file, None, f"cannot be read: {error}")
             return
         facts = {"scenario": scenario.name, "seed": str(scenario.seed), "sites": " ".join(scenario.names)}
         for key, value in facts.items():
             if about.get(key) != value:
-                text_there = about.get(key, "")[:40]
-                problems.add(self._file, None, f"has {key} {value}, the session {text_there!r}")
-
-    def _session_number(self, key: str) -> int:
-        text = self._about.get(key, "")
-        return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
+                there = about.get(key, "")[:40]
+                finding.add(self._file, None, f"has {key} {value}, the session {there!r}")
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
         """Returns the check of a channel in this file; None if it is none of the session's own."""
-        topic, problems = channel.topic, self._problems["schema"]
+        topic, finding = channel.topic, self._findings["schema"]
         key = topics.parse_key(topic.removeprefix("/"))
         if topic.startswith(VIZ_ROOT):
             is_cdr = (channel.encoding, channel.schema_encoding) == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
             if not is_cdr or channel.schema_data != cdr.ROS2_SCHEMAS.get(channel.schema):
                 schema = channel.schema[:80] or "no schema"
-                problems.add(self._file, None, f"{topic[:80]}: {schema} is none of the standard ones")
+                finding.add(self._file, None, f"{topic[:80]}: {schema} is none of the standard ones")
             return None
         session = self._about["session"]
         if key is None or key.channel not in CHANNEL_TYPES or key.session != session or key.boot:
             if not channel.schema:
-                problems.add(self._file, None, f"{topic[:80]}: has no schema")
+                finding.add(self._file, None, f"{topic[:80]}: has no schema")
             return None
         if topic not in self.channels:
-            self.channels[topic] = self._make_channel_check(topic, key)
+            if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
+                finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
+            self.channels[topic] = ChannelCheck(key, self._about, self._scenario, self._findings)
         self.channels[topic].begin(self._file, channel)
         return self.channels[topic]
 
-    def _make_channel_check(self, topic: str, key: topics.KeyParts) -> ChannelCheck:
-        sites = self._scenario.sites if self._scenario else {}
-        if self._scenario and key.member not in (*sites, topics.RECORDER):
-            self._problems["schema"].add(self._file, None, f"{topic[:80]}: the scenario has no such member")
-        rate_hz, layout = 0, None
-        if self._scenario and key.member in sites:
-            rate_hz, layout = sites[key.member].rate_hz, self._scenario.layout(key.member)
-        epoch_ns, version = self._session_number("epoch_unix_ns"), self._session_number("schema_version")
-        return ChannelCheck(key.member, key.channel, rate_hz, epoch_ns, version, layout, self._problems)
-
-    def findings(self) -> Iterator[CheckFinding]:
+    def findings(self) -> Iterator[Finding]:
         """Yields the results, once all files were read; without a session only that it was taken out."""
+        counts, found = self._counts, self._findings
+        messages, chunks = counts["messages"], counts["chunks"]
+        yield found["whole"].tell(f"finished, {counts['bytes'] / 1e6:.1f} MB")
+        yield found["checksums"].tell(f"{counts['crcs']} compared, all agree")
+        yield found["records"].tell(f"{messages} messages in {chunks} chunks, built as the format says")
+        yield found["index"].tell("is what is there")
         if not self.ours:
-            if self._problems["chain"].wrong:
-                yield self._problems["chain"].finding("chain", "")
+            if "chain" in found:
+                yield found["chain"].tell("")
             return
         told, records = (
             {check.member: check for check in self.channels.values() if check.kind == kind}
@@ -447,19 +434,18 @@ class SessionCheck:
                     check.leave_out(records[check.member])
         yield self._check_sequence()
         yield self._check_accounts()
-        yield self._problems["chain"].finding("chain", self._chain_text)
-        kinds = f"every message is one of version {self._session_number('schema_version')}"
+        yield found["chain"].tell(self._chain_text)
+        kinds = f"every message is one of version {self._version}"
         views = f", and {self._views} views" if self._views else ""
-        yield self._problems["schema"].finding("schema", kinds + views)
-        times = "log times never go back, publish times are the senders'"
-        yield self._problems["times"].finding("times", times)
+        yield found["schema"].tell(kinds + views)
+        yield found["times"].tell("log times never go back, publish times are the senders'")
         yield self._check_rates()
         scenario = self._scenario.name if self._scenario else ""
         text = f"{scenario}, SHA-256 {self._about.get('scenario_sha256', '')[:16]}, as the session names it"
-        yield self._problems["scenario"].finding("scenario", text)
+        yield found["scenario"].tell(text)
 
-    def _check_sequence(self) -> CheckFinding:
-        problems, missing, reordered = self._problems["sequence"], 0, 0
+    def _check_sequence(self) -> Finding:
+        finding, missing, reordered = self._findings["sequence"], 0, 0
         gaps = []
         for check in self.channels.values():
             for first, last in check.gaps(whole=self._first_part):
@@ -470,36 +456,37 @@ class SessionCheck:
         text = f"{received} messages of {len(self.channels)} channels"
         if missing:
             text += f", {missing} missing in {len(gaps)} range{'s' * (len(gaps) > 1)}"
-        elif not problems.wrong:
+        elif finding.passed:
             text += ", none missing, none twice"
-        if problems.wrong:
-            text += f"; {problems.summary()}"
+        if not finding.passed:
+            text += f"; {finding.summary()}"
         if reordered:
             text += f"; {reordered} came late"
         for gap in gaps:
-            problems.add("", None, f"missing {gap}")
-        return CheckFinding("sequence", not problems.wrong, text, problems.places, problems.wrong)
+            finding.add("", None, f"missing {gap}")
+        finding.text = text
+        return finding
 
-    def _check_accounts(self) -> CheckFinding:
-        problems = ProblemList()
+    def _check_accounts(self) -> Finding:
+        finding = self._findings["accounts"]
         if not self._accounts:
-            return problems.finding("accounts", "there are none: the file was not finished")
+            return finding.tell("there are none: the file was not finished")
         own = (check for check in self.channels.values() if check.member == topics.RECORDER)
         if not self._first_part or len({boot for check in own for boot in check.accounts}) > 1:
-            return problems.finding("accounts", "tell of parts that are not here, and were not compared")
+            return finding.tell("tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
             stated = parse_counts(self._accounts.get(topic, ""))
             there = {"received": check.received, "missing": check.missing}
             for word, count in stated.items():
                 if check.kind != topics.STATS and count != there[word]:
                     text = f"{check.name}: {count} {word} by the account, {there[word]} by the file"
-                    problems.add("", None, text)
-            if not stated and self._session_number("schema_version") >= _ACCOUNTS_SINCE:
-                problems.add("", None, f"{check.name}: has no account")
-        return problems.finding("accounts", "agree with what is there")
+                    finding.add("", None, text)
+            if not stated and self._version >= _ACCOUNTS_SINCE:
+                finding.add("", None, f"{check.name}: has no account")
+        return finding.tell("agree with what is there")
 
-    def _check_rates(self) -> CheckFinding:
-        problems, texts = ProblemList(), []
+    def _check_rates(self) -> Finding:
+        finding, texts = self._findings["rates"], []
         for check in self.channels.values():
             if check.kind != topics.STATE or check.first is None or check.last is None or not check.rate_hz:
                 continue
@@ -510,5 +497,5 @@ class SessionCheck:
             texts.append(f"{check.member} {rate_hz:.1f} Hz")
             if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
-                problems.add("", None, f"{sent}, the scenario says {check.rate_hz}")
-        return problems.finding("rates", ", ".join(texts) or "too short to tell")
+                finding.add("", None, f"{sent}, the scenario says {check.rate_hz}")
+        return finding.tell(", ".join(texts) or "too short to tell")

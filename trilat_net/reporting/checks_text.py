@@ -18,7 +18,7 @@ _MAX_LOSSES = 10
 def compose_verification(found: LogCheckReport) -> Iterator[Block]:
     """Yields a line per check, and of a log that passed those of its run."""
     for line in found.lines:
-        yield MarkedText("", f"{line.label}: {line.text}", failed=not line.passed)
+        yield MarkedText("", f"{line.check}: {line.text}", failed=not line.passed)
     if found.passed:
         yield from format_run_lines(found.log)
 

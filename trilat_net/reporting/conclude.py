@@ -13,9 +13,10 @@ import numpy as np
 
 from ..analysis.site_signals import shared_unit
 from ..errors import LawFailed, LawWithheld, RunFailed, ScenarioError
-from ..execution.log_checks import CheckLine, check_log_files, choose_exit_code
+from ..execution.log_checks import check_log_files, choose_exit_code
 from ..execution.virtual_comparison import simulate_without_operators
-from ..log.integrity import MIN_COVERAGE
+from ..log.accounting import MIN_COVERAGE
+from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
@@ -38,7 +39,7 @@ class Conclusion(Result):
     verdict: CertificateLine
     table: TextTable
     notes: list[str]
-    lines: list[CheckLine]
+    lines: list[Finding]
     paths: list[Path]
 
     @property
@@ -52,7 +53,7 @@ class Conclusion(Result):
         for line in self.lines:
             bad = "[red]FAIL[/red]" if line.judged else "[yellow]open[/yellow]"
             mark = "[green]ok[/green]  " if line.passed else bad
-            yield MarkedText(mark, f"{line.label}: {line.text}")
+            yield MarkedText(mark, f"{line.check}: {line.text}")
         yield self.table
         yield from self.notes
         yield from (f"  {path}" for path in self.paths if path != self.page)
@@ -74,7 +75,7 @@ class Conclusion(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat report --json`."""
-        checks = [line._asdict() for line in self.lines]
+        checks = [line.line() for line in self.lines]
         paths = [str(path) for path in self.paths]
         found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
         return {**found, "checks": checks, "paths": paths}
@@ -98,14 +99,14 @@ def conclude(
     from .figures.registry import write_report_figures
     from .page import write_report
 
-    lines: list[CheckLine] = []
+    lines: list[Finding] = []
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
         checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_laws))
         twin = _run_without_operators(log)
         certificate = certify_run(log, min_coverage=min_coverage)
         notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]
 
-        def verdicts() -> Iterator[CheckLine]:
+        def verdicts() -> Iterator[Finding]:
             try:
                 lines.extend(checking.result())
             except BrokenProcessPool:

@@ -17,8 +17,8 @@ from ..analysis.certificate.stability_certificate import Certificate, certificat
 from ..analysis.json_values import JsonObject
 from ..analysis.run_summary import summarise_run
 from ..analysis.twin_growth import PushedTwins
-from ..execution.log_checks import CheckLine
 from ..files import make_folder, write_whole
+from ..log.findings import Finding
 from ..log.log_reader import Log
 from . import charts, page_tables
 from .figures.arm_poses import render_arms_svg
@@ -67,7 +67,7 @@ def write_report(
     *,
     twin: Log | None = None,
     certificate: Certificate | None = None,
-    verdicts: Iterable[CheckLine] = (),
+    verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
     """Writes report.html and summary.json, and returns their paths.
 
@@ -99,7 +99,7 @@ def write_report(
             section += f'<img src="data:image/png;base64,{data}" alt="{words}" class="picture">'
         section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
-    facts["checks"] = [line._asdict() for line in lines]
+    facts["checks"] = [line.line() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
     write_whole(page, render_report(log, twin, lines, facts, section, verdict))
     write_whole(numbers, _json(facts, indent=2) + "\n")
@@ -109,7 +109,7 @@ def write_report(
 def render_report(
     log: Log,
     twin: Log | None,
-    verdicts: Sequence[CheckLine],
+    verdicts: Sequence[Finding],
     facts: JsonObject,
     certificate: str = "",
     verdict: str = "",

@@ -13,7 +13,7 @@ from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.json_values import JsonObject
 from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
-from ..execution.log_checks import CheckLine
+from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..scenario import Scenario, list_shipped, load_scenario
 from .certificate_text import describe_certificate, list_energies
@@ -39,13 +39,13 @@ def render_verdict(certificate: Certificate) -> str:
     return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li></ul>'
 
 
-def render_check_lines(verdicts: Sequence[CheckLine]) -> str:
+def render_check_lines(verdicts: Sequence[Finding]) -> str:
     """Returns the list of verdicts; "" if nothing was checked."""
     items = ""
     for line in verdicts:
         bad = "✗ failed" if line.judged else "not judged"
         kind, mark = ("passed", "✓ ok") if line.passed else ("failed", bad)
-        items += f'<li class="{kind}"><b>{mark}</b>{escape(line.label)}: {escape(line.text)}</li>'
+        items += f'<li class="{kind}"><b>{mark}</b>{escape(line.check)}: {escape(line.text)}</li>'
     return f'<ul class="verdicts">{items}</ul>' if items else ""
 
 

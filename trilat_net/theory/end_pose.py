@@ -20,7 +20,7 @@ from ..analysis.timeline import recorded_end_s
 from ..analysis.twin_growth import TWINS, measure_twins
 from ..core.vectors import Array
 from ..errors import ScenarioError
-from ..log.integrity import MIN_COVERAGE
+from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario

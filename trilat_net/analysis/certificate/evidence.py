@@ -10,8 +10,7 @@ import numpy as np
 
 from ...log.accounting import Coverage
 from ...log.digest_chain import Integrity
-from ...log.integrity import judge_integrity
-from ...log.log_reader import Log
+from ...log.log_reader import Log, judge_integrity
 from .energy_balance import EnergyBalance
 from .premises import find_unjudged_spans, was_away
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core.vectors import Array
-from ...log.integrity import MIN_COVERAGE
+from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import Result
 from ..json_values import JsonObject, finite_or_none
