@@ -13,18 +13,19 @@ CONSTANT = {"model": "constant", "delay_ms": 200.0}
 JITTER = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0, "loss": 0.1}
 MOBILE = {"preset": "4g"}
 FOLLOWER = {"K": 100.0, "B": 10.0}
+LEADER = {"K": 0.0, "B": 0.0}
 LAWS: dict[str, dict[str, Any]] = {
     "wave": {"law": "wave"},
-    "tdpa": {"law": "tdpa", "acceleration_rad_s2": 100.0},  # torque that jumps makes joints jump
+    "tdpa": {"law": "tdpa"},
     "tanks": {"law": "tanks"},
 }
 
 
 def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any) -> Scenario:
-    """A master with the hand H50 and a slave; the slave has K and B of laws that ask for them there alone."""
-    follows = {} if control["law"].lower().endswith("tanks") else FOLLOWER
+    """A master with the hand H50 that leads only, and a slave with K and B, of laws that have them."""
+    follows, leads = ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
     slave = {"hands": [CLAMP] if clamped else [], "control": {**control, **follows}}
-    sites = {"m": {"hands": [H50]}, "s": slave}
+    sites = {"m": {"hands": [H50], "control": {**control, **leads}}, "s": slave}
     return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
 
 

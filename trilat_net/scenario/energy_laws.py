@@ -174,14 +174,15 @@ class EnergyTanks(EnergyLaw, frozen=True, tag_field="law", tag="tanks"):
 class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
     """Time-domain passivity control with delay: each end watches the energy of its coupling, and damps.
 
-    Followers are moved by K and B towards the integral of their leaders' velocities, and leaders feel that
-    torque. After Ryu, Artigas and Preusche (2010).
+    Every site follows by K and B towards the integral of its peers' velocities, mixed by dominance, and the
+    peers feel that torque; K = 0 and B = 0 make a site lead only. After Ryu, Artigas and Preusche (2010);
+    several sites: after Panzirsch, Artigas, Tobergte, Kotyczka, Preusche, Albu-Schaeffer and Hirzinger (2012).
 
     Attributes:
         K: spring by which the site follows, per joint, N m/rad; 0: it follows nobody.
         B: damper by which it follows, per joint, N m s/rad.
-        acceleration_rad_s2: most by which a joint accelerates, as far as leaders' controllers cover it: in
-            the period to come it moves by qd h and half of this times h^2 more.
+        acceleration_rad_s2: by which torques that are not the law's change a joint's acceleration from tick
+            to tick, as far as leaders' controllers cover it beforehand; half of the reserve covers it too.
         drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
         reserve_J: energy per joint and peer with which an end begins.
         energy: "step": what the arm gets, torque times the step in q; "velocity": torque times velocity times
@@ -195,17 +196,18 @@ class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
         """Returns why it cannot be linearised."""
         return "its controllers act by the energy observed, which is of second order in the motion"
 
-    K: NotNegativeJoints = (0.0,)
-    B: NotNegativeJoints = (0.0,)
-    acceleration_rad_s2: NotNegative = 100.0
+    K: NotNegativeJoints = (100.0,)
+    B: NotNegativeJoints = (10.0,)
+    acceleration_rad_s2: NotNegative = 0.0
     drift_rad_s: NotNegative = 0.5
     reserve_J: NotNegative = 1e-3
     energy: Literal["step", "velocity"] = "step"
     beta: Positive = 1.0
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that the couplings are passive as far as their leaders' joints do not accelerate more."""
-        leak = "" if self.energy == "step" else " in books that leak tau qdd h^2 / 2 a tick"
-        most = f"leaders' joints accelerate by {self.acceleration_rad_s2:g} rad/s^2 at most"
-        text = f"couplings are passive{leak} for any delays, jitter and loss, where {_PASSIVE}, and {most}"
-        return StabilityCondition(True, text)
+        """Returns that the couplings are passive, as far as motion can be foretold for a tick."""
+        text = f"couplings are passive for any delays, jitter, loss and shares, where {_PASSIVE}, "
+        if self.energy == "velocity":
+            return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
+        most = f"change accelerations by {self.acceleration_rad_s2:g} rad/s^2 a tick, beyond what half of reserve_J"
+        return StabilityCondition(True, f"{text}and torques of others do not {most} pays")

@@ -209,12 +209,6 @@ def _wave(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) ->
     return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
 
 
-def _tdpa(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    known = {"law": "tdpa", "gravity": knowledge.gravity}
-    follows = {"slave": dict(gains), "master": {}}
-    return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
-
-
 def _sync(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
     known = {"law": "sync", "Lambda": gains["Lambda"], "K": gains["Kp"], "Gamma": gains["Gamma"]}
     return {name: {**known, "theta_hat0": knowledge.prior(scenario, name)} for name in scenario.names}
@@ -280,7 +274,7 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
         SearchSpace("wave", (_D._replace(name="b"), _FOLLOWING[0]), "gravity", _wave),
-        SearchSpace("tdpa", _FOLLOWING, "gravity", _tdpa),
+        SearchSpace("tdpa", _CHANNELS, "gravity, and inertia for a tick ahead", _tell_gains("tdpa")),
         SearchSpace("tanks", (_K, _KD), "gravity", _tell_gains("tanks")),
     )
 }
