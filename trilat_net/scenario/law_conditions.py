@@ -30,6 +30,7 @@ class LawSituation(NamedTuple):
         tau_limit_nm: largest torques of the site's joints, N m.
         rate_hz: tick rate of the site, Hz.
         gravity_nm: largest torque by which the site's planar arm is held, N m per joint; () of a chain.
+        digital: true: torques are held over a tick, see `Scheme`.
     """
 
     site: int
@@ -40,6 +41,7 @@ class LawSituation(NamedTuple):
     tau_limit_nm: tuple[float, ...]
     rate_hz: int
     gravity_nm: tuple[float, ...] = ()
+    digital: bool = False
 
     @property
     def longest_s(self) -> float:

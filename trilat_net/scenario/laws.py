@@ -185,6 +185,10 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
     k_f: fields.NotNegativeCoordinates = (0.0,)
     gravity: fields.NotNegative = 1.0
 
+    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
+        """Returns that a site with neither gain follows nobody."""
+        return "" if any(self.K) or any(self.k_f) else "K = 0 and k_f = 0 follow nobody"
+
 
 class LeeSpong(fields.Frozen, frozen=True, tag_field="law", tag="lee_spong"):
     """PD+d under its published bound: d = K T_max + P_e for delays up to T_max.

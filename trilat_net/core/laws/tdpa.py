@@ -137,7 +137,7 @@ def correct_drift(law: Any, now: LawInput, i: int, force: float, error: float, r
 
 @compiled
 def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the velocity of the goal by peer j, less where this torque makes it dearer than what is known."""
+    """Returns the velocity of the goal by peer j, less where that costs more than is known."""
     at, work = j * now.joints + i, now.peers[j].alpha * force * now.h_s
     known = now.received[j].E_led[i] + 0.5 * law.reserve - law.E_moved[at] + law.E_yielded[at]
     known, velocity = max(known, 0.0), float(law.v_led[at])
@@ -206,7 +206,7 @@ def follow(law: Any, now: LawInput, i: int) -> None:
     for j in range(len(now.peers)):
         law.v_led[j * n + i] += more
         moved += now.peers[j].alpha * law.v_led[j * n + i]
-    for _ in range(SWEEPS if law.by_step else 0):  # the torque is that of these velocities, and they pay for it
+    for _ in range(SWEEPS if law.by_step else 0):  # it is that of velocities which pay for it
         force = max(law.low[i], min(law.high[i], K * stretch + B * (moved - now.qd[i])))
         moved = 0.0
         for j in range(len(now.peers)):
