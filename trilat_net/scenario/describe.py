@@ -58,11 +58,13 @@ def _list_situations(scenario: Scenario) -> list[LawSituation]:
     """Returns what the condition of each site's law may be made of."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     every = (scenario.names, scenario.controls, scenario.alpha, find_link_delays(scenario.links, rates_hz))
+    ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
+    hold_s = 0.0 if scenario.scheme != "digital" else ticks_s.pop() if len(ticks_s) == 1 else math.nan
     return [
         LawSituation(
             *(n, *every, tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()), site.rate_hz),
             gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
-            digital=scenario.scheme == "digital",
+            hold_s=hold_s,
         )
         for n, (name, site) in enumerate(scenario.sites.items())
     ]

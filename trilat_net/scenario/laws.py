@@ -134,7 +134,8 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
 
     For reversible shares, equal gains and one constant delay T the linearised loop of N sites is stable
     whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some masses only then; two
-    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d.
+    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d. That
+    is in continuous time: held torques need more (docs/laws.md).
 
     Attributes:
         K: stiffness per joint, N m/rad.
