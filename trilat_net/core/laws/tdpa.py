@@ -19,6 +19,10 @@ from ..user_law import LawContext, LawInput
 
 SWEEPS = 3
 """How often joints and couplings settle what each leaves of its torque, as these move one another."""
+AHEAD = 2.0
+"""Ticks of a leader's motion that are foretold and paid for: stopped in one, a joint turns back; in two it rests."""
+SPENT_S = 0.1
+"""Drift compensation spends what is left at such a rate that it lasts for this time, s."""
 _SLACK_NM = 1e-9
 """A torque that gives a follower's controller nothing to act on."""
 
@@ -68,19 +72,20 @@ def invert_inertia(law: Any, now: LawInput) -> None:
 def lead(law: Any, now: LawInput, j: int, i: int) -> None:
     """Writes the torque that the leader's end of that coupling feels.
 
-    The controller leaves of the follower's torque what the known energy pays for in the period to come. In it
-    the joint goes on as before, and farther by what torques of this tick add to those of the tick before, its
-    own included. A deficit is repaid by damping.
+    The controller leaves of the follower's torque what the known energy pays for in the time ahead. In it the
+    joint goes on as before, and farther by what torques of this tick add to those of the tick before, its own
+    included. A deficit is repaid by damping.
     """
     n, h, asked = now.joints, now.h_s, now.received[j].F[i]
     at, spare = j * n + i, max(now.sent[j].W_led[i] - law.floor, 0.0)
     sign, most = 1.0 if asked > 0.0 else -1.0, abs(asked)
-    step, own = now.qd[i] * h, 0.0
+    step, own, half = now.qd[i] * h, 0.0, 0.5 * h * h
     if law.by_step:
-        own, step = 0.5 * law.inverse[i * n + i] / law.beta * h * h, law.ahead[i]
+        half *= AHEAD * AHEAD
+        own, step = half * law.inverse[i * n + i] / law.beta, AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
         for one in range(n):
-            step += 0.5 * law.inverse[i * n + one] * law.change[one] * h * h
-    away = 0.5 * law.acceleration * h * h - sign * step - own * sign * law.F_now[at]  # without a torque here
+            step += half * law.inverse[i * n + one] * law.change[one]
+    away = half * law.acceleration - sign * step - own * sign * law.F_now[at]  # without a torque here
     if most * (away + own * most) > spare:
         if own > 0.0:
             most = max(math.sqrt(away * away + 4.0 * own * spare) - away, 0.0) / (2.0 * own)
@@ -89,7 +94,7 @@ def lead(law: Any, now: LawInput, j: int, i: int) -> None:
     torque = asked if not law.controlled else sign * most
     owed = law.floor - now.sent[j].W_led[i]
     if law.controlled and own > 0.0 and owed > 0.0 and now.qd[i] * law.ahead[i] > 0.0:
-        damping = 0.25 * h / (n * len(now.peers) * own)
+        damping = 0.25 * h * AHEAD**2 / (n * len(now.peers) * own)
         torque += now.qd[i] * min(0.1 * owed / (now.qd[i] * law.ahead[i]), damping)
     law.change[i] -= (torque - law.F_now[at]) / law.beta
     law.F_now[at] = torque
@@ -113,26 +118,25 @@ def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, pric
 
 
 @compiled
-def correct_drift(law: Any, now: LawInput, i: int, force: float, error: float, room: float) -> float:
-    """Returns the velocity that takes the goal to where the peers are, as far as each coupling pays for it.
+def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) -> float:
+    """Returns the velocity that takes the goal to where the peers are, as far as couplings pay for it.
 
-    Of a unit of dominance `room` is what the poorest one has left. It moves the goal for all peers, so their
-    velocities, and the damper and the spring that answer it, count too.
+    `room` is what they have left together. The goal moves for all peers: the work of the torque counts, by
+    steps that of the damper and the spring which answer, and what these do with the peers' velocities too.
     """
     h, more = now.h_s, max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
-    against = abs(force) * (force * more > 0.0)
+    linear, square, most = law.force[i] * (1.0 if more > 0.0 else -1.0), 0.0, abs(more)
+    power = room / h
     if law.by_step:
-        speed = apart = 0.0
+        power = room / max(SPENT_S, h)
+        square = law.B[i] + 0.5 * law.K[i] * h
         for j in range(len(now.peers)):
-            speed = max(speed, abs(now.peers[j].qd[i]))
-            apart += now.peers[j].alpha * now.peers[j].qd[i]
-        apart -= now.qd[i]
-        against += law.B[i] * (speed + 2.0 * abs(apart) + law.drift_rad_s)
-        against += law.K[i] * h * (abs(apart) + 0.5 * law.drift_rad_s)
-    if against > 0.0:
-        most = room / (against * h)
-        more = max(-most, min(most, more))
-    return float(more)
+            linear += law.B[i] * now.peers[j].alpha * abs(now.peers[j].qd[i])
+    if square > 0.0:
+        most = (math.sqrt(linear * linear + 4.0 * square * power) - linear) / (2.0 * square)
+    elif linear > 0.0:
+        most = power / linear
+    return float(max(-most, min(most, more)))
 
 
 @compiled
@@ -145,11 +149,12 @@ def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
 
 
 @compiled
-def book_follower(law: Any, now: LawInput, j: int, i: int, force: float) -> None:
-    """Books the follower's end of the coupling to peer j.
+def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
+    """Books the follower's end of the coupling to peer j, and its part of what drift compensation takes.
 
     By steps, the torque is that of the velocity in use, and the energy too; as it is published, both are
-    those of the leader's velocity, and what the controller changes is booked apart.
+    those of the leader's velocity, and what the controller changes is booked apart. What drift compensation
+    gives back stays here.
     """
     at, h = j * now.joints + i, now.h_s
     velocity = law.v_led[at] if law.by_step else now.peers[j].qd[i]
@@ -158,7 +163,7 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float) -> None
         law.E_moved[at] += energy
     else:
         now.sent[j].E_followed[i] -= energy
-    law.E_yielded[at] += force * (velocity - law.v_led[at]) * h
+    law.E_yielded[at] += force * (velocity - law.v_led[at]) * h - drift
     now.sent[j].W_followed[i] = now.received[j].E_led[i] + law.reserve - law.E_moved[at] + law.E_yielded[at]
 
 
@@ -180,6 +185,30 @@ def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
 
 
 @compiled
+def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float, room: float) -> None:
+    """Settles torque and velocities of a joint that follows, `more` that of drift compensation, and books.
+
+    By steps, the torque is that of velocities which pay for it; several peers share one torque.
+    """
+    n, h, force, velocity = now.joints, now.h_s, law.force[i], 0.0
+    for sweep in range(1 + SWEEPS * law.by_step):
+        if sweep > 0:
+            force = law.K[i] * stretch + law.B[i] * (velocity - now.qd[i])
+            force = max(law.low[i], min(law.high[i], force))
+            more = room / (force * h) if force * more * h > room else more
+        velocity = more
+        for j in range(len(now.peers)):
+            if sweep > 0:
+                law.v_led[j * n + i] = afford(law, now, j, i, force)
+            velocity += now.peers[j].alpha * law.v_led[j * n + i]
+    for j in range(len(now.peers)):
+        part = law.left[j * n + i] / room if room > 0.0 else 0.0
+        book_follower(law, now, j, i, now.peers[j].alpha * force, part * force * more * h)
+    law.goal[i] += h * velocity
+    law.force[i], law.paid[i] = force, force * velocity * h
+
+
+@compiled
 def follow(law: Any, now: LawInput, i: int) -> None:
     """Moves the goal of a joint by the velocities of the peers, and writes the torque that follows it."""
     n, h, K, B = now.joints, now.h_s, law.K[i], law.B[i]
@@ -192,30 +221,20 @@ def follow(law: Any, now: LawInput, i: int) -> None:
     stretch = law.goal[i] - now.q[i]
     pull = max(law.low[i], min(law.high[i], K * stretch))
     charge_unpaid(law, now, i, pull * (stretch - 0.5 * pull / K) if K > 0.0 else 0.0)
-    force = max(law.low[i], min(law.high[i], K * stretch + B * (velocity - now.qd[i])))
+    law.force[i] = max(law.low[i], min(law.high[i], K * stretch + B * (velocity - now.qd[i])))
     gap = velocity * h - law.ahead[i]  # by which the spring is expected to become longer
-    price, room, moved = max((0.5 * K * gap - B * (velocity - now.qd[i])) * gap, 0.0), np.inf, 0.0
+    price = max((0.5 * K * gap - B * (velocity - now.qd[i])) * gap, 0.0)
+    more = room = least = 0.0
     for j in range(len(now.peers)):
         alpha = now.peers[j].alpha
-        now.sent[j].F[i] = alpha * force
-        left = control_follower(law, now, j, i, alpha * force, alpha * price)
-        room = min(room, left / alpha) if alpha > 0.0 else room
-    more = 0.0
-    if law.drift_rad_s > 0.0 and 0.0 < room < np.inf:
-        more = correct_drift(law, now, i, force, target - law.goal[i] - h * velocity, room)
-    for j in range(len(now.peers)):
-        law.v_led[j * n + i] += more
-        moved += now.peers[j].alpha * law.v_led[j * n + i]
-    for _ in range(SWEEPS if law.by_step else 0):  # it is that of velocities which pay for it
-        force = max(law.low[i], min(law.high[i], K * stretch + B * (moved - now.qd[i])))
-        moved = 0.0
-        for j in range(len(now.peers)):
-            law.v_led[j * n + i] = afford(law, now, j, i, force)
-            moved += now.peers[j].alpha * law.v_led[j * n + i]
-    for j in range(len(now.peers)):
-        book_follower(law, now, j, i, now.peers[j].alpha * force)
-    law.goal[i] += h * moved
-    law.force[i], law.paid[i] = force, force * moved * h
+        now.sent[j].F[i] = alpha * law.force[i]
+        left = control_follower(law, now, j, i, alpha * law.force[i], alpha * price)
+        law.left[j * n + i] = max(left, 0.0) * (alpha > 0.0)
+        room += law.left[j * n + i]
+        least = min(least, left)
+    if law.drift_rad_s > 0.0 and room > 0.0 and least >= 0.0:
+        more = correct_drift(law, now, i, target - law.goal[i] - h * velocity, room)
+    settle_follower(law, now, i, stretch, more, room)
 
 
 @compiled
@@ -275,7 +294,7 @@ class Tdpa:
         self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
         self.E_moved, self.E_yielded, self.lent, self.E_settled = ([0.0] * (n * peers) for _ in range(4))
         self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
-        self.inverse = [0.0] * (n * n)
+        self.inverse, self.left = [0.0] * (n * n), [0.0] * (n * peers)
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque; sends torques and energies."""
