@@ -104,8 +104,8 @@ class WaveVariables(EnergyLaw, frozen=True, tag_field="law", tag="wave"):
         lines = np.array([self.find_impedances(here, peer)[0] * (peer != here) for peer in at.names])
         if np.allclose(lines, at.alpha[at.site] * lines.sum(), atol=1e-6 * lines.sum()):
             return ""
-        why = "" if self.lines else ", as the sites' shares are not reversible"
-        return f"lines share as b_ij / sum b_ik{why}"
+        own = self.lines or find_balancing_weights(at.alpha) is not None
+        return f"lines share as b_ij / sum b_ik{'' if own else ', as the shares of sites are not reversible'}"
 
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
         """Returns the impedance of a line at each joint, N m s/rad; as `at_shares` left it."""

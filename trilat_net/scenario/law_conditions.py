@@ -126,7 +126,13 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
         return StabilityCondition(
             False, "shares that are not reversible: some heavy arms are unstable at any d"
         )
-    share = max(-least, COMMON_MOTION_SHARE)
+    share = max(-least, _find_common_share(2.0 * T / h + 1.0) if h else COMMON_MOTION_SHARE)
     bound = 0.5 * h * K[0] + share * K[0] * (T + 0.5 * h)
     text = f"d > {'K h / 2 + ' if h else ''}{share:.4g} K {'(T + h / 2)' if h else 'T'} = {bound.max():.4g}"
     return StabilityCondition(bool((d[0] > bound).all()), f"{text} ({scope})")
+
+
+def _find_common_share(count: float) -> float:
+    """Returns -min sin(n x) / (n sin x), the common motion's share over n = 2 T / h + 1 halves of a tick."""
+    x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
+    return float(-(np.sin(count * x) / (count * np.sin(x))).min())
