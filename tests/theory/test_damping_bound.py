@@ -197,14 +197,14 @@ def test_it_never_calls_enough_what_grows(seed: int, *, sharp: bool) -> None:
     assert found.count(None) > 40
 
 
-K_HELD, h_HELD = 50.0, 1.0 / 30.0
+K_PAIR, TICK_S = 50.0, 1.0 / 30.0
 
 
 def judged(count: int, ticks: int, d: float) -> StabilityCondition:
     """The condition of equal sites at 30 Hz whose torques are held."""
-    laws = (SimpleNamespace(K=(K_HELD,), d=(d,)),) * count
-    names, delay_s = tuple(map(str, range(count))), ticks * h_HELD * (equal(count) > 0.0)
-    situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=h_HELD)
+    laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
+    names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
+    situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
     return judge_position_exchange(situation, "K", "d")
 
 
@@ -213,20 +213,20 @@ def growth(count: int, ticks: int, d: float, mass: float) -> float:
     rates = []
     for share in (1.0, -1.0 / (count - 1)):
         row = np.zeros(2 + ticks)
-        row[:2], row[-1] = (-K_HELD, -d), row[-1] + K_HELD * share
+        row[:2], row[-1] = (-K_PAIR, -d), row[-1] + K_PAIR * share
         step = np.eye(2 + ticks, k=-1)
         step[:2] = 0.0
-        step[0, :2], step[1, 1], step[2, 0], step[2, 1] = (1.0, h_HELD), 1.0, 1.0, 0.0
-        step[:2] += np.outer([0.5 * h_HELD**2 / mass, h_HELD / mass], row)
+        step[0, :2], step[1, 1], step[2, 0], step[2, 1] = (1.0, TICK_S), 1.0, 1.0, 0.0
+        step[:2] += np.outer([0.5 * TICK_S**2 / mass, TICK_S / mass], row)
         z = np.linalg.eigvals(step)
         others = np.delete(z, np.abs(z - 1.0).argmin()) if share == 1.0 else z
-        rates.append(np.log(np.abs(others).max()) / h_HELD)
+        rates.append(np.log(np.abs(others).max()) / TICK_S)
     return float(max(rates))
 
 
 def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
     """K 50, d 2 at 30 Hz over a tick: 1.667 would do in continuous time."""
-    assert K_HELD * h_HELD == pytest.approx(1.667, abs=1e-3)
+    assert K_PAIR * TICK_S == pytest.approx(1.667, abs=1e-3)
     assert growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
     assert judged(2, 1, 2.0).holds is False
 
@@ -236,9 +236,9 @@ def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
 def test_the_bound_of_held_torques_is_that_of_the_worst_mass(count: int, ticks: int) -> None:
     """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
     text = judged(count, ticks, 1e3).text
-    sides = K_HELD * h_HELD * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
+    sides = K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
     for d, grows in ((0.97 * sides, True), (1.01 * sides, False)):
         assert judged(count, ticks, d).holds is not grows
-        masses = np.concatenate([0.5 * d * h_HELD * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)])
-        most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * h_HELD)
+        masses = np.concatenate([0.5 * d * TICK_S * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)])
+        most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S)
         assert (most > 0.0) is grows

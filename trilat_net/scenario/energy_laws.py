@@ -240,12 +240,12 @@ class PassivityControl(EnergyLaw, frozen=True, tag_field="law", tag="tdpa"):
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that the couplings are passive, as far as motion can be foretold for a tick."""
+        """Returns that the couplings are passive, as far as motion can be foretold."""
         text = f"couplings are passive for any delays, jitter, loss and shares, where {_PASSIVE}, "
         if self.energy == "velocity":
             return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
-        beside = f"{self.acceleration_rad_s2:g} rad/s^2 and " if self.acceleration_rad_s2 else ""
-        most = (
-            f"by which torques outside of it change a joint's acceleration within a tick is within {beside}"
+        beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2" if self.acceleration_rad_s2 else ""
+        paid = (
+            f"while half of reserve_J pays for what other torques change accelerations by in a tick{beyond}"
         )
-        return StabilityCondition(True, f"{text}and that {most}what half of reserve_J pays")
+        return StabilityCondition(True, f"{text}{paid}")

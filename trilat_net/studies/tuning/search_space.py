@@ -273,7 +273,7 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
         SearchSpace("wave", (_D._replace(name="b"), _K), "gravity", _wave),
-        SearchSpace("tdpa", _CHANNELS, "gravity, and inertia for a tick ahead", _tell_gains("tdpa")),
+        SearchSpace("tdpa", _CHANNELS, "gravity, and inertia for two ticks", _tell_gains("tdpa")),
         SearchSpace("tanks", (_K, _KD), "gravity", _tell_gains("tanks")),
     )
 }
