@@ -226,7 +226,8 @@ def growth(count: int, ticks: int, d: float, mass: float) -> float:
 
 def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
     """K 50, d 2 at 30 Hz over a tick: 1.667 would do in continuous time."""
-    assert K_PAIR * TICK_S == pytest.approx(1.667, abs=1e-3)
+    assert judged(2, 1, 3.33).holds is False
+    assert judged(2, 1, 3.34).holds
     assert growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
     assert judged(2, 1, 2.0).holds is False
 

@@ -20,7 +20,7 @@ from ..user_law import LawContext, LawInput
 SWEEPS = 3
 """How often joints and couplings settle what each leaves of its torque, as these move one another."""
 AHEAD = 2.0
-"""Ticks of a leader's motion that are foretold and paid for: stopped in one, a joint turns back; in two it rests."""
+"""Ticks of a leader's motion that are paid for beforehand: in one a joint turns back, in two it rests."""
 SPENT_S = 0.1
 """Drift compensation spends what is left at such a rate that it lasts for this time, s."""
 _SLACK_NM = 1e-9
