@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.unit_arm import CLAMP, H50, unit_scenario
+from tests.unit_arm import CLAMP, H50, hand, unit_scenario
 from tests.virtual_runs import sampled
 from trilat_net.scenario import Scenario
 
@@ -13,18 +13,19 @@ CONSTANT = {"model": "constant", "delay_ms": 200.0}
 JITTER = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0, "loss": 0.1}
 MOBILE = {"preset": "4g"}
 FOLLOWER = {"K": 100.0, "B": 10.0}
+LEADER = {"K": 0.0, "B": 0.0}
 LAWS: dict[str, dict[str, Any]] = {
     "wave": {"law": "wave"},
-    "tdpa": {"law": "tdpa", "acceleration_rad_s2": 100.0},  # torque that jumps makes joints jump
+    "tdpa": {"law": "tdpa"},
     "tanks": {"law": "tanks"},
 }
 
 
 def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any) -> Scenario:
-    """A master with the hand H50 and a slave; the slave has K and B of laws that ask for them there alone."""
-    follows = {} if control["law"].lower().endswith("tanks") else FOLLOWER
+    """A master with the hand H50 that leads only, and a slave with K and B, of laws that have them."""
+    follows, leads = ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
     slave = {"hands": [CLAMP] if clamped else [], "control": {**control, **follows}}
-    sites = {"m": {"hands": [H50]}, "s": slave}
+    sites = {"m": {"hands": [H50], "control": {**control, **leads}}, "s": slave}
     return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
 
 
@@ -67,3 +68,48 @@ def least_energy(run: dict[str, Any]) -> float:
         if hasattr(to, name)
     ]
     return min(float(one.min()) for one in found)
+
+
+def drawn(law: str, seed: int) -> Scenario:
+    """Two or three sites, half of the runs with planar arms, over a bad network; shares change thrice.
+
+    Half of the samples are lost, or delays are those of 4g, or jitter is as long as the delay. In most runs
+    the slave is in contact, or is pushed.
+    """
+    rng = np.random.default_rng(seed)
+    names = ["m1", "m2", "s"] if rng.random() < 0.65 else ["m1", "s"]
+    K = round(float(np.exp(rng.uniform(np.log(20.0), np.log(300.0)))), 1)
+    B, T = round(K * float(rng.uniform(0.03, 0.15)), 2), round(float(rng.uniform(20.0, 250.0)), 1)
+    b = round(float(rng.uniform(2.0, 20.0)), 2)
+    keys: dict[str, dict[str, Any]] = {
+        "tdpa": {"K": K, "B": B},
+        "wave": {"b": b, "K": K * float(rng.random() < 0.6), "B": b},
+        "tanks": {"K": K, "Kd": B},
+    }
+    links: list[dict[str, Any]] = [
+        MOBILE,
+        {"model": "uniform", "delay_ms": T, "half_width_ms": T, "loss": 0.1},
+        {"model": "constant", "delay_ms": T, "loss": 0.5},
+        {"model": "uniform", "delay_ms": T, "half_width_ms": round(0.5 * T, 1), "loss": 0.5},
+    ]
+    clamp = {**CLAMP, "stiffness_nm_rad": float(rng.uniform(200.0, 1500.0)), "damping_nm_s_rad": 3.0}
+    push = {"kind": "pulse", "start_s": 3.0, "end_s": 3.3, "peak_nm": [8.0, 4.0]}
+    sites: dict[str, Any] = {"s": {"hands": [[clamp], [clamp], [push], []][rng.integers(4)]}}
+    for name, to in zip(names[:-1], (0.3, -0.3), strict=False):
+        k = round(float(rng.uniform(20.0, 100.0)), 1)
+        sites = {name: {"hands": [hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]}, **sites}
+    sites = {name: sites[name] for name in names}
+    more: dict[str, Any] = {} if rng.random() < 0.5 else {"arm": {}, "limits": {"tau_limit_nm": 200.0}}
+    if len(names) == 3:
+        times = [(at_s, name) for at_s in (2.5, 4.5, 6.5) for name in names]
+        changes = [{"at_s": at_s, "dominance": name, "to": _draw_shares(rng, name)} for at_s, name in times]
+        more["timeline"] = [{**one, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for one in changes]
+        more["dominance"] = {name: _draw_shares(rng, name) for name in names}
+    control, link = {"law": law, **keys[law]}, links[rng.integers(4)]
+    return unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)
+
+
+def _draw_shares(rng: np.random.Generator, name: str) -> dict[str, float]:
+    first, second = (one for one in ("m1", "m2", "s") if one != name)
+    share = round(float(rng.uniform(0.05, 0.95)), 3)
+    return {first: share, second: round(1.0 - share, 3)}

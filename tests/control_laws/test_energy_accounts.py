@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from tests.energy_runs import JITTER, LAWS, MOBILE, least_energy, pair, ticked
+from tests.energy_runs import JITTER, LAWS, MOBILE, drawn, least_energy, pair, ticked
 from tests.log_editing import opened
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.execution import virtual
@@ -30,6 +30,18 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
             run = ticked(scenario, every=11)
             assert least_energy(run) >= -1e-9
             assert np.abs(run["s"].qd).max() < 5.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    "seeds",
+    [range(4), range(4, 8), range(8, 12), pytest.param(range(12, 200), marks=pytest.mark.long)],
+    ids=str,
+)
+def test_no_energy_is_below_zero_at_any_tick_of_drawn_runs(law: str, seeds: range) -> None:
+    """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
+    least = {seed: least_energy(ticked(drawn(law, seed))) for seed in seeds}
+    assert {seed: one for seed, one in least.items() if one < -1e-9} == {}
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -75,14 +75,24 @@ def test_lee_and_spong_feel_the_clamp_and_drag_a_common_motion() -> None:
     assert 0.8 / last_rows(pushed, 40.0)[0]["qd"][:, 0] == pytest.approx(80.0, abs=0.05)
 
 
-@pytest.mark.parametrize(("late_ms", "holds"), [(200.0, True), (201.0, False)])
-def test_the_bound_of_lee_and_spong_is_met_at_the_edge(late_ms: float, holds: bool) -> None:
-    link = {"model": "constant", "delay_ms": late_ms}
-    law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0}
-    told = describe_law_conditions(unit_scenario({"m": {}, "s": {}}, law, link=link))
-    assert (
-        f"lee_spong at m, s {'holds' if holds else 'does not hold'}: 4 d1 d2 >= (T1 + T2)^2 K1 K2" in told[0]
-    )
+@pytest.mark.parametrize(
+    ("scheme", "more_ms", "P_e", "holds"),
+    [
+        ("second_order", 0.0, 0.0, True),
+        ("second_order", 1.0, 0.0, False),
+        ("digital", 0.0, 0.1, True),
+        ("digital", 0.0, 0.09, False),
+    ],
+)
+def test_the_bound_of_lee_and_spong_is_met_at_the_edge(
+    scheme: str, more_ms: float, P_e: float, holds: bool
+) -> None:
+    """As published, and with K h more for torques that are held."""
+    link = {"model": "constant", "delay_ms": 200.0 + more_ms}
+    law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
+    told = describe_law_conditions(unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme))
+    text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
+    assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in told[0]
 
 
 @pytest.mark.long

@@ -130,6 +130,36 @@ def test_a_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str,
     assert waves.min() == pytest.approx(least, rel=4e-3, abs=1e-12)
 
 
+LOSSY = [
+    ({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0),
+    ({"model": "constant", "delay_ms": 68.0, "loss": 0.02}, 20.0),
+    pytest.param({"preset": "4g"}, 240.0, marks=pytest.mark.long),
+]
+
+
+def held_torque(link: dict[str, Any], push: dict[str, Any], duration_s: float) -> Any:
+    """The master's torque, a row a tick, in contact with 700 N m/rad and 3 N m s/rad."""
+    clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
+    return ticked(received("replay", link, duration_s, [clamp], push))["m"].tau[:, 0]
+
+
+@pytest.mark.parametrize(("link", "duration_s"), LOSSY)
+def test_a_line_under_a_constant_force_plays_it_at_ticks_without_a_wave(
+    link: dict[str, Any], duration_s: float
+) -> None:
+    push = {"kind": "recorded", "points": [[0.0, 2.2, 1.1], [1e4, 2.2, 1.1]]}
+    tau = held_torque(link, push, min(duration_s, 60.0))[10000:]
+    assert np.abs(tau) == pytest.approx(2.2, abs=0.01)
+    assert np.abs(np.diff(tau)).max() < 0.01
+
+
+@pytest.mark.parametrize(("link", "duration_s"), LOSSY)
+def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: float) -> None:
+    tau = np.abs(held_torque(link, hand(0.0682, 40.0, 6.0), duration_s))
+    assert tau[-1000:].mean() == pytest.approx(tau[9000:10000].mean(), rel=1e-3)
+    assert np.abs(np.diff(tau[10000:])).max() < 0.03
+
+
 def test_play_out_makes_jitter_a_constant_delay() -> None:
     jitter = {**JITTER, "loss": 0.0, "playout_ms": 400.0}
     a, other = (

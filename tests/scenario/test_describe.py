@@ -1,7 +1,9 @@
 import numpy as np
+import pytest
 
 import trilat_net
 from tests.scenario.chains import six
+from tests.unit_arm import unit_scenario
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import compare_scenarios, describe_scenario
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
@@ -91,3 +93,49 @@ def test_an_arm_that_takes_long_to_stop_says_so() -> None:
     )
     slow = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 10.0})
     assert not [line for line in describe_scenario(slow) if "to stop from" in line]
+
+
+REVERSIBLE = {"m1": {"m2": 0.25, "s": 0.75}, "m2": {"m1": 0.25, "s": 0.75}, "s": {"m1": 0.5, "m2": 0.5}}
+ONE_WAY = {**REVERSIBLE, "s": {"m1": 0.9, "m2": 0.1}}
+RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 0.5}]
+
+
+@pytest.mark.parametrize(
+    ("law", "more", "expected"),
+    [
+        ({"law": "p_d"}, {}, []),
+        ({"law": "tdpa"}, {}, []),
+        ({"law": "tdpa", "K": 0.0, "B": 0.0}, {}, ["m1, m2, s: K = 0 and B = 0 follow nobody"]),
+        ({"law": "wave"}, {}, []),
+        ({"law": "wave", "lines": {}}, {}, ["m1, m2: lines share as b_ij / sum b_ik"]),
+        ({"law": "wave", "lines": {"m1-m2": 5.0, "m1-s": 15.0, "m2-s": 15.0}}, {}, []),
+        (
+            {"law": "wave"},
+            {"dominance": ONE_WAY},
+            ["m1, m2, s: lines share as b_ij / sum b_ik, as the shares of sites are not reversible"],
+        ),
+        (
+            {"law": "wave"},
+            {"timeline": RAMP},
+            ["s: lines stay as they are at the start, whatever the timeline says"],
+        ),
+    ],
+)
+def test_a_check_says_which_shares_have_no_effect(
+    law: dict[str, object], more: dict[str, object], expected: list[str]
+) -> None:
+    scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more})
+    found = [line for line in describe_scenario(scenario) if line.startswith("dominance without effect")]
+    assert found == [f"dominance without effect at {line}" for line in expected]
+
+
+def test_lines_have_the_shares_of_their_sites_and_b_on_the_average() -> None:
+    law = {"law": "wave", "b": [6.0, 3.0]}
+    scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
+    total = np.zeros(2)
+    for name, one in zip(scenario.names, scenario.controls, strict=True):
+        lines = np.array([one.find_impedances(name, peer) for peer in scenario.peers(name)])
+        shares = [scenario.dominance[name][peer] for peer in scenario.peers(name)]
+        assert lines / lines.sum(axis=0) == pytest.approx(np.array([shares, shares]).T, rel=1e-9)
+        total += lines.sum(axis=0)
+    assert total / 6.0 == pytest.approx([6.0, 3.0])

@@ -1,5 +1,6 @@
 """Errata 13: how much damping P+d needs for N sites, against roots that are counted independently."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,12 @@ import sympy as sp
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
 from trilat_net.core.dominance import find_balancing_weights
-from trilat_net.scenario.law_conditions import COMMON_MOTION_SHARE
+from trilat_net.scenario.law_conditions import (
+    COMMON_MOTION_SHARE,
+    LawSituation,
+    StabilityCondition,
+    judge_position_exchange,
+)
 from trilat_net.studies.sweep.stability_map import evaluate_criterion
 from trilat_net.theory import analyse_linear_loop
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
@@ -189,3 +195,51 @@ def test_it_never_calls_enough_what_grows(seed: int, *, sharp: bool) -> None:
     assert found.count(True) > 40
     assert found.count(False) > 40
     assert found.count(None) > 40
+
+
+K_PAIR, TICK_S = 50.0, 1.0 / 30.0
+
+
+def judged(count: int, ticks: int, d: float) -> StabilityCondition:
+    """The condition of equal sites at 30 Hz whose torques are held."""
+    laws = (SimpleNamespace(K=(K_PAIR,), d=(d,)),) * count
+    names, delay_s = tuple(map(str, range(count))), ticks * TICK_S * (equal(count) > 0.0)
+    situation = LawSituation(0, names, laws, equal(count), delay_s, (1e3,), 30, hold_s=TICK_S)
+    return judge_position_exchange(situation, "K", "d")
+
+
+def growth(count: int, ticks: int, d: float, mass: float) -> float:
+    """The rate, 1/s, of the loop from tick to tick, mode by mode of equal shares: x, its speed, x before."""
+    rates = []
+    for share in (1.0, -1.0 / (count - 1)):
+        row = np.zeros(2 + ticks)
+        row[:2], row[-1] = (-K_PAIR, -d), row[-1] + K_PAIR * share
+        step = np.eye(2 + ticks, k=-1)
+        step[:2] = 0.0
+        step[0, :2], step[1, 1], step[2, 0], step[2, 1] = (1.0, TICK_S), 1.0, 1.0, 0.0
+        step[:2] += np.outer([0.5 * TICK_S**2 / mass, TICK_S / mass], row)
+        z = np.linalg.eigvals(step)
+        others = np.delete(z, np.abs(z - 1.0).argmin()) if share == 1.0 else z
+        rates.append(np.log(np.abs(others).max()) / TICK_S)
+    return float(max(rates))
+
+
+def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
+    """K 50, d 2 at 30 Hz over a tick: 1.667 would do in continuous time."""
+    assert judged(2, 1, 3.33).holds is False
+    assert judged(2, 1, 3.34).holds
+    assert growth(2, 1, 2.0, 1.0) == pytest.approx(0.595, abs=5e-3)
+    assert judged(2, 1, 2.0).holds is False
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 7])
+@pytest.mark.parametrize("ticks", [1, 2, 3, 20])
+def test_the_bound_of_held_torques_is_that_of_the_worst_mass(count: int, ticks: int) -> None:
+    """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
+    text = judged(count, ticks, 1e3).text
+    sides = K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
+    for d, grows in ((0.97 * sides, True), (1.01 * sides, False)):
+        assert judged(count, ticks, d).holds is not grows
+        masses = np.concatenate([0.5 * d * TICK_S * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)])
+        most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S)
+        assert (most > 0.0) is grows

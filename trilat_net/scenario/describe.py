@@ -23,6 +23,7 @@ from .laws import (
     AdaptiveBox,
     AdaptiveRobust,
     ControlLaw,
+    ForceReflecting,
     LeeSpong,
     ProportionalDamped,
     ProportionalDerivativeDamped,
@@ -53,24 +54,50 @@ def _exchanges_positions(law: ControlLaw) -> bool:
     return isinstance(law, ProportionalDamped | ProportionalDerivativeDamped) and law.gravity == 1.0
 
 
+def _list_situations(scenario: Scenario) -> list[LawSituation]:
+    """Returns what the condition of each site's law may be made of."""
+    rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
+    every = (scenario.names, scenario.controls, scenario.alpha, find_link_delays(scenario.links, rates_hz))
+    ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
+    hold_s = 0.0 if scenario.scheme != "digital" else ticks_s.pop() if len(ticks_s) == 1 else math.nan
+    return [
+        LawSituation(
+            *(n, *every, tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()), site.rate_hz),
+            gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
+            hold_s=hold_s,
+        )
+        for n, (name, site) in enumerate(scenario.sites.items())
+    ]
+
+
 def describe_law_conditions(scenario: Scenario) -> list[str]:
     """Returns what the stability of the sites' laws rests on, a line for sites of whom the same holds."""
-    rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    delay_s = find_link_delays(scenario.links, rates_hz)
-    laws = tuple(site.control for site in scenario.sites.values())
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
-    for n, (name, site) in enumerate(scenario.sites.items()):
-        if isinstance(law := site.control, PluggedLaw | LeeSpong | AdaptiveRobust):
-            limits = np.atleast_1d(site.limits.tau_limit_nm).tolist()
-            own = (tuple(limits), site.rate_hz, scenario.arms[name].largest_gravity(site.arm.g_m_s2))
-            situation = LawSituation(n, scenario.names, laws, scenario.alpha, delay_s, *own)
-            if found := law.condition(situation):
-                owners.setdefault((str(law.__struct_config__.tag), found), []).append(name)
+    for name, law, situation in zip(
+        scenario.names, scenario.controls, _list_situations(scenario), strict=True
+    ):
+        if isinstance(law, PluggedLaw | LeeSpong | AdaptiveRobust) and (found := law.condition(situation)):
+            owners.setdefault((str(law.__struct_config__.tag), found), []).append(name)
     words = {True: "holds", False: "does not hold", None: "is not decided here"}
     return [
         f"condition of {tag} at {', '.join(where)} {words[one.holds]}: {one.text}"
         for (tag, one), where in owners.items()
     ]
+
+
+def _describe_idle_shares(scenario: Scenario) -> list[str]:
+    """Returns which dominance factors have no effect by the laws that have them, and why."""
+    ramped = {change.dominance for change in scenario.timeline}
+    owners: dict[str, list[str]] = {}
+    for name, law, situation in zip(
+        scenario.names, scenario.controls, _list_situations(scenario), strict=True
+    ):
+        why = law.explain_idle_shares(situation) if isinstance(law, PluggedLaw | ForceReflecting) else ""
+        if not why and name in ramped and getattr(law, "fixed_shares", False):
+            why = "lines stay as they are at the start, whatever the timeline says"
+        if why:
+            owners.setdefault(why, []).append(name)
+    return [f"dominance without effect at {', '.join(where)}: {why}" for why, where in owners.items()]
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
@@ -97,6 +124,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
         *describe_law_conditions(scenario),
+        *_describe_idle_shares(scenario),
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
         *_describe_silences(scenario),

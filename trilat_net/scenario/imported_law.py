@@ -13,7 +13,7 @@ import inspect
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
@@ -62,6 +62,8 @@ class PluggedLaw(Frozen, frozen=True):
     core_class: ClassVar[Any] = None
     linear_note: ClassVar[str] = ""
     """What its small motions leave out."""
+    fixed_shares: ClassVar[bool] = False
+    """True: it takes the dominance factors of the start alone."""
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core: none."""
@@ -85,6 +87,14 @@ class PluggedLaw(Frozen, frozen=True):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Returns what the stability of the law at a site rests on; None if that is not known here."""
         return None
+
+    def at_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
+        """Returns the law with what it takes of the dominance factors at the start, alpha, shape (N, N)."""
+        return self
+
+    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
+        """Returns why the dominance factors of a site have no effect; "": they have one."""
+        return ""
 
     @property
     def sends(self) -> SentVectorSpecs:

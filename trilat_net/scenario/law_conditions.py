@@ -30,6 +30,8 @@ class LawSituation(NamedTuple):
         tau_limit_nm: largest torques of the site's joints, N m.
         rate_hz: tick rate of the site, Hz.
         gravity_nm: largest torque by which the site's planar arm is held, N m per joint; () of a chain.
+        hold_s: for how long a torque is held, s: a tick of the scheme `digital`, NaN if sites have several
+            rates; else 0, as in continuous time.
     """
 
     site: int
@@ -40,6 +42,7 @@ class LawSituation(NamedTuple):
     tau_limit_nm: tuple[float, ...]
     rate_hz: int
     gravity_nm: tuple[float, ...] = ()
+    hold_s: float = 0.0
 
     @property
     def longest_s(self) -> float:
@@ -93,18 +96,29 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
     """Returns the condition of P+d, whatever the arms weigh; the keys of a law's K and d are named.
 
     Nuno, Basanez, Ortega and Spong, IJRR 28, 2009, for two sites; of more than two the shares must be
-    reversible, K and d one for all and the delays one T: docs/errata.md, 13.
+    reversible, K and d one for all and the delays one T: docs/errata.md, 13. Torques that are held for h act
+    h / 2 later: d is K h / 2 less and T is h / 2 more, for arms whose least inertia is above d h / 2
+    (docs/laws.md).
     """
-    T, laws = situation.longest_s, situation.laws
+    T, laws, h = situation.longest_s, situation.laws, situation.hold_s
     K, d = (np.array([getattr(law, key, [np.nan]) for law in laws]) for key in (stiffness, damping))
     if np.isnan(T) or np.isnan(K).any():
         return StabilityCondition(None, "known for constant delays, and with this law at all sites")
+    if np.isnan(h):
+        return StabilityCondition(None, "known of held torques for sites of one tick rate")
+    scope = f"sufficient for arms above d h / 2 = {0.5 * float(d.max()) * h:.3g} kg m^2" if h else ""
+    if h and any(np.any(getattr(law, "Kd", 0.0)) for law in laws):
+        scope = "sufficient for heavy arms"
+    scope, own = scope or "sufficient whatever the masses", d - 0.5 * K * h
     if len(laws) == 2:
-        both = float(situation.delay_s.sum())
+        both = float(situation.delay_s.sum()) + h
         pulls = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
-        excess = float((4.0 * d[0] * d[1] - both**2 * pulls).min())
-        text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {1e3 * both:.4g} ms (sufficient whatever the masses)"
-        return StabilityCondition(excess >= -1e-9 * float(d.max()) ** 2, text)
+        excess = float((4.0 * own[0] * own[1] - both**2 * pulls).min())
+        text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {1e3 * both:.4g} ms"
+        if h:
+            text = f"4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, the last {1e3 * both:.4g} ms"
+        holds = excess >= -1e-9 * float(d.max()) ** 2 and bool((own >= 0.0).all())
+        return StabilityCondition(holds, f"{text} ({scope})")
     if np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any() or np.ptp(situation.delay_s[situation.alpha > 0.0]):
         return StabilityCondition(None, "known of more than two sites for one K, one d and one delay")
     least = find_least_reversible(situation.alpha)
@@ -112,6 +126,13 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
         return StabilityCondition(
             False, "shares that are not reversible: some heavy arms are unstable at any d"
         )
-    share = max(-least, COMMON_MOTION_SHARE)
-    text = f"d > {share:.4g} K T = {share * float(K.max()) * T:.4g} (sufficient whatever the masses)"
-    return StabilityCondition(bool((d[0] > share * K[0] * T).all()), text)
+    share = max(-least, _find_common_share(2.0 * T / h + 1.0) if h else COMMON_MOTION_SHARE)
+    bound = 0.5 * h * K[0] + share * K[0] * (T + 0.5 * h)
+    text = f"d > {'K h / 2 + ' if h else ''}{share:.4g} K {'(T + h / 2)' if h else 'T'} = {bound.max():.4g}"
+    return StabilityCondition(bool((d[0] > bound).all()), f"{text} ({scope})")
+
+
+def _find_common_share(count: float) -> float:
+    """Returns -min sin(n x) / (n sin x), the common motion's share over n = 2 T / h + 1 halves of a tick."""
+    x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
+    return float(-(np.sin(count * x) / (count * np.sin(x))).min())

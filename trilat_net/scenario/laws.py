@@ -134,7 +134,8 @@ class ProportionalDamped(KnownGravity, frozen=True, tag_field="law", tag="p_d"):
 
     For reversible shares, equal gains and one constant delay T the linearised loop of N sites is stable
     whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some masses only then; two
-    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d.
+    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d. That
+    is in continuous time: held torques need more (docs/laws.md).
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -184,6 +185,10 @@ class ForceReflecting(KnownGravity, frozen=True, tag_field="law", tag="p_f"):
     d: fields.NotNegativeJoints = (5.0,)
     k_f: fields.NotNegativeCoordinates = (0.0,)
     gravity: fields.NotNegative = 1.0
+
+    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
+        """Returns that a site with neither gain follows nobody."""
+        return "" if any(self.K) or any(self.k_f) else "K = 0 and k_f = 0 follow nobody"
 
 
 class LeeSpong(fields.Frozen, frozen=True, tag_field="law", tag="lee_spong"):

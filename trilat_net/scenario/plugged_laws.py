@@ -179,6 +179,11 @@ class Authority(PluggedLaw, frozen=True, tag_field="law", tag="authority"):
             form.add(("to", j), "q", 1.0)
         return form
 
+    def explain_idle_shares(self, at: LawSituation) -> str:
+        """Returns whom a user does not feel: those who do not lead."""
+        idle = [name for name, law in zip(at.names, at.laws, strict=True) if not getattr(law, "leads", False)]
+        return f"users feel those who lead alone, not {', '.join(idle)}" if self.leads and idle else ""
+
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the condition of P+d among the users; the slave follows them and closes no loop."""
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
@@ -303,6 +308,10 @@ class Impedances(PluggedLaw, frozen=True, tag_field="law", tag="impedance"):
             form.add("tau", ("from", j), share)
             form.add(("to", j), "tau_h", self.follows * at.alpha[at.site, j])
         return form
+
+    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
+        """Returns that a master follows nobody."""
+        return "" if self.follows else "follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the stiffest spring at the slave's arm for which the small-gain theorem holds."""

@@ -295,6 +295,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         """The dominance matrix, shape (N, N), Eq. (6)."""
         return np.array([[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names])
 
+    @cached_property
+    def controls(self) -> tuple[ControlLaw, ...]:
+        """The law of every site, with what it takes of the dominance factors at the start."""
+        laws = [spec.control for spec in self.sites.values()]
+        return tuple(
+            law.at_shares(self.names, self.alpha) if isinstance(law, PluggedLaw) else law for law in laws
+        )
+
     @property
     def beta(self) -> Array | None:
         """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None if alpha is reducible."""
@@ -376,7 +384,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def setup(self, site: str) -> site_setup.SiteSetup:
         """Returns all that the core needs to build a site."""
-        spec, arm = self.sites[site], self.arms[site]
+        spec, arm, control = self.sites[site], self.arms[site], self.controls[self.names.index(site)]
         return site_setup.SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
@@ -398,9 +406,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             ),
             on_stale=spec.on_stale.rule,
             external=spec.plant == "external",
-            own=spec.control.maker(len(self.sites), self.scheme)
-            if isinstance(spec.control, PluggedLaw)
-            else None,
+            own=control.maker(len(self.sites), self.scheme) if isinstance(control, PluggedLaw) else None,
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),

@@ -135,7 +135,7 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
     )
     alpha = _final_dominance(scenario, sites, notes)
     age_s, varying = np.zeros_like(alpha), []
-    laws = tuple(spec.control for spec in scenario.sites.values())
+    laws = scenario.controls
     sites = tuple(_make_own_law(scenario, site, alpha) for site in sites)
     codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
     for code in filter(None, dict.fromkeys(codes)):

@@ -46,14 +46,16 @@ def test_a_figure_shows_them_over_time() -> None:
 
 
 @pytest.mark.long
-def test_a_controller_at_its_clip_leaves_its_observer_negative_and_the_certificate_says_so() -> None:
-    """Sites that start apart jolt the leader by more than it was told to expect."""
-    changes = {"control.law": "tdpa", "scheme": "digital", "duration_s": 1.0, "sites.s.control.K": 100.0}
-    changes |= {"sites.s.control.B": 10.0, "control.acceleration_rad_s2": 0.0, "sites.s.q0_rad": [0.8, 0.5]}
-    found = certify(simulate_scenario(load_scenario("two_sites", changes)))
+def test_a_jolt_beyond_the_reserve_leaves_an_observer_negative_and_the_certificate_says_so() -> None:
+    """Sites that start apart; the reserve of a scenario that names none covers that."""
+    changes = {"control.law": "tdpa", "scheme": "digital", "duration_s": 1.0, "sites.s.q0_rad": [0.8, 0.5]}
+    changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
+    covered = certify(simulate_scenario(load_scenario("two_sites", changes)))
+    assert covered.observed.finding is ObservedFinding.PASSIVE
+    found = certify(simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0})))
     assert found.observed.finding is ObservedFinding.NEGATIVE
-    known = next(one for one in found.observed.least if one.name == "known at m of s")
-    assert known.amount_j < -1e-6
+    known = next(one for one in found.observed.least if one.name == "known at s of m")
+    assert known.amount_j < -1e-7
     assert found.observed.text in found.reasons
 
 

@@ -6,6 +6,7 @@ import pytest
 import trilat_net
 from trilat_net.analysis.certificate.premises import Premise
 from trilat_net.analysis.certificate.wall_energy import check_sampled_walls, find_wall_energies
+from trilat_net.core.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 
@@ -71,3 +72,37 @@ def test_a_wall_out_of_reach_or_not_sampled_gives_nothing() -> None:
     assert away is not None
     assert away.holds
     assert premise(run(**{f"{SITE}.0.sampled": False})) is None
+
+
+def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = False) -> float:
+    """The least damping b, N s/m, that takes what a held wall gives to a motion, h = 1; v at ends of parts.
+
+    Its speed is straight over each part; it begins and ends at rest in the wall.
+    """
+    parts = v.reshape(ticks, -1)
+    after = np.append(parts[1:, :1], [[0.0]], axis=0)
+    ends = np.hstack([parts, after])
+    dt = 1.0 / parts.shape[1]
+    steps = (0.5 * dt * (ends[:, 1:] + ends[:, :-1])).sum(axis=1)
+    taken = (dt / 3.0 * (ends[:, 1:] ** 2 + ends[:, 1:] * ends[:, :-1] + ends[:, :-1] ** 2)).sum()
+    speed = np.append(0.0, steps[:-1]) if differenced else parts[:, 0]
+    return float((0.5 * K * steps**2 - B * speed * steps).sum() / taken)
+
+
+def test_damping_by_the_speed_at_a_tick_gives_what_that_of_differences_does_not() -> None:
+    """Ticks of 1 s, K 2, B 1: K h / 2 + B is 2. Faster motions than half the tick rate are without bound."""
+    ticks, rng = 200, np.random.default_rng(5)
+    t = np.arange(ticks * 400) / 400.0
+    square = np.where(t % 2.0 < 1.0, 1.0, -1.0)  # its speed changes sides at each tick
+    assert most_given(square, ticks, 2.0, 1.0, differenced=True) == pytest.approx(2.0, rel=0.02)
+    harmonics = np.pi * (2.0 * np.arange(20) + 1.0)
+    c, s = np.ones(20) / np.sqrt(20.0), 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
+    many = (c[:, None] * np.cos(harmonics[:, None] * t) - s[:, None] * np.sin(harmonics[:, None] * t)).sum(0)
+    assert most_given(many, ticks, 0.0, 1.0) == pytest.approx(3.1, abs=0.1)
+    for _ in range(50):
+        straight = rng.normal(size=ticks)
+        assert most_given(straight, ticks, 2.0, 1.0) <= 1.5
+        slow = (
+            np.sin(np.pi * rng.uniform(0.0, 1.0) * t + rng.uniform(0.0, 6.0)) * np.sin(np.pi * t / ticks) ** 2
+        )
+        assert most_given(slow, ticks, 2.0, 1.0) <= 1.0

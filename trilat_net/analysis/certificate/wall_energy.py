@@ -3,8 +3,9 @@
 Invariant: a wall of stiffness K and damping B that is held over a tick h does the work F_k (x_{k+1} - x_k);
 with its spring's energy K x^2 / 2 booked, it gives K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less
 what its damping takes. A damper b of the arm itself takes all of it if b > K h / 2 + B: Colgate and Schenkel,
-"Passivity of a class of sampled-data systems", J. Robotic Systems 14 (1997). That is sufficient; whether the
-loop is stable in contact is told by the map from tick to tick, `trilat linear`.
+"Passivity of a class of sampled-data systems", J. Robotic Systems 14 (1997). That is sufficient, for a B on
+the speed at the tick while that is straight within one (docs/certificate.md); whether the loop is stable in
+contact is told by the map from tick to tick, `trilat linear`.
 """
 
 from typing import NamedTuple

@@ -130,6 +130,7 @@ QUANTITIES = (
     Quantity("rms_tau_nm", "site", EFFORT, "RMS tau", "N m"),
     Quantity("peak_tau_nm", "site", EFFORT, "peak |tau|", "N m"),
     Quantity("saturated_share", "site", EFFORT, "ticks at the limit"),
+    Quantity("chatter_nm", "site", EFFORT, "chatter, mean change of tau a tick", "N m"),
     Quantity("controller_j", "site", ENERGY, "given by the controller", "J", "sum"),
     Quantity("hands_j", "site", ENERGY, "given by hands", "J", "sum"),
     Quantity("hands_most_j", "site", ENERGY, "given by hands at most", "J"),

@@ -143,12 +143,14 @@ def measure_effort(log: Log, site: str) -> MetricValues:
     if not len(part):
         return unavailable(EFFORT, f"no records of {site}")
     tau = part.tau
+    steps = np.diff(tau, axis=0)[np.diff(part.tick) == 1]
     at_limit = np.any(np.abs(tau) >= log.scenario.sites[site].limits.tau_limit_nm, axis=1)
     return {
         "effort_nm2_s": metric(float(np.einsum("kj,kj->", tau, tau)) / part.rate_hz),
         "rms_tau_nm": metric(rms(tau)),
         "peak_tau_nm": metric(peak(tau)),
         "saturated_share": metric(float(at_limit.mean())),
+        "chatter_nm": metric(float(np.abs(steps).mean(axis=0).max()) if len(steps) else None, "no two ticks"),
     }
 
 

@@ -3,10 +3,11 @@
 Invariant: in every directed coupling of a follower to a leader each end books, cumulatively and per joint,
 the energy that it puts in; the other end takes out no more than it knows of.
 
-A follower is moved by F = K (q_sd - q) + B (v - qd), where v mixes the leaders' velocities by dominance and
-q_sd is its integral; the leader feels -F by the same factor.
+A follower is moved by F = K (goal - q) + B (v - qd), goal += h v, v = sum alpha_j v_j: the velocities of the
+peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a coupling each way.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -16,6 +17,12 @@ from ..compiled_law import compiled
 from ..law_energy import LawEnergies, LawRecords, sum_work
 from ..user_law import LawContext, LawInput
 
+SWEEPS = 3
+"""How often joints and couplings settle what each leaves of its torque, as these move one another."""
+AHEAD = 2.0
+"""Ticks of a leader's motion that are paid for beforehand: in one a joint turns back, in two it rests."""
+SPENT_S = 0.1
+"""Drift compensation spends what is left at such a rate that it lasts for this time, s."""
 _SLACK_NM = 1e-9
 """A torque that gives a follower's controller nothing to act on."""
 
@@ -29,82 +36,205 @@ def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
 
 
 @compiled
-def lead(law: Any, now: LawInput, j: int, i: int) -> float:
-    """Returns the torque that the leader's end of the coupling feels by which peer j follows.
-
-    The controller leaves of the follower's torque what the known energy pays for in the period to come.
-    """
+def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
+    """Brings what the leader's end knows of the coupling by which peer j follows up to the present."""
     at, sent = j * now.joints + i, now.sent[j]
-    torque, velocity, h = now.received[j].F[i], now.qd[i], now.h_s
     observed = sent.W_led[i] if now.k > 0 else law.reserve
     observed += now.received[j].E_followed[i] - law.E_known[at]
     law.E_known[at] = now.received[j].E_followed[i]
     if law.by_step:  # of the period before, which is over
         observed += book(now, j, i, law.F_led[at], now.q[i] - now.q_before[i])
-    sign = 1.0 if torque > 0.0 else -1.0
-    away = max(-sign * velocity * h + 0.5 * law.acceleration * h * h, 0.0)
-    if law.controlled and away > 0.0 and abs(torque) * away > observed:
-        torque = sign * max(observed, 0.0) / away
-    law.F_led[at], sent.W_led[i] = torque, observed
-    return float(torque)
+    sent.W_led[i] = observed
 
 
 @compiled
-def control_follower(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the velocity by which peer j is followed: its own, less what cannot be paid for, and drift."""
+def invert_inertia(law: Any, now: LawInput) -> None:
+    """Writes M^-1 by elimination; zeros where the arm's parameters are unknown."""
+    n, inverse = now.joints, law.inverse
+    for i in range(n):
+        for j in range(n):
+            inverse[i * n + j] = now.inertia[i][j]
+    for p in range(n):
+        pivot = inverse[p * n + p]
+        if pivot == 0.0:
+            return
+        inverse[p * n + p] = 1.0
+        for j in range(n):
+            inverse[p * n + j] /= pivot
+        for i in range(n):
+            if i != p:
+                factor, inverse[i * n + p] = inverse[i * n + p], 0.0
+                for j in range(n):
+                    inverse[i * n + j] -= factor * inverse[p * n + j]
+
+
+@compiled
+def lead(law: Any, now: LawInput, j: int, i: int) -> None:
+    """Writes the torque that the leader's end of that coupling feels.
+
+    The controller leaves of the follower's torque what the known energy pays for in the time ahead. In it the
+    joint goes on as before, and farther by what torques of this tick add to those of the tick before, its own
+    included. A deficit is repaid by damping.
+    """
+    n, h, asked = now.joints, now.h_s, now.received[j].F[i]
+    at, spare = j * n + i, max(now.sent[j].W_led[i] - law.floor, 0.0)
+    sign, most = 1.0 if asked > 0.0 else -1.0, abs(asked)
+    step, own, half = now.qd[i] * h, 0.0, 0.5 * h * h
+    if law.by_step:
+        half *= AHEAD * AHEAD
+        own, step = half * law.inverse[i * n + i] / law.beta, AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
+        for one in range(n):
+            step += half * law.inverse[i * n + one] * law.change[one]
+    away = half * law.acceleration - sign * step - own * sign * law.F_now[at]  # without a torque here
+    if most * (away + own * most) > spare:
+        if own > 0.0:
+            most = max(math.sqrt(away * away + 4.0 * own * spare) - away, 0.0) / (2.0 * own)
+        else:
+            most = spare / away
+    torque = asked if not law.controlled else sign * most
+    owed = law.floor - now.sent[j].W_led[i]
+    if law.controlled and own > 0.0 and owed > 0.0 and now.qd[i] * law.ahead[i] > 0.0:
+        damping = 0.25 * h * AHEAD**2 / (n * len(now.peers) * own)
+        torque += now.qd[i] * min(0.1 * owed / (now.qd[i] * law.ahead[i]), damping)
+    law.change[i] -= (torque - law.F_now[at]) / law.beta
+    law.F_now[at] = torque
+
+
+@compiled
+def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, price: float) -> float:
+    """Sets the velocity by which peer j is followed: its own, less what cannot be paid; returns what is left.
+
+    `price` is what the period is expected to cost beyond the work of that velocity.
+    """
     at, h, peer = j * now.joints + i, now.h_s, now.peers[j]
-    velocity: float = peer.qd[i]
     known = now.received[j].E_led[i] + 0.5 * law.reserve - law.E_moved[at] + law.E_yielded[at]
     if law.by_step:  # half of the reserve is for what steps cost more than planned
-        known = max(known, 0.0)
-    spare = known - max(force * velocity * h, 0.0)
-    if law.controlled and spare < 0.0 and abs(force) > _SLACK_NM:
-        velocity += spare / (force * h)
-    elif law.drift_rad_s > 0.0 and spare > 0.0:
-        more = (peer.q[i] - law.q_led[at]) / h - velocity
-        more = max(-law.drift_rad_s, min(law.drift_rad_s, more))
-        damper = peer.alpha * peer.alpha * law.B[i] if law.by_step else 0.0  # it acts on what is added, too
-        against = abs(force) * (force * more > 0.0) + damper * (abs(velocity) + law.drift_rad_s)
-        if against > 0.0:
-            most = spare / (against * h)
-            more = max(-most, min(most, more))
-        velocity += more
-    return velocity
+        known = max(known - price, 0.0)
+    law.v_led[at] = peer.qd[i]
+    left: float = known - max(force * peer.qd[i] * h, 0.0)
+    if law.controlled and left < 0.0 and abs(force) > _SLACK_NM:
+        law.v_led[at] += left / (force * h)
+    return left
 
 
 @compiled
-def follow(law: Any, now: LawInput, j: int, i: int, force: float) -> None:
-    """Books the follower's end of the coupling to peer j, and moves what it follows.
+def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) -> float:
+    """Returns the velocity that takes the goal to where the peers are, as far as couplings pay for it.
+
+    `room` is what they have left together. The goal moves for all peers: the work of the torque counts, by
+    steps that of the damper and the spring which answer, and what these do with the peers' velocities too.
+    """
+    h, more = now.h_s, max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
+    linear, square, most = law.force[i] * (1.0 if more > 0.0 else -1.0), 0.0, abs(more)
+    power = room / h
+    if law.by_step:
+        power = room / max(SPENT_S, h)
+        square = law.B[i] + 0.5 * law.K[i] * h
+        for j in range(len(now.peers)):
+            linear += law.B[i] * now.peers[j].alpha * abs(now.peers[j].qd[i])
+    if square > 0.0:
+        most = (math.sqrt(linear * linear + 4.0 * square * power) - linear) / (2.0 * square)
+    elif linear > 0.0:
+        most = power / linear
+    return float(max(-most, min(most, more)))
+
+
+@compiled
+def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
+    """Returns the velocity of the goal by peer j, less where that costs more than is known."""
+    at, work = j * now.joints + i, now.peers[j].alpha * force * now.h_s
+    known = now.received[j].E_led[i] + 0.5 * law.reserve - law.E_moved[at] + law.E_yielded[at]
+    known, velocity = max(known, 0.0), float(law.v_led[at])
+    return known / work if law.controlled and work * velocity > known else velocity
+
+
+@compiled
+def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
+    """Books the follower's end of the coupling to peer j, and its part of what drift compensation takes.
 
     By steps, the torque is that of the velocity in use, and the energy too; as it is published, both are
-    those of the leader's velocity, and what the controller changes is booked apart.
+    those of the leader's velocity, and what the controller changes is booked apart. What drift compensation
+    gives back stays here.
     """
     at, h = j * now.joints + i, now.h_s
     velocity = law.v_led[at] if law.by_step else now.peers[j].qd[i]
-    led = now.received[j].E_led[i] + law.reserve
-    known = max(led - law.E_moved[at] + law.E_yielded[at] - 0.5 * law.reserve, 0.0)
-    if law.by_step and law.controlled and force * velocity * h > known:
-        velocity = law.v_led[at] = known / (force * h)  # several peers share one torque
     energy = force * velocity * h
     if energy >= 0.0:
         law.E_moved[at] += energy
     else:
         now.sent[j].E_followed[i] -= energy
-    law.E_yielded[at] += force * (velocity - law.v_led[at]) * h
-    now.sent[j].W_followed[i] = led - law.E_moved[at] + law.E_yielded[at]
-    law.q_led[at] += h * law.v_led[at]
+    law.E_yielded[at] += force * (velocity - law.v_led[at]) * h - drift
+    now.sent[j].W_followed[i] = now.received[j].E_led[i] + law.reserve - law.E_moved[at] + law.E_yielded[at]
 
 
 @compiled
 def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Charges what the spring and the arm got in the period before, beyond what couplings paid, to them."""
+    """Charges what the spring and the arm got in the period before, beyond what couplings paid, to them.
+
+    What the damper takes in other periods repays that, and no more.
+    """
     unpaid = law.force[i] * (now.q[i] - now.q_before[i]) + spring - law.spring[i] - law.paid[i]
     for j in range(len(now.peers)):
         at = j * now.joints + i
-        if law.by_step and unpaid > 0.0 and now.k > 0:
-            law.E_moved[at] += now.peers[j].alpha * unpaid
+        if law.by_step and now.k > 0:
+            charged = max(now.peers[j].alpha * unpaid, -law.lent[at])
+            law.E_moved[at] += charged
+            law.lent[at] += charged
         law.E_settled[at] = law.E_moved[at] - law.E_yielded[at]
     law.spring[i] = spring
+
+
+@compiled
+def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float, room: float) -> None:
+    """Settles torque and velocities of a joint that follows, `more` that of drift compensation, and books.
+
+    By steps, the torque is that of velocities which pay for it; several peers share one torque.
+    """
+    n, h, force, velocity = now.joints, now.h_s, law.force[i], 0.0
+    for sweep in range(1 + SWEEPS * law.by_step):
+        if sweep > 0:
+            force = law.K[i] * stretch + law.B[i] * (velocity - now.qd[i])
+            force = max(law.low[i], min(law.high[i], force))
+            more = room / (force * h) if force * more * h > room else more
+        velocity = more
+        for j in range(len(now.peers)):
+            if sweep > 0:
+                law.v_led[j * n + i] = afford(law, now, j, i, force)
+            velocity += now.peers[j].alpha * law.v_led[j * n + i]
+    for j in range(len(now.peers)):
+        part = law.left[j * n + i] / room if room > 0.0 else 0.0
+        book_follower(law, now, j, i, now.peers[j].alpha * force, part * force * more * h)
+    law.goal[i] += h * velocity
+    law.force[i], law.paid[i] = force, force * velocity * h
+
+
+@compiled
+def follow(law: Any, now: LawInput, i: int) -> None:
+    """Moves the goal of a joint by the velocities of the peers, and writes the torque that follows it."""
+    n, h, K, B = now.joints, now.h_s, law.K[i], law.B[i]
+    target = velocity = 0.0
+    for j in range(len(now.peers)):
+        target += now.peers[j].alpha * now.peers[j].q[i]
+        velocity += now.peers[j].alpha * now.peers[j].qd[i]
+    if now.k == 0:
+        law.goal[i] = target
+    stretch = law.goal[i] - now.q[i]
+    pull = max(law.low[i], min(law.high[i], K * stretch))
+    charge_unpaid(law, now, i, pull * (stretch - 0.5 * pull / K) if K > 0.0 else 0.0)
+    law.force[i] = max(law.low[i], min(law.high[i], K * stretch + B * (velocity - now.qd[i])))
+    gap = velocity * h - law.ahead[i]  # by which the spring is expected to become longer
+    price = max((0.5 * K * gap - B * (velocity - now.qd[i])) * gap, 0.0)
+    more = room = least = 0.0
+    for j in range(len(now.peers)):
+        alpha = now.peers[j].alpha
+        now.sent[j].F[i] = alpha * law.force[i]
+        left = control_follower(law, now, j, i, alpha * law.force[i], alpha * price)
+        law.left[j * n + i] = max(left, 0.0) * (alpha > 0.0)
+        room += law.left[j * n + i]
+        least = min(least, left)
+    if law.drift_rad_s > 0.0 and room > 0.0 and least >= 0.0:
+        more = correct_drift(law, now, i, target - law.goal[i] - h * velocity, room)
+    settle_follower(law, now, i, stretch, more, room)
 
 
 @compiled
@@ -115,7 +245,8 @@ class Tdpa:
         facts: of its site.
         K: spring by which it follows, per joint, N m/rad; 0: it follows nobody.
         B: damper by which it follows, N m s/rad.
-        acceleration_rad_s2: most by which an arm accelerates, as far as a leader's controller is to cover it.
+        acceleration_rad_s2: by which an arm may begin to accelerate within a period for reasons that are not
+            the law's, as far as a leader's controller is to cover it.
         drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
         reserve_J: energy that an end begins with, per joint and peer.
         energy: "step": torque times the step in q; "velocity": times velocity and period.
@@ -132,10 +263,11 @@ class Tdpa:
         "W_followed": {"unit": "J", "length": "joints", "per_peer": True},
     }
     remembers = (
-        *("q_led", "F_led", "E_known", "E_moved", "E_yielded"),
+        *("goal", "F_led", "E_known", "E_moved", "E_yielded", "lent"),
         *("carried", "spring", "force", "paid", "E_settled"),
     )
     schemes = ("digital",)
+    needs_model = True
 
     def __init__(
         self,
@@ -150,58 +282,53 @@ class Tdpa:
         beta: float = 1.0,
         controlled: bool = True,
     ) -> None:
-        size = facts.joints * len(facts.peers)
+        n, peers = facts.joints, len(facts.peers)
         self.K, self.B = list(K), list(B)
         self.acceleration, self.drift_rad_s = float(acceleration_rad_s2), float(drift_rad_s)
         self.reserve, self.gravity = float(reserve_J), float(gravity)
         self.by_step, self.controlled = energy == "step", controlled
-        self.q_led, self.F_led = [0.0] * size, [0.0] * size
-        self.E_known = [0.0] * size
-        self.E_moved, self.E_yielded = [0.0] * size, [0.0] * size
-        self.beta, self.tau_limit = float(beta), (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
-        self.carried, self.spring = [0.0] * facts.joints, [0.0] * facts.joints
-        self.v_led, self.E_settled = [0.0] * size, [0.0] * size
-        self.force, self.paid = [0.0] * facts.joints, [0.0] * facts.joints
+        self.floor = 0.5 * self.reserve if self.by_step else 0.0
+        self.beta, self.tau_limit = float(beta), (np.zeros(n) + facts.tau_limit_nm).tolist()
+        self.goal, self.ahead, self.low, self.high = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n
+        self.change = [0.0] * n
+        self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
+        self.E_moved, self.E_yielded, self.lent, self.E_settled = ([0.0] * (n * peers) for _ in range(4))
+        self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
+        self.inverse, self.left = [0.0] * (n * n), [0.0] * (n * peers)
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque; sends torques and energies."""
         n, peers = now.joints, len(now.peers)
+        invert_inertia(self, now)
         for i in range(n):
-            goal = velocity = 0.0
+            self.change[i] = self.carried[i] - now.tau_before[i]
+            self.carried[i] = self.gravity * now.gravity[i]
+            self.low[i] = self.beta * (-self.tau_limit[i] - self.carried[i])
+            self.high[i] = self.beta * (self.tau_limit[i] - self.carried[i])
+            self.ahead[i] = now.qd[i] * now.h_s
+            if now.k > 0:
+                self.ahead[i] += self.ahead[i] - (now.q[i] - now.q_before[i])
+            follow(self, now, i)
+            self.change[i] += self.force[i] / self.beta
             for j in range(peers):
-                at, peer = j * n + i, now.peers[j]
-                if now.k == 0:
-                    self.q_led[at] = peer.q[i]
-                goal += peer.alpha * self.q_led[at]
-                velocity += peer.alpha * peer.qd[i]
-            stretch, self.carried[i] = goal - now.q[i], self.gravity * now.gravity[i]
-            low = self.beta * (-self.tau_limit[i] - self.carried[i])
-            high = self.beta * (self.tau_limit[i] - self.carried[i])
-            pull = max(low, min(high, self.K[i] * stretch))
-            spring = pull * (stretch - 0.5 * pull / self.K[i]) if self.K[i] > 0.0 else 0.0
-            charge_unpaid(self, now, i, spring)
-            force = self.K[i] * stretch + self.B[i] * (velocity - now.qd[i])
-            force = max(low, min(high, force))
-            moved = felt = 0.0
+                observe_leader(self, now, j, i)
+                self.F_now[j * n + i] = self.F_led[j * n + i]
+                self.change[i] -= self.F_now[j * n + i] / self.beta
+        for _ in range(SWEEPS):
+            for i in range(n):
+                for j in range(peers):
+                    lead(self, now, j, i)
+        for i in range(n):
+            felt, force = 0.0, self.force[i]
             for j in range(peers):
-                alpha = now.peers[j].alpha
-                now.sent[j].F[i] = alpha * force
-                self.v_led[j * n + i] = control_follower(self, now, j, i, alpha * force)
-                moved += alpha * self.v_led[j * n + i]
-            if self.by_step:
-                force = max(low, min(high, self.K[i] * stretch + self.B[i] * (moved - now.qd[i])))
-            moved = 0.0
-            for j in range(peers):
-                follow(self, now, j, i, now.peers[j].alpha * force)
-                moved += now.peers[j].alpha * self.v_led[j * n + i]
-                felt += lead(self, now, j, i)
-            self.force[i], self.paid[i] = force, force * moved * now.h_s
-            within = max(force - high, min(force - low, felt))
+                felt += self.F_now[j * n + i]
+            within = max(force - self.high[i], min(force - self.low[i], felt))
             share = 1.0 if within == felt else within / felt
             for j in range(peers):
-                self.F_led[j * n + i] *= share
+                at = j * n + i
+                self.F_led[at] = share * self.F_now[at]
                 if not self.by_step:
-                    now.sent[j].W_led[i] += book(now, j, i, self.F_led[j * n + i], now.qd[i] * now.h_s)
+                    now.sent[j].W_led[i] += book(now, j, i, self.F_led[at], now.qd[i] * now.h_s)
             now.tau[i] = self.carried[i] + (force - within) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:

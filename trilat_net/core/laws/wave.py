@@ -27,6 +27,8 @@ from ..user_law import LawContext, LawInput
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
 """How waves are played, by number. `hold` repeats the last wave; it is not passive, and for comparison."""
 _REPLAY, _SCALED, _HOLD = 0, 2, 3
+CONCEALED_S = 0.005
+"""A wave that is held falls to what the known energy pays for this long, s."""
 STAMP_FILTER_TICKS = 20.0
 """Time constant of the rate at which stamps advance, ticks."""
 
@@ -42,11 +44,28 @@ def replay_wave(law: Any, at: int, fresh: float, energy: float, h: float) -> flo
     if owed == 0.0:
         return fresh
     sign = 1.0 if law.owed_U[at] > 0.0 else -1.0
-    mean = owed / max(law.owed_s[at], h)
-    extra: float = max(0.0, min(2.0 * (energy / owed - sign * fresh), mean))
+    mean = owed / max(law.owed_s[at], CONCEALED_S, h)
+    spare = max(energy - 0.5 * law.reserve, 0.0)  # the rest is for waves that are concealed
+    extra: float = max(0.0, min(2.0 * (spare / owed - sign * fresh), mean))
     law.owed_U[at] -= sign * extra * h
-    law.owed_s[at] -= extra / mean * h
+    law.owed_s[at] = max(law.owed_s[at] - extra / mean * h, 0.0)
     return fresh + sign * extra
+
+
+@compiled
+def conceal_wave(law: Any, at: int, energy: float, h: float) -> float:
+    """Returns the wave of a tick without a new one: the last one again, as far as the known energy allows.
+
+    It is an advance on what the next sample tells: its integral counts against what is owed.
+    """
+    most = math.sqrt(2.0 * max(energy, 0.0) / max(CONCEALED_S, h))
+    held = max(-most, min(most, law.wave[at]))
+    played: float = held
+    if law.owed_U[at] * held > 0.0:
+        played = replay_wave(law, at, held, energy - 0.5 * held * held * h, h)
+    law.owed_U[at] -= held * h
+    law.held_s[at] += h
+    return played
 
 
 @compiled
@@ -56,18 +75,23 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
     `missed` counts the samples between the one in use and the one before it; -1: no new one came.
     """
     received, sent, at, h = now.received[j], now.sent[j], j * now.joints + i, now.h_s
-    fresh = own = 0.0
-    if missed >= 0.0:
+    if now.k == 0 and law.reception == _REPLAY:
+        sent.W[i] = law.reserve
+    fresh = own = played = 0.0
+    if missed < 0.0 and law.reception == _REPLAY:
+        played = conceal_wave(law, at, sent.W[i], h)
+    elif missed >= 0.0:
         fresh = law.wave[at] = received.u[i]
         own = 0.5 * fresh * fresh * h
         if missed > 0.0:
             energy = max(received.E[i] - law.E_seen[at] - own, 0.0)
             law.owed_U[at] += received.U[i] - law.U_seen[at] - fresh * h
-            law.owed_s[at] += missed * h if energy > 0.0 else 0.0
+            law.owed_s[at] += max(missed * h - law.held_s[at], 0.0) if energy > 0.0 else 0.0
             sent.W[i] += energy
+        law.held_s[at] = 0.0
         law.U_seen[at], law.E_seen[at] = received.U[i], received.E[i]
-    played = fresh
-    if law.reception == _REPLAY:
+        played = fresh
+    if law.reception == _REPLAY and missed >= 0.0:
         played = replay_wave(law, at, fresh, sent.W[i], h)
     elif law.reception == _SCALED:
         most = math.sqrt(2.0 * max(sent.W[i] + own, 0.0) / h)
@@ -95,7 +119,7 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
 
 @compiled
 def close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Books in H what the arm, and the springs of an end that has any, got in the period before."""
+    """Books in H what the arm got in the period before; what the springs of an end got is part of H."""
     H, spring = now.to_all.H, 0.0
     for j in range(len(now.peers)):
         at = j * now.joints + i
@@ -105,13 +129,12 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
             stretch = law.q_sd[at] - now.q[i]
             spring += 0.5 * law.K[i] * stretch * stretch
     if now.k == 0:
-        H[i], law.spring[i] = law.reserve, spring
+        H[i] = law.reserve + spring
     H[i] -= law.beta * (now.tau_before[i] - law.carried[i]) * (now.q[i] - now.q_before[i])
-    H[i] -= spring - law.spring[i]
-    law.spring[i] = spring
-    if law.K[i] > 0.0 and H[i] > law.reserve:  # what is left its damper has taken
-        law.damped[i] += H[i] - law.reserve
-        H[i] = law.reserve
+    law.spring[i], most = spring, law.reserve + spring
+    if law.K[i] > 0.0 and H[i] > most:  # what is left its damper has taken
+        law.damped[i] += H[i] - most
+        H[i] = most
 
 
 @compiled
@@ -120,7 +143,7 @@ def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
     h, asked = now.h_s, 0.0
     for j in range(len(now.peers)):
         asked += 0.5 * now.sent[j].u[i] * now.sent[j].u[i] * h
-    most = now.to_all.H[i] - ahead - 0.5 * law.reserve
+    most = now.to_all.H[i] - law.spring[i] - ahead - 0.5 * law.reserve
     share = 1.0
     if asked > max(most, 0.0):  # of nothing asked nothing is cut
         share = math.sqrt(max(most, 0.0) / asked)
@@ -132,8 +155,8 @@ def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
         now.to_all.H[i] -= 0.5 * sent.u[i] * sent.u[i] * h
 
 
-def find_line(lines: Mapping[str, float], site: str, peer: str) -> float | None:
-    """Returns the impedance that a table such as {"m1-s": 18.0} has for a line, or None."""
+def find_line(lines: Mapping[str, Any], site: str, peer: str) -> Any:
+    """Returns the impedance that a table such as {"m1-s": 18.0} has for a line, one or per joint, or None."""
     return lines.get(f"{site}-{peer}", lines.get(f"{peer}-{site}"))
 
 
@@ -146,7 +169,7 @@ class Wave:
         b: impedance of the lines per joint, N m s/rad.
         K: spring of an end that moves its arm by one, per joint, N m/rad; 0: none.
         B: damper of such an end, N m s/rad; b matches it to the line.
-        lines: impedances of single lines, all joints alike, as in {"m1-s": 18.0}.
+        lines: impedances of single lines, of all joints or per joint, as in {"m1-s": 18.0}.
         beta: the torque is divided by it.
         reception: one of `RECEPTIONS`.
         gravity: share of gravity that it knows.
@@ -161,8 +184,8 @@ class Wave:
         "H": {"unit": "J", "length": "joints"},  # what this end has, for logs too
     }
     remembers = (
-        *("q_sd", "wave", "U_seen", "E_seen", "owed_U", "owed_s", "stamp", "rate"),
-        *("played", "carried", "spring", "damped"),
+        *("q_sd", "wave", "U_seen", "E_seen", "owed_U", "owed_s", "held_s", "stamp", "rate"),
+        *("played", "carried", "damped"),
     )
     schemes = ("digital",)
 
@@ -172,7 +195,7 @@ class Wave:
         b: Sequence[float],
         K: Sequence[float],
         B: Sequence[float],
-        lines: Mapping[str, float],
+        lines: Mapping[str, Any],
         beta: float,
         reception: str,
         gravity: float,
@@ -183,11 +206,11 @@ class Wave:
         self.b: list[float] = []
         for peer in facts.peers:
             line = find_line(lines, facts.site, peer)
-            self.b += b if line is None else [line] * n
+            self.b += b if line is None else (np.zeros(n) + line).tolist()
         self.reception = RECEPTIONS.index(reception)
         self.q_sd, self.wave = [0.0] * (n * peers), [0.0] * (n * peers)
         self.U_seen, self.E_seen = [0.0] * (n * peers), [0.0] * (n * peers)
-        self.owed_U, self.owed_s = [0.0] * (n * peers), [0.0] * (n * peers)
+        self.owed_U, self.owed_s, self.held_s = ([0.0] * (n * peers) for _ in range(3))
         self.stamp, self.rate = [-1.0] * peers, [1.0] * peers
         self.reserve, self.tau_limit = float(reserve_J), (np.zeros(n) + facts.tau_limit_nm).tolist()
         self.played, self.carried, self.ahead = [0.0] * (n * peers), [0.0] * n, [0.0] * n
@@ -234,6 +257,5 @@ class Wave:
         observed = [peer.sent["W"] for peer in seen.peers]
         took = [peer.received["E"] - peer.sent["W"] for peer in seen.peers]
         port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
-        store = seen.to_all["H"] + seen.memory["spring"]
         taken = seen.memory["damped"].sum(axis=1)
-        return LawEnergies(gave, took, port, store, taken, observed, self.beta, self.gravity)
+        return LawEnergies(gave, took, port, seen.to_all["H"], taken, observed, self.beta, self.gravity)

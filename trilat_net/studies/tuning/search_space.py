@@ -204,15 +204,9 @@ def _tell_gains(
 
 
 def _wave(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    known = {"law": "wave", "b": gains["b"], "gravity": knowledge.gravity}
-    follows = {"slave": {"K": gains["K"], "B": gains["b"]}, "master": {}}
-    return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
-
-
-def _tdpa(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-    known = {"law": "tdpa", "gravity": knowledge.gravity}
-    follows = {"slave": dict(gains), "master": {}}
-    return {name: {**known, **follows[spec.role]} for name, spec in scenario.sites.items()}
+    """All ends are matched to their lines, masters too, so that no wave is reflected for ever."""
+    matched = {"law": "wave", **gains, "B": gains["b"], "gravity": knowledge.gravity}
+    return {name: dict(matched) for name in scenario.names}
 
 
 def _sync(scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
@@ -246,7 +240,6 @@ _REFLECTING = (
     _D._replace(name="d_master", where="master"),
     GainRange("k_f", "", 0.05, 2.0, "master"),
 )
-_FOLLOWING = (_K._replace(where="slave"), _D._replace(name="B", where="slave"))
 _AS_FIRST = "gravity, as its first estimate"
 
 SEARCH_SPACES: dict[str, SearchSpace] = {
@@ -279,8 +272,8 @@ SEARCH_SPACES: dict[str, SearchSpace] = {
         SearchSpace("smith", _PREDICTING, "gravity", _tell_gains("smith", predicts=True)),
         SearchSpace("p_f", _REFLECTING, "gravity", _p_f),
         SearchSpace("known", _ADAPTING[:3], "gravity, AND inertia exactly: more than the others", _known),
-        SearchSpace("wave", (_D._replace(name="b"), _FOLLOWING[0]), "gravity", _wave),
-        SearchSpace("tdpa", _FOLLOWING, "gravity", _tdpa),
+        SearchSpace("wave", (_D._replace(name="b"), _K), "gravity", _wave),
+        SearchSpace("tdpa", _CHANNELS, "gravity, and inertia for two ticks", _tell_gains("tdpa")),
         SearchSpace("tanks", (_K, _KD), "gravity", _tell_gains("tanks")),
     )
 }
