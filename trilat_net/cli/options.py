@@ -1,18 +1,25 @@
-"""Options and arguments that several commands share, and the scenario and connection that they describe."""
+"""Options that several commands share, one by one or together, and the scenario, connection and log they mean."""
 
+import inspect
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import wraps
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from ..errors import UsageError
+from ..reporting import terminal_output as terminal
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..log.log_reader import Log
     from ..net.connection import Connection
     from ..net.member_keys import MemberKeys
+    from ..results import Result
     from ..scenario import Scenario
 
 
@@ -208,8 +215,10 @@ PngOption = Annotated[bool, typer.Option("--png", help="Write every figure as a 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
 
 
-def check_picture(path: Path, *, force: bool) -> None:
+def check_picture(path: Path | None, *, force: bool) -> None:
     """Refuses the path of a figure that cannot be written."""
+    if path is None:
+        return
     from ..files import refuse_existing
     from ..reporting.style import FIGURE_FORMATS
 
@@ -218,6 +227,19 @@ def check_picture(path: Path, *, force: bool) -> None:
     refuse_existing(path, force=force)
     if not path.parent.is_dir():
         raise UsageError(f"{path}: there is no folder {path.parent}")
+
+
+def print_drawn(
+    found: "Result", picture: Path | None, draw: "Callable[[], Figure]", *, as_json: bool
+) -> None:
+    """Prints a result, and writes its figure if a path for it was given."""
+    if picture is not None:
+        from ..reporting.style import REPORT_DPI, write_figure
+
+        write_figure(draw(), picture, REPORT_DPI)
+    terminal.print_result(found, as_json=as_json)
+    if picture is not None and not as_json:
+        terminal.print_paths([picture])
 
 
 def load_chosen_scenario(
@@ -245,42 +267,88 @@ def given_options(context: typer.Context) -> list[str]:
     return [param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"]
 
 
-def resolve_connection(
-    listen: list[str] | None,
-    connect: list[str] | None,
-    routers: list[str] | None,
-    zenoh_config: Path | None,
-    listen_else: Sequence[str],
-    connect_else: Sequence[str] | None,
-    keys: Path | None = None,
-    *,
-    insecure: bool = False,
-) -> "Connection":
-    """Returns how a member takes part by a command's options, and by default."""
-    from ..net.connection import resolve_member_connection, secure_connection
-    from ..net.zenoh_bus import read_zenoh_file
+class Membership(NamedTuple):
+    """The options by which a process takes part in a session."""
 
-    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    connection = resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
-    return secure_connection(connection, read_keys(keys), insecure=insecure)
+    listen: ListenOption = None
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
+    insecure: InsecureOption = False
+
+    def find_endpoints(
+        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+    ) -> "Connection":
+        """Returns where it listens and what it connects to, by default these; without its keys."""
+        from ..net.connection import resolve_member_connection
+        from ..net.zenoh_bus import read_zenoh_file
+
+        file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
+        ways = self.listen, self.connect, self.router, file
+        return resolve_member_connection(*ways, listen_else, connect_else)
+
+    def resolve(
+        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+    ) -> "Connection":
+        """Returns how it takes part, by default at these endpoints; with its keys."""
+        from ..net.connection import secure_connection
+
+        connection = self.find_endpoints(listen_else, connect_else)
+        return secure_connection(connection, read_keys(self.keys), insecure=self.insecure)
 
 
-def resolve_client_connection(
-    connect: list[str] | None,
-    routers: list[str] | None,
-    zenoh_config: Path | None,
-    keys: Path | None,
-    *,
-    operates: bool = True,
-) -> "Connection":
-    """Returns how a command reaches a session of which it is no member, by its options.
+class Reach(NamedTuple):
+    """The options by which a command reaches a session of which it is no member."""
 
-    Keys must be the operator's, unless every member may do what the command does (`operates` is False).
-    """
-    from ..net.access_rules import OPERATOR
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
 
-    connection = resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
-    return connection.require(OPERATOR) if operates else connection
+    def resolve(self, *, operates: bool = True) -> "Connection":
+        """Returns the connection; its keys are the operator's, unless `operates` is False."""
+        from ..net.access_rules import OPERATOR
+
+        connection = Membership(None, *self).resolve()
+        return connection.require(OPERATOR) if operates else connection
+
+
+class LawFiles(NamedTuple):
+    """The options that let files run as the laws that a log names."""
+
+    law: LawFilesOption = None
+    other_version: OtherVersionOption = False
+    remember: RememberOption = False
+
+    def open(self, *files: Path, runs_them: bool = True) -> "Log":
+        """Returns a log; warns of code from outside that its execution runs, or may not run."""
+        allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
+        log = terminal.open_with_progress(*files, **allowed)
+        if runs_them:
+            terminal.warn_user_laws(log)
+        return log
+
+
+def spread(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a command with an option for every field of its parameters that are tuples of options."""
+    given = inspect.signature(run).parameters
+    kinds = {n: p.annotation for n, p in given.items() if p.annotation in (Membership, Reach, LawFiles)}
+    parameters = [
+        inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, outer in given.items()
+        for inner in (inspect.signature(kinds[name]).parameters.values() if name in kinds else [outer])
+    ]
+
+    @wraps(run)
+    def gather(**values: Any) -> Any:
+        for name, kind in kinds.items():
+            values[name] = kind(*map(values.pop, kind._fields))
+        return run(**values)
+
+    vars(gather)["__signature__"] = inspect.Signature(parameters)
+    gather.__annotations__ = {one.name: one.annotation for one in parameters}
+    return gather
 
 
 def read_keys(folder: Path | None) -> "MemberKeys | None":

@@ -190,13 +190,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         display.stop()
 
 
-def open_with_progress(
-    first: Path,
-    *more: Path,
-    law: list[Path] | None = None,
-    other_version: bool = False,
-    remember: bool = False,
-) -> "Log":
+def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
     """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns of damage.
 
     Raises:
@@ -205,7 +199,6 @@ def open_with_progress(
     from ..log.log_reader import open_log
 
     with progress_bar(f"reading {first}") as progress:
-        allowed: Any = {"law": law or (), "other_version": other_version, "remember": remember}
         log = open_log(first, *more, progress=progress, **allowed)
     for path in (first, *more):
         warn_if_unfinished(path)
