@@ -19,7 +19,8 @@ from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
-from . import bench, compare, inputs, log, members, options, runs, sessions, sweep, test
+from . import bench, inputs, log, members, options, runs, sessions, studies, sweep
+from .options import flag
 
 
 class _Commands(TyperGroup):
@@ -61,8 +62,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _main(
     _: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+        bool, flag("--version", "Print the version and exit.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     pass
@@ -119,7 +119,7 @@ _KEYS = {
     "info": ["keys/m1"],
 }
 
-_MODULES = (sessions, members, runs, compare, log, test, sweep, bench, inputs)
+_MODULES = (sessions, members, runs, log, studies, sweep, bench, inputs)
 _FUNCTIONS = {name: run for module in _MODULES for name, run in vars(module).items()}
 
 

@@ -10,6 +10,7 @@ from ..files import refuse_existing, write_whole
 from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
 from . import options
+from .options import value
 
 
 def scenario_list_command(as_json: options.JsonOption = False) -> None:
@@ -88,20 +89,18 @@ def trace_import_command(
     file: Annotated[
         Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a header.", metavar="FILE")
     ],
-    out: Annotated[
-        Path | None, options.value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")
-    ] = None,
+    out: Annotated[Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")] = None,
     way: Annotated[
         str,
-        options.value(
+        value(
             "--way",
             "half|send|receive|whole",
             "Half a round trip, one way of irtt (send or receive), or delays as they are. "
             "Default: half of a round trip, a one-way delay as it is.",
         ),
     ] = "",
-    column: Annotated[str, options.value("--column", "NAME", "Column of the delays in a table.")] = "",
-    every_s: Annotated[float, options.value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
+    column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
+    every_s: Annotated[float, value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
@@ -129,7 +128,7 @@ def keys_new_command(
     ],
     hosts: Annotated[
         list[str] | None,
-        options.value("--host", "NAME", "Host name or address at which a member listens; repeatable."),
+        value("--host", "NAME", "Host name or address at which a member listens; repeatable."),
     ] = None,
     days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
 ) -> None:

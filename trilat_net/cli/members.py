@@ -14,6 +14,7 @@ from ..errors import LawWithheld, RunFailed, UsageError
 from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
 from . import options
+from .options import flag, seconds, value
 
 if TYPE_CHECKING:
     from recorder.play.play_process import PlaybackSummary
@@ -26,8 +27,7 @@ if TYPE_CHECKING:
 
 def site_command(
     name: Annotated[
-        str,
-        typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites),
+        str, typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites)
     ],
     scenario: Annotated[
         str,
@@ -38,21 +38,18 @@ def site_command(
             autocompletion=options.complete_scenarios,
         ),
     ],
-    session: Annotated[str | None, options.value("--session", "ID", "Default: the scenario's name.")] = None,
+    session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
     *,
     ways: options.Membership,
-    join_timeout: Annotated[
-        float, options.seconds("--join-timeout", "Longest wait for the others, s.")
-    ] = 60.0,
+    join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the others, s.")] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
     stay: Annotated[
-        float,
-        options.seconds("--stay", "At the end, wait until the recorder has left, at most this long, s."),
+        float, seconds("--stay", "At the end, wait until the recorder has left, at most this long, s.")
     ] = 0.0,
     without: Annotated[
         list[str] | None,
-        options.value(
+        value(
             "--without",
             "SITE",
             "Option of the first site: begin without SITE, which may join later; repeatable.",
@@ -60,7 +57,7 @@ def site_command(
     ] = None,
     leave_timeout: Annotated[
         float | None,
-        options.seconds(
+        seconds(
             "--leave-timeout",
             "Under glide: time to go on without a site that has left, s; default: to the end.",
         ),
@@ -119,12 +116,12 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
 
 
 def record_command(
-    session: Annotated[str, options.value("--session", "ID", "Session to record.")],
+    session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
     ways: options.Membership,
     output: Annotated[
         Path | None,
-        options.value(
+        value(
             "-o --out --output",
             "FILE",
             "Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
@@ -132,34 +129,29 @@ def record_command(
     ] = None,
     join_timeout: Annotated[
         float | None,
-        options.seconds("--join-timeout", "Longest wait for the session to begin, s; default: no limit."),
+        seconds("--join-timeout", "Longest wait for the session to begin, s; default: no limit."),
     ] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
     concluded: Annotated[
-        bool,
-        typer.Option("--conclude", help="Afterwards verify the log, and write a report into its folder."),
+        bool, flag("--conclude", "Afterwards verify the log, and write a report into its folder.")
     ] = False,
     include: Annotated[
         list[str] | None,
-        options.value("--include", "KEYS", "Record only these channels, as in '**/m1/**'; repeatable."),
+        value("--include", "KEYS", "Record only these channels, as in '**/m1/**'; repeatable."),
     ] = None,
     exclude: Annotated[
-        list[str] | None,
-        options.value("--exclude", "KEYS", "Leave these channels out, as in '**/link'; repeatable."),
+        list[str] | None, value("--exclude", "KEYS", "Leave these channels out, as in '**/link'; repeatable.")
     ] = None,
     split_size: Annotated[
-        float | None,
-        options.value("--split-size", "MIB", "Split the log into parts of at most this size, MiB."),
+        float | None, value("--split-size", "MIB", "Split the log into parts of at most this size, MiB.")
     ] = None,
     split_duration: Annotated[
-        float | None, options.value("--split-duration", "S", "Split the log into parts of this duration, s.")
+        float | None, value("--split-duration", "S", "Split the log into parts of this duration, s.")
     ] = None,
-    carry_on: Annotated[
-        bool, typer.Option("--continue", help="If the log exists, write its next part.")
-    ] = False,
+    carry_on: Annotated[bool, flag("--continue", "If the log exists, write its next part.")] = False,
     durable: Annotated[
-        bool, typer.Option("--durable", help="Sync to the disk at every flush instead of every second.")
+        bool, flag("--durable", "Sync to the disk at every flush instead of every second.")
     ] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
@@ -241,21 +233,19 @@ def replay_command(
         list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
     ],
     rate: Annotated[
-        str, options.value("--rate", "X", "Speed relative to the recording, or max: as fast as possible.")
+        str, value("--rate", "X", "Speed relative to the recording, or max: as fast as possible.")
     ] = "1",
-    loop: Annotated[bool, typer.Option("--loop", help="Start over at the end, until Ctrl-C.")] = False,
+    loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[
-        float | None, options.value("--start", "S", "Start of the part to play, s since tick 0.")
+        float | None, value("--start", "S", "Start of the part to play, s since tick 0.")
     ] = None,
-    stop: Annotated[
-        float | None, options.value("--stop", "S", "End of the part to play, s since tick 0.")
-    ] = None,
+    stop: Annotated[float | None, value("--stop", "S", "End of the part to play, s since tick 0.")] = None,
     duration: Annotated[
-        float | None, options.value("--duration", "S", "Duration of the part to play, s, instead of --stop.")
+        float | None, value("--duration", "S", "Duration of the part to play, s, instead of --stop.")
     ] = None,
     include: Annotated[
         list[str] | None,
-        options.value(
+        value(
             "--include",
             "KEYEXPR",
             "Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
@@ -263,24 +253,22 @@ def replay_command(
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        options.value("--exclude", "KEYEXPR", "Leave these channels out, as in '**/link'; repeatable."),
+        value("--exclude", "KEYEXPR", "Leave these channels out, as in '**/link'; repeatable."),
     ] = None,
     prefix: Annotated[
-        str, options.value("--prefix", "WORD", "Name the session WORD-NAME; with '' NAME, as recorded.")
+        str, value("--prefix", "WORD", "Name the session WORD-NAME; with '' NAME, as recorded.")
     ] = "replay",
-    session: Annotated[
-        str | None, options.value("--session", "ID", "Name of the session, without a prefix.")
-    ] = None,
+    session: Annotated[str | None, value("--session", "ID", "Name of the session, without a prefix.")] = None,
     time: Annotated[
-        str, options.value("--time", "publish|log", "Play messages at their times of sending, or of arrival.")
+        str, value("--time", "publish|log", "Play messages at their times of sending, or of arrival.")
     ] = "publish",
     low_cpu: Annotated[
-        bool, typer.Option("--low-cpu", help="Sleep until every deadline, which is about 0.1 ms less exact.")
+        bool, flag("--low-cpu", "Sleep until every deadline, which is about 0.1 ms less exact.")
     ] = False,
     needs_recorder: options.NeedsRecorderOption = False,
     preload: Annotated[
         int,
-        options.value(
+        value(
             "--preload",
             "MIB",
             "Largest log held in memory; another process reads a larger one during the replay.",
@@ -452,7 +440,7 @@ LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 def router_command(
     listen: Annotated[
         list[str] | None,
-        options.value(
+        value(
             "--listen",
             "EP",
             f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
@@ -464,9 +452,7 @@ def router_command(
     insecure: options.InsecureOption = False,
     until_idle: Annotated[
         float | None,
-        options.seconds(
-            "--until-idle", "End once all members have been gone for this long, s; default: never."
-        ),
+        seconds("--until-idle", "End once all members have been gone for this long, s; default: never."),
     ] = None,
 ) -> None:
     """Connects sites that cannot reach each other directly, for example behind NAT.

@@ -1,4 +1,4 @@
-"""Options that several commands share, one by one or together, and the scenario, connection and log they mean."""
+"""Options that several commands share, alone or together, and the scenario, connection or log they mean."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -41,6 +41,11 @@ check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
 def value(names: str, metavar: str, text: str, **more: Any) -> Any:
     """Returns an option that takes a value, with its help; several names are separated by spaces."""
     return typer.Option(*names.split(), metavar=metavar, help=text, **more)
+
+
+def flag(names: str, text: str, **more: Any) -> Any:
+    """Returns an option without a value, with its help."""
+    return typer.Option(names, help=text, **more)
 
 
 def seconds(name: str, text: str) -> Any:
@@ -93,7 +98,7 @@ SetOption = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
 DurationOption = Annotated[float | None, value("--duration", "S", "Override the duration of the run, s.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
     list[str] | None, value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447.")
 ]
@@ -113,8 +118,7 @@ ZenohConfigOption = Annotated[
 ]
 KeysOption = Annotated[Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")]
 InsecureOption = Annotated[
-    bool,
-    typer.Option("--insecure", help="Allow --listen on a network whose users you trust, unencrypted."),
+    bool, flag("--insecure", "Allow --listen on a network whose users you trust, unencrypted.")
 ]
 
 
@@ -147,7 +151,7 @@ ClockDriftOption = Annotated[
         "--clock-drift-ppm",
         "PPM",
         "For tests: use a clock that runs faster than the machine's by this, ppm.",
-        callback=check_range(-200.0, 200.0, "a number"),  # slewing takes no more
+        callback=check_range(-200.0, 200.0, "a number"),
     ),
 ]
 
@@ -160,9 +164,7 @@ ViewsOption = Annotated[
     ),
 ]
 
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
-]
+JobsOption = Annotated[int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)]
 
 
 class Accepted(StrEnum):
@@ -177,27 +179,23 @@ AcceptOption = Annotated[
     typer.Option("--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."),
 ]
 OwnLawsOption = Annotated[
-    bool,
-    typer.Option("--own-laws", help="Run code of imported laws for the energies that they declare."),
+    bool, flag("--own-laws", "Run code of imported laws for the energies that they declare.")
 ]
-TwinsOption = Annotated[
-    int, typer.Option("--twins", metavar="N", min=0, max=99, help="Twins that get a small push; 0: none.")
-]
+TwinsOption = Annotated[int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)]
 LawFilesOption = Annotated[
-    list[Path] | None,
-    typer.Option("--law", metavar="FILE", help="Let this file run as a law that the log names; repeatable."),
+    list[Path] | None, value("--law", "FILE", "Let this file run as a law that the log names; repeatable.")
 ]
 OtherVersionOption = Annotated[
-    bool, typer.Option("--other-version", help="Take the --law FILE though it is not the one that ran.")
+    bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
 ]
 RememberOption = Annotated[
-    bool, typer.Option("--remember", help="Let the --law FILE run for other logs that name its hash, too.")
+    bool, flag("--remember", "Let the --law FILE run for other logs that name its hash, too.")
 ]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
-NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")]
+NeedsRecorderOption = Annotated[bool, flag("--needs-recorder", "Wait for a recorder.")]
 
 
 MinCoverageOption = Annotated[
@@ -211,8 +209,8 @@ MinCoverageOption = Annotated[
 ]
 MIN_COVERAGE = 0.999
 """As in `log.integrity`, which takes long to import."""
-PngOption = Annotated[bool, typer.Option("--png", help="Write every figure as a PNG file too.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
+PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
+JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:

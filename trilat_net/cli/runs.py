@@ -13,6 +13,7 @@ from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
 from . import options
+from .options import flag, value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 def sim_command(
     scenario: options.ScenarioArgument,
-    output: Annotated[Path | None, options.value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
+    output: Annotated[Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
@@ -61,16 +62,15 @@ def sim_command(
 def verify_command(
     files: options.LogsArgument,
     virtual: Annotated[
-        bool,
-        typer.Option("--virtual", help="Compare with virtual time too, with and without the log's arrivals."),
+        bool, flag("--virtual", "Compare with virtual time too, with and without the log's arrivals.")
     ] = False,
     resume_every: Annotated[
         int,
-        typer.Option(
+        value(
             "--resume-every",
-            metavar="N",
+            "N",
+            "Start sites afresh from the records every N ticks: shows what a law knows besides.",
             min=0,
-            help="Start sites afresh from the records every N ticks: shows what a law knows besides.",
         ),
     ] = 0,
     *,
@@ -132,16 +132,15 @@ _PUSHED = (
 
 def twin_command(
     files: options.LogsArgument,
-    at_s: Annotated[float, options.value("--at", "S", "The instant of the push, s.")] = 0.0,
+    at_s: Annotated[float, value("--at", "S", "The instant of the push, s.")] = 0.0,
     push: Annotated[
-        list[str] | None,
-        options.value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites),
+        list[str] | None, value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites)
     ] = None,
     delta: Annotated[
-        str, options.value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade.")
+        str, value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade.")
     ] = "",
     picture: Annotated[
-        Path | None, options.value("-o --out --output", "FILE", "Draw a figure: .png, .svg or .pdf.")
+        Path | None, value("-o --out --output", "FILE", "Draw a figure: .png, .svg or .pdf.")
     ] = None,
     *,
     laws: options.LawFiles,
@@ -190,24 +189,18 @@ def figure_command(
         ),
     ] = None,
     width_in: Annotated[
-        float, typer.Option("--width", metavar="3.5|7", help="Width of one or two columns of a paper, in.")
+        float, value("--width", "3.5|7", "Width of one or two columns of a paper, in.")
     ] = 3.5,
-    formats: Annotated[
-        str, typer.Option("--format", metavar="pdf,png,svg", help="One or more formats.")
-    ] = "pdf,png",
-    folder: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Default: FILE without .mcap, -figures.")
-    ] = None,
+    formats: Annotated[str, value("--format", "pdf,png,svg", "One or more formats.")] = "pdf,png",
+    folder: Annotated[Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")] = None,
     others: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--with", metavar="FILE", help="Draw this log over FILE, as the figure overlay; repeatable."
-        ),
+        value("--with", "FILE", "Draw this log over FILE, as the figure overlay; repeatable."),
     ] = None,
     *,
     laws: options.LawFiles,
-    listed: Annotated[bool, typer.Option("--list", help="Only list the figures.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list or the paths as JSON.")] = False,
+    listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
+    as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
     """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
@@ -261,9 +254,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
 
 def report_command(
     files: options.LogsArgument,
-    folder: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Default: FILE without .mcap.")
-    ] = None,
+    folder: Annotated[Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")] = None,
     *,
     laws: options.LawFiles,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
@@ -288,23 +279,17 @@ def rerun_command(
     files: options.LogsArgument,
     replace: Annotated[
         list[str] | None,
-        typer.Option(
-            "--replace",
-            metavar="SITE",
-            help="Execute this site again; repeatable.",
-            autocompletion=options.complete_sites,
+        value(
+            "--replace", "SITE", "Execute this site again; repeatable.", autocompletion=options.complete_sites
         ),
     ] = None,
     closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="Execute all sites, over the network of the log.")
+        bool, flag("--closed-loop", "Execute all sites, over the network of the log.")
     ] = False,
     overrides: options.SetOption = None,
     *,
     laws: options.LawFiles,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", "--output", metavar="FILE", help="Write the result as a log."),
-    ] = None,
+    output: Annotated[Path | None, value("-o --out --output", "FILE", "Write the result as a log.")] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -347,19 +332,14 @@ def linear_command(
     scenario: options.ScenarioArgument,
     overrides: options.SetOption = None,
     pose: Annotated[
-        str | None,
-        options.value("--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end."),
+        str | None, value("--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end.")
     ] = None,
-    roots: Annotated[int, options.value("--roots", "N", "Number of roots to print.")] = 6,
+    roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
     over: Annotated[
-        list[str] | None, options.value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
+        list[str] | None, value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
     ] = None,
-    ports: Annotated[
-        bool, typer.Option("--ports/--no-ports", help="Print what operators feel, and passivity.")
-    ] = True,
-    picture: Annotated[
-        Path | None, options.value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
-    ] = None,
+    ports: Annotated[bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")] = True,
+    picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
     what: Annotated[
         LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
     ] = LinearFigure.ROOTS,

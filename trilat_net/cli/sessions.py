@@ -13,6 +13,7 @@ from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from ..reporting.session_text import MARKS
 from . import options
+from .options import flag, value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,7 +75,7 @@ def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
     session: Annotated[
-        str | None, options.value("--session", "ID", "Show this running session instead of starting one.")
+        str | None, value("--session", "ID", "Show this running session instead of starting one.")
     ] = None,
     *,
     reach: options.Reach,
@@ -86,11 +87,9 @@ def live_command(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Allow --host beyond loopback, without encryption.")
+        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
     ] = False,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open a browser if there is one.")
-    ] = True,
+    browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
     duration: options.DurationOption = None,
     folder: options.ResultsOption = None,
     seed: options.SeedOption = None,
@@ -135,39 +134,37 @@ def _check_count(value: int) -> int:
 
 def ping_command(
     context: typer.Context,
-    session: Annotated[str, options.value("--session", "ID", "Session to measure.")] = "paper",
+    session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
     *,
     reach: options.Reach,
-    count: Annotated[
-        int, typer.Option("--count", metavar="N", help="Round trips to each member.", callback=_check_count)
-    ] = 50,
+    count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
         str | None,
-        typer.Option(
+        value(
             "--benchmark",
-            metavar="SCENARIO",
-            help="Measure the network instead, by size, rate and transport, for this scenario.",
+            "SCENARIO",
+            "Measure the network instead, by size, rate and transport, for this scenario.",
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
     overrides: options.SetOption = None,
     seconds: Annotated[
         float | None,
-        typer.Option(
+        value(
             "--seconds",
-            metavar="S",
-            help="Duration of all cases together, s; default 24. With --answer: time until it ends.",
+            "S",
+            "Duration of all cases together, s; default 24. With --answer: time until it ends.",
             callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
         ),
     ] = None,
     picture: Annotated[
-        Path | None, options.value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
+        Path | None, value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
     ] = None,
     force: options.ForceOption = False,
     answer: Annotated[
         list[str] | None,
-        options.value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
+        value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
     ] = None,
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
@@ -266,7 +263,7 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
 
 
 def watch_command(
-    session: Annotated[str, options.value("--session", "ID", "Session to watch.")],
+    session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
@@ -296,7 +293,7 @@ def watch_command(
     terminal.print_text(f"session {name} has ended")
 
 
-SessionOption = Annotated[str, options.value("--session", "ID", "The session.")]
+SessionOption = Annotated[str, value("--session", "ID", "The session.")]
 SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
 
 
@@ -315,10 +312,7 @@ def _print_answers(answers: list[str]) -> None:
 def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
-    end: Annotated[
-        bool,
-        typer.Option("--end", help="End the whole session instead; recorders get every record."),
-    ] = False,
+    end: Annotated[bool, flag("--end", "End the whole session instead; recorders get every record.")] = False,
     *,
     reach: options.Reach,
 ) -> None:
@@ -393,7 +387,7 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
 
 def set_command(
     context: typer.Context,
-    session: Annotated[str | None, options.value("--session", "ID", "Session to change; required.")] = None,
+    session: Annotated[str | None, value("--session", "ID", "Session to change; required.")] = None,
     *,
     reach: options.Reach,
 ) -> None:
@@ -412,8 +406,7 @@ def set_link_command(
     loss: Annotated[str | None, typer.Option("--loss", help="New loss, as in 5%.")] = None,
     preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
     to: Annotated[
-        list[str] | None,
-        options.value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable."),
+        list[str] | None, value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable.")
     ] = None,
 ) -> None:
     """Changes the given keys of a directed link; a model or a preset replaces all of them."""
@@ -467,11 +460,9 @@ def doctor_command(
     *,
     ways: options.Membership,
     session: Annotated[
-        str | None, options.value("--session", "ID", "Also ask the members of this session for their clocks.")
+        str | None, value("--session", "ID", "Also ask the members of this session for their clocks.")
     ] = None,
-    folder: Annotated[Path, options.value("--out -o", "DIR", "Folder where results would go.")] = Path(
-        "runs"
-    ),
+    folder: Annotated[Path, value("--out -o", "DIR", "Folder where results would go.")] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per finding.
