@@ -40,7 +40,7 @@ def site_command(
     ],
     session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
     *,
-    ways: options.Membership,
+    ways: options.MemberOptions,
     join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the others, s.")] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
@@ -118,7 +118,7 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
 def record_command(
     session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
-    ways: options.Membership,
+    ways: options.MemberOptions,
     output: Annotated[
         Path | None,
         value(
@@ -302,7 +302,7 @@ def replay_command(
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
     name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    ways = options.Membership(listen, connect, router, zenoh_config, None, insecure)
+    ways = options.MemberOptions(listen, connect, router, zenoh_config, None, insecure)
     connection = ways.resolve([default_endpoint(name, 0)], [])
     play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
     tell = partial((terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True)
@@ -312,15 +312,7 @@ def replay_command(
     clock = SystemClock()
     with Interrupt() as interrupt:
         outcome = play_log(
-            (facts, block),
-            files,
-            selection,
-            play,
-            connection,
-            clock,
-            interrupt.requested,
-            tell,
-            _show_position(clock),
+            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, _line(clock)
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
@@ -354,7 +346,7 @@ def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Cal
         )
 
 
-def _show_position(clock: "Clock") -> Callable[["PlayProgress"], None]:
+def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
     """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 

@@ -265,7 +265,7 @@ def given_options(context: typer.Context) -> list[str]:
     return [param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"]
 
 
-class Membership(NamedTuple):
+class MemberOptions(NamedTuple):
     """The options by which a process takes part in a session."""
 
     listen: ListenOption = None
@@ -308,7 +308,7 @@ class Reach(NamedTuple):
         """Returns the connection; its keys are the operator's, unless `operates` is False."""
         from ..net.access_rules import OPERATOR
 
-        connection = Membership(None, *self).resolve()
+        connection = MemberOptions(None, *self).resolve()
         return connection.require(OPERATOR) if operates else connection
 
 
@@ -331,7 +331,7 @@ class LawFiles(NamedTuple):
 def spread(run: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a command with an option for every field of its parameters that are tuples of options."""
     given = inspect.signature(run).parameters
-    kinds = {n: p.annotation for n, p in given.items() if p.annotation in (Membership, Reach, LawFiles)}
+    kinds = {n: p.annotation for n, p in given.items() if p.annotation in (MemberOptions, Reach, LawFiles)}
     parameters = [
         inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for name, outer in given.items()

@@ -458,7 +458,7 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
 
 def doctor_command(
     *,
-    ways: options.Membership,
+    ways: options.MemberOptions,
     session: Annotated[
         str | None, value("--session", "ID", "Also ask the members of this session for their clocks.")
     ] = None,
