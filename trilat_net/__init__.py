@@ -16,114 +16,73 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from sites.demo_session import run
-    from sites.doctor import doctor
-    from sites.network_benchmark import ping_benchmark
-    from sites.running_session import hand, session, start
+    from sites.demo_session import run as run
+    from sites.doctor import doctor as doctor
+    from sites.network_benchmark import ping_benchmark as ping_benchmark
+    from sites.running_session import hand as hand
+    from sites.running_session import session as session
+    from sites.running_session import start as start
 
-    from .analysis.twin_growth import twin
-    from .api import (
-        bench,
-        certify,
-        check_file,
-        compare,
-        export,
-        info,
-        linear,
-        margin,
-        metrics,
-        recover,
-        report,
-        simulate,
-        sweep,
-        tune,
-        verify,
-        view,
-    )
-    from .core.compiled_law import compiled
-    from .execution.rerun import rerun
-    from .log.log_reader import open_log
-    from .log.log_signature import create_signing_keys, sign_log
-    from .net.member_keys import create_keys, read_member_keys
-    from .reporting.figures.registry import figure
-    from .scenario import list_shipped, load_scenario, read_template
-    from .scenario.describe import describe_scenario
-    from .scenario.law_skeleton import new_law
-    from .scenario.measured_traces import import_trace
-    from .studies.trials.trial import trials
-    from .studies.trials.trial_runner import check
+    from .analysis.twin_growth import twin as twin
+    from .api import bench as bench
+    from .api import certify as certify
+    from .api import check_file as check_file
+    from .api import compare as compare
+    from .api import export as export
+    from .api import info as info
+    from .api import linear as linear
+    from .api import margin as margin
+    from .api import metrics as metrics
+    from .api import recover as recover
+    from .api import report as report
+    from .api import simulate as simulate
+    from .api import sweep as sweep
+    from .api import tune as tune
+    from .api import verify as verify
+    from .api import view as view
+    from .core.compiled_law import compiled as compiled
+    from .execution.rerun import rerun as rerun
+    from .log.log_reader import open_log as open_log
+    from .log.log_signature import create_signing_keys as create_signing_keys
+    from .log.log_signature import sign_log as sign_log
+    from .net.member_keys import create_keys as create_keys
+    from .net.member_keys import read_member_keys as read_member_keys
+    from .reporting.figures.registry import figure as figure
+    from .scenario import list_shipped as list_shipped
+    from .scenario import load_scenario as load_scenario
+    from .scenario import read_template as read_template
+    from .scenario.describe import describe_scenario as describe_scenario
+    from .scenario.law_skeleton import new_law as new_law
+    from .scenario.measured_traces import import_trace as import_trace
+    from .studies.trials.trial import trials as trials
+    from .studies.trials.trial_runner import check as check
 
     __version__: str
 
-__all__ = [
-    "__version__",
-    "bench",
-    "certify",
-    "check",
-    "check_file",
-    "compare",
-    "compiled",
-    "create_keys",
-    "create_signing_keys",
-    "describe_scenario",
-    "doctor",
-    "export",
-    "figure",
-    "hand",
-    "import_trace",
-    "info",
-    "linear",
-    "list_shipped",
-    "load_scenario",
-    "margin",
-    "metrics",
-    "new_law",
-    "open_log",
-    "ping_benchmark",
-    "read_member_keys",
-    "read_template",
-    "recover",
-    "report",
-    "rerun",
-    "run",
-    "session",
-    "sign_log",
-    "simulate",
-    "start",
-    "sweep",
-    "trials",
-    "tune",
-    "twin",
-    "verify",
-    "view",
-]
-
-_MODULES = {
-    "check": "trilat_net.studies.trials.trial_runner",
-    "compiled": "trilat_net.core.compiled_law",
-    "create_keys": "trilat_net.net.member_keys",
-    "create_signing_keys": "trilat_net.log.log_signature",
-    "describe_scenario": "trilat_net.scenario.describe",
-    "doctor": "sites.doctor",
-    "figure": "trilat_net.reporting.figures.registry",
-    "hand": "sites.running_session",
-    "import_trace": "trilat_net.scenario.measured_traces",
-    "list_shipped": "trilat_net.scenario",
-    "load_scenario": "trilat_net.scenario",
-    "new_law": "trilat_net.scenario.law_skeleton",
-    "open_log": "trilat_net.log.log_reader",
-    "ping_benchmark": "sites.network_benchmark",
-    "read_member_keys": "trilat_net.net.member_keys",
-    "read_template": "trilat_net.scenario",
-    "rerun": "trilat_net.execution.rerun",
-    "run": "sites.demo_session",
-    "session": "sites.running_session",
-    "sign_log": "trilat_net.log.log_signature",
-    "start": "sites.running_session",
-    "twin": "trilat_net.analysis.twin_growth",
-    "trials": "trilat_net.studies.trials.trial",
+_NAMES = {
+    "sites.demo_session": "run",
+    "sites.doctor": "doctor",
+    "sites.network_benchmark": "ping_benchmark",
+    "sites.running_session": "hand session start",
+    "trilat_net.analysis.twin_growth": "twin",
+    "trilat_net.api": "bench certify check_file compare export info linear margin metrics recover report "
+    "simulate sweep tune verify view",
+    "trilat_net.core.compiled_law": "compiled",
+    "trilat_net.execution.rerun": "rerun",
+    "trilat_net.log.log_reader": "open_log",
+    "trilat_net.log.log_signature": "create_signing_keys sign_log",
+    "trilat_net.net.member_keys": "create_keys read_member_keys",
+    "trilat_net.reporting.figures.registry": "figure",
+    "trilat_net.scenario": "list_shipped load_scenario read_template",
+    "trilat_net.scenario.describe": "describe_scenario",
+    "trilat_net.scenario.law_skeleton": "new_law",
+    "trilat_net.scenario.measured_traces": "import_trace",
+    "trilat_net.studies.trials.trial": "trials",
+    "trilat_net.studies.trials.trial_runner": "check",
 }
-"""Where names are; the others are in `api`."""
+"""By module what is offered of it."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(["__version__", *_MODULES])
 
 
 def __getattr__(name: str) -> _Any:
@@ -132,8 +91,8 @@ def __getattr__(name: str) -> _Any:
         from importlib.metadata import version
 
         return version("trilat-net")
-    if name in __all__:
-        return getattr(_import_module(_MODULES.get(name, "trilat_net.api")), name)
+    if name in _MODULES:
+        return getattr(_import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.net.waiting import until
 from tests.studies.trials.results import QUICK
-from trilat_net.cli.test import parse_seeds
+from trilat_net.cli.studies import parse_seeds
 from trilat_net.errors import UsageError
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -84,7 +84,7 @@ def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Pat
 
 
 def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
-    from trilat_net.cli.test import _batch
+    from trilat_net.cli.studies import _batch
 
     named = [trial.source for trial in _batch([], [1, 2], [], live=False)]
     assert set(named) == {name for name in list_shipped() if load_scenario(name).expect.asks}

@@ -11,7 +11,7 @@ import trilat_net as tn
 from tests.cli.running import simulated, trilat
 from tests.execution.logs import without_records
 from trilat_net.analysis.twin_growth import TWINS
-from trilat_net.cli.certify import certify_command
+from trilat_net.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.log_inputs import explain_no_repetition
 

@@ -14,7 +14,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.reporting import charts
 from trilat_net.reporting.figure_size import REPORT_SIZE, make_print_size
-from trilat_net.reporting.figures import arm_poses, contact_force, joint_motion
+from trilat_net.reporting.figures import arm_poses, joint_motion
 from trilat_net.reporting.style import arrange_joints
 from trilat_net.scenario import parse_scenario
 
@@ -106,7 +106,7 @@ def test_the_force_of_a_wall_in_space_is_what_the_record_says_of_the_arm():
     push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
     log = simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
     part = log["s"]
-    force_panel, depth_panel = contact_force.draw_contact(log).axes
+    force_panel, depth_panel = joint_motion.draw_contact(log).axes
     t_s, force = force_panel.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)
     assert force.max() > 5.0

@@ -13,14 +13,11 @@ from trilat_net.analysis.timeline import find_mode_intervals
 from trilat_net.errors import UsageError
 from trilat_net.reporting import style
 from trilat_net.reporting.figures import (
+    age_and_lateness,
     arm_poses,
-    authority,
     joint_motion,
-    loop_timing,
     registry,
     run_overview,
-    sample_age,
-    time_figure,
 )
 from trilat_net.reporting.palette import SITE_COLOURS, list_site_colours
 from trilat_net.scenario import load_scenario, parse_scenario
@@ -56,10 +53,10 @@ def test_a_site_has_one_colour_in_every_figure():
 
 def test_histograms_count_every_tick():
     log = logs.timed(logs.simulated("four"))
-    edges = loop_timing.loop_time_bin_edges(log)
+    edges = age_and_lateness.loop_time_bin_edges(log)
     for site in log.sites:
-        assert loop_timing.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
-        assert loop_timing.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
+        assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
+        assert age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
 
 
 def test_a_log_without_events_has_no_markers():
@@ -87,19 +84,19 @@ def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow(monk
     assert len(shades) == 3 * sum(len(find_mode_intervals(log[site])) for site in log.sites)
     assert "1: a → c 90 ms, loss 10 %" in figure.get_supxlabel()
     assert "holds" in figure.get_supxlabel()
-    monkeypatch.setattr(time_figure, "MOST_EXPLAINED_CHANGES", 1)
+    monkeypatch.setattr(style, "MOST_EXPLAINED_CHANGES", 1)
     assert "and 2 more" in joint_motion.draw_operation(log).get_supxlabel()
 
 
 def test_the_stated_mean_is_drawn_while_it_holds_and_not_where_there_is_none():
     log = logs.busy().log
-    figure = sample_age.draw_sample_age(log)
+    figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
     t_s, mean_ms = lines(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
     assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
     measured = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
-    figure = sample_age.draw_sample_age(measured)
+    figure = age_and_lateness.draw_sample_age(measured)
     assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
     assert "mean delay as stated" not in [text.get_text() for text in figure.legends[0].get_texts()]
 
@@ -114,15 +111,17 @@ def test_estimates_show_the_sites_that_are_asked_for():
 def test_distributions_reach_the_longest_age_and_a_rare_one_by_logarithm():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
-        x_ms = sample_age.delay_axis_ms([sample_age.DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)])
+        x_ms = age_and_lateness.delay_axis_ms(
+            [age_and_lateness.DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)]
+        )
         assert x_ms[-1] >= 3200.0
         assert (x_ms[0] == 0.0) == even
 
 
 def test_ages_that_go_up_and_down_all_the_time_are_a_band():
     seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
-    assert sample_age.is_unsteady(200.0 + 10.0 * swings)
-    assert not sample_age.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
+    assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
+    assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
     axes = Figure().subplots()
     style.plot_spread(axes, seconds, 200.0 + 10.0 * swings, color="#004488")
     (band,), (median,) = axes.collections, axes.lines
@@ -140,14 +139,14 @@ def test_a_slave_has_the_same_colour_however_many_masters_there_are():
 def test_the_axis_of_ages_is_logarithmic_after_an_outage():
     for outage_ms in (0.0, 5000.0):
         values = np.append(np.full(1000, 200.0), 200.0 + outage_ms)
-        assert sample_age.needs_log_axis(values) == (outage_ms > 0.0)
-    assert not sample_age.needs_log_axis(np.full(3, np.nan))
+        assert age_and_lateness.needs_log_axis(values) == (outage_ms > 0.0)
+    assert not age_and_lateness.needs_log_axis(np.full(3, np.nan))
 
 
 def test_shares_are_of_all_that_there_is():
-    percent = sample_age.cumulative_percent(np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0]))
+    percent = age_and_lateness.cumulative_percent(np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0]))
     assert percent.tolist() == [0, 75, 100]
-    assert np.isnan(sample_age.cumulative_percent(np.zeros(0), np.zeros(2))).all()
+    assert np.isnan(age_and_lateness.cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
 
 def test_arms_stand_where_their_angles_put_them_in_panels_with_equal_axes():
@@ -217,13 +216,13 @@ RAMPS = [
 
 def test_shares_are_drawn_as_they_change():
     log = trilat_net.simulate("paper", {"duration_s": 2.0, "rate_hz": 100, "timeline": RAMPS})
-    assert authority.sites_with_changing_dominance(log) == ["s"]
-    figure = authority.draw_authority(log)
+    assert joint_motion.sites_with_changing_dominance(log) == ["s"]
+    figure = joint_motion.draw_authority(log)
     assert len(figure.axes) == 3
     m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
     assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx([0.5, 0.625, 0.75, 0.375, 0.0])
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
-    assert authority.sites_with_changing_dominance(logs.simulated("paper")) == []
+    assert joint_motion.sites_with_changing_dominance(logs.simulated("paper")) == []
 
 
 def test_an_overview_has_the_extremes_of_every_site_and_the_verdict():

@@ -16,7 +16,7 @@ import trilat_net
 from tests.analysis import logs
 from trilat_net.errors import UsageError
 from trilat_net.reporting.figure_size import COLUMN_IN, PAGE_IN, make_print_size
-from trilat_net.reporting.figures import contact_force, loop_timing, registry
+from trilat_net.reporting.figures import age_and_lateness, joint_motion, registry
 from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
 from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
 
@@ -155,7 +155,7 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     assert "contact" not in list_drawable_figures(logs.busy().log)
     reasons = {name: entry.absent(logs.simulated("free")) for name, entry in FIGURES.items()}
     assert reasons["operator_torques"] == reasons["hands_moved"] == registry.NO_OPERATOR
-    assert reasons["loop_timing"] == loop_timing.NO_LOOP_CLOCK
+    assert reasons["loop_timing"] == age_and_lateness.NO_LOOP_CLOCK
     assert not reasons["positions"]
     assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
 
@@ -164,7 +164,7 @@ def test_the_force_of_a_wall_is_what_the_record_says_of_the_arm():
     """J'F of the drawn force along the normal is the recorded torque ON the arm: the wall is all there is."""
     log = walled()
     part, wall = log["s"], log.scenario.sites["s"].environment[0]
-    above = contact_force.draw_contact(log).axes[0]
+    above = joint_motion.draw_contact(log).axes[0]
     t_s, force = above.lines[0].get_data()
     rows = np.rint(t_s * part.rate_hz).astype(int)
     q = part.q[rows]

@@ -10,7 +10,6 @@ import gc
 import inspect
 import os
 import sys
-from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -20,7 +19,8 @@ from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
-from .set import set_command
+from . import bench, inputs, log, members, options, runs, sessions, studies, sweep
+from .options import flag
 
 
 class _Commands(TyperGroup):
@@ -62,8 +62,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _main(
     _: Annotated[
-        bool,
-        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+        bool, flag("--version", "Print the version and exit.", is_eager=True, callback=_print_version)
     ] = False,
 ) -> None:
     pass
@@ -120,32 +119,29 @@ _KEYS = {
     "info": ["keys/m1"],
 }
 
-_HOMES = {"enable": "stop", "reset": "stop"}
-"""Modules of commands that share one."""
+_MODULES = (sessions, members, runs, log, studies, sweep, bench, inputs)
+_FUNCTIONS = {name: run for module in _MODULES for name, run in vars(module).items()}
 
 
-def _group(examples: dict[str, list[str]], module: str = "", words: str = "", **options: Any) -> typer.Typer:
+def _group(examples: dict[str, list[str]], words: str = "", **more: Any) -> typer.Typer:
     """Returns a group of commands: by name the arguments of their examples, which follow `words`.
 
-    The function of a command `info` of the module `log` is `log_info_command`; of one without a group,
-    `ping_command` in the module `ping`.
+    The function of a command `log info` is `log_info_command`, that of `ping` is `ping_command`.
     """
-    group = typer.Typer(**options)
+    group = typer.Typer(**more)
     for name, arguments in examples.items():
-        home = import_module(f".{module or _HOMES.get(name, name)}", __package__)
-        run = getattr(home, f"{module}_{name}_command".removeprefix("_"))
+        run = _FUNCTIONS[f"{'_'.join([*words.split()[:1], name])}_command"]
         epilog = "\n\n".join(f"Example: trilat {words}{name} {one}".rstrip() for one in arguments)
         text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
         paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
         text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
-        group.command(name, help=text, epilog=epilog)(run)
+        group.command(name, help=text, epilog=epilog)(options.spread(run))
     return group
 
 
-def _add(name: str, examples: dict[str, list[str]], more: str = "", **options: Any) -> None:
-    """Adds a group of commands to `trilat`; `more` follows its name in their examples."""
-    group = _group(examples, name, f"{name} {more}", no_args_is_help=True, **options)
-    app.add_typer(group, name=name)
+def _add(name: str, examples: dict[str, list[str]], words: str = "", **more: Any) -> None:
+    """Adds a group of commands to `trilat`; `words` follow its name in their examples."""
+    app.add_typer(_group(examples, f"{name} {words}", no_args_is_help=True, **more), name=name)
 
 
 app.add_typer(_group(_SINGLE))
@@ -154,7 +150,7 @@ app.add_typer(_group(_STUDIES))
 _add("scenario", _SCENARIO, help="The shipped scenarios and your own.")
 _add("new", _NEW, help="A control law of your own, with its test.")
 _add("trace", _TRACE, help="Imports delays that other programs measured.")
-_add("set", _SET, "--session paper ", callback=set_command)
+_add("set", _SET, "--session paper ", callback=options.spread(sessions.set_command))
 _add("keys", _KEYS, help="Keys that authenticate members of a session, and sign logs.")
 
 

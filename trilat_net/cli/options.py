@@ -1,17 +1,24 @@
-"""Options and arguments that several commands share, and the scenario and connection that they describe."""
+"""Options that several commands share, alone or together, and the scenario, connection or log they mean."""
 
+import inspect
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import wraps
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from ..errors import UsageError
+from ..reporting import terminal_output as terminal
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..log.log_reader import Log
     from ..net.connection import Connection
+    from ..results import Result
     from ..scenario import Scenario
 
 
@@ -33,6 +40,11 @@ check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
 def value(names: str, metavar: str, text: str, **more: Any) -> Any:
     """Returns an option that takes a value, with its help; several names are separated by spaces."""
     return typer.Option(*names.split(), metavar=metavar, help=text, **more)
+
+
+def flag(names: str, text: str, **more: Any) -> Any:
+    """Returns an option without a value, with its help."""
+    return typer.Option(names, help=text, **more)
 
 
 def seconds(name: str, text: str) -> Any:
@@ -85,7 +97,7 @@ SetOption = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
 DurationOption = Annotated[float | None, value("--duration", "S", "Override the duration of the run, s.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
     list[str] | None, value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447.")
 ]
@@ -105,8 +117,7 @@ ZenohConfigOption = Annotated[
 ]
 KeysOption = Annotated[Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")]
 InsecureOption = Annotated[
-    bool,
-    typer.Option("--insecure", help="Allow --listen on a network whose users you trust, unencrypted."),
+    bool, flag("--insecure", "Allow --listen on a network whose users you trust, unencrypted.")
 ]
 
 
@@ -139,7 +150,7 @@ ClockDriftOption = Annotated[
         "--clock-drift-ppm",
         "PPM",
         "For tests: use a clock that runs faster than the machine's by this, ppm.",
-        callback=check_range(-200.0, 200.0, "a number"),  # slewing takes no more
+        callback=check_range(-200.0, 200.0, "a number"),
     ),
 ]
 
@@ -152,9 +163,7 @@ ViewsOption = Annotated[
     ),
 ]
 
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes; default: one per core.")
-]
+JobsOption = Annotated[int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)]
 
 
 class Accepted(StrEnum):
@@ -169,27 +178,23 @@ AcceptOption = Annotated[
     typer.Option("--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."),
 ]
 OwnLawsOption = Annotated[
-    bool,
-    typer.Option("--own-laws", help="Run code of imported laws for the energies that they declare."),
+    bool, flag("--own-laws", "Run code of imported laws for the energies that they declare.")
 ]
-TwinsOption = Annotated[
-    int, typer.Option("--twins", metavar="N", min=0, max=99, help="Twins that get a small push; 0: none.")
-]
+TwinsOption = Annotated[int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)]
 LawFilesOption = Annotated[
-    list[Path] | None,
-    typer.Option("--law", metavar="FILE", help="Let this file run as a law that the log names; repeatable."),
+    list[Path] | None, value("--law", "FILE", "Let this file run as a law that the log names; repeatable.")
 ]
 OtherVersionOption = Annotated[
-    bool, typer.Option("--other-version", help="Take the --law FILE though it is not the one that ran.")
+    bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
 ]
 RememberOption = Annotated[
-    bool, typer.Option("--remember", help="Let the --law FILE run for other logs that name its hash, too.")
+    bool, flag("--remember", "Let the --law FILE run for other logs that name its hash, too.")
 ]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
-NeedsRecorderOption = Annotated[bool, typer.Option("--needs-recorder", help="Wait for a recorder.")]
+NeedsRecorderOption = Annotated[bool, flag("--needs-recorder", "Wait for a recorder.")]
 
 
 MinCoverageOption = Annotated[
@@ -202,13 +207,15 @@ MinCoverageOption = Annotated[
     ),
 ]
 MIN_COVERAGE = 0.999
-"""As in `log.integrity`, which takes long to import."""
-PngOption = Annotated[bool, typer.Option("--png", help="Write every figure as a PNG file too.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print everything as JSON.")]
+"""As in `log.accounting`, which takes long to import."""
+PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
+JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 
 
-def check_picture(path: Path, *, force: bool) -> None:
+def check_picture(path: Path | None, *, force: bool) -> None:
     """Refuses the path of a figure that cannot be written."""
+    if path is None:
+        return
     from ..files import refuse_existing
     from ..reporting.style import FIGURE_FORMATS
 
@@ -217,6 +224,19 @@ def check_picture(path: Path, *, force: bool) -> None:
     refuse_existing(path, force=force)
     if not path.parent.is_dir():
         raise UsageError(f"{path}: there is no folder {path.parent}")
+
+
+def print_drawn(
+    found: "Result", picture: Path | None, draw: "Callable[[], Figure]", *, as_json: bool
+) -> None:
+    """Prints a result, and writes its figure if a path for it was given."""
+    if picture is not None:
+        from ..reporting.style import REPORT_DPI, write_figure
+
+        write_figure(draw(), picture, REPORT_DPI)
+    terminal.print_result(found, as_json=as_json)
+    if picture is not None and not as_json:
+        terminal.print_paths([picture])
 
 
 def load_chosen_scenario(
@@ -244,42 +264,88 @@ def given_options(context: typer.Context) -> list[str]:
     return [param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"]
 
 
-def resolve_connection(
-    listen: list[str] | None,
-    connect: list[str] | None,
-    routers: list[str] | None,
-    zenoh_config: Path | None,
-    listen_else: Sequence[str],
-    connect_else: Sequence[str] | None,
-    keys: Path | None = None,
-    *,
-    insecure: bool = False,
-) -> "Connection":
-    """Returns how a member takes part by a command's options, and by default."""
-    from ..net.connection import resolve_member_connection, secure_connection
-    from ..net.zenoh_bus import read_zenoh_file
+class MemberOptions(NamedTuple):
+    """The options by which a process takes part in a session."""
 
-    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    connection = resolve_member_connection(listen, connect, routers, file, listen_else, connect_else)
-    return secure_connection(connection, keys, insecure=insecure)
+    listen: ListenOption = None
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
+    insecure: InsecureOption = False
+
+    def find_endpoints(
+        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+    ) -> "Connection":
+        """Returns where it listens and what it connects to, by default these; without its keys."""
+        from ..net.connection import resolve_member_connection
+        from ..net.zenoh_bus import read_zenoh_file
+
+        file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
+        ways = self.listen, self.connect, self.router, file
+        return resolve_member_connection(*ways, listen_else, connect_else)
+
+    def resolve(
+        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+    ) -> "Connection":
+        """Returns how it takes part, by default at these endpoints; with its keys."""
+        from ..net.connection import secure_connection
+
+        connection = self.find_endpoints(listen_else, connect_else)
+        return secure_connection(connection, self.keys, insecure=self.insecure)
 
 
-def resolve_client_connection(
-    connect: list[str] | None,
-    routers: list[str] | None,
-    zenoh_config: Path | None,
-    keys: Path | None,
-    *,
-    operates: bool = True,
-) -> "Connection":
-    """Returns how a command reaches a session of which it is no member, by its options.
+class Reach(NamedTuple):
+    """The options by which a command reaches a session of which it is no member."""
 
-    Keys must be the operator's, unless every member may do what the command does (`operates` is False).
-    """
-    from ..net.access_rules import OPERATOR
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
 
-    connection = resolve_connection(None, connect, routers, zenoh_config, [], None, keys)
-    return connection.require(OPERATOR) if operates else connection
+    def resolve(self, *, operates: bool = True) -> "Connection":
+        """Returns the connection; its keys are the operator's, unless `operates` is False."""
+        from ..net.access_rules import OPERATOR
+
+        connection = MemberOptions(None, *self).resolve()
+        return connection.require(OPERATOR) if operates else connection
+
+
+class LawFiles(NamedTuple):
+    """The options that let files run as the laws that a log names."""
+
+    law: LawFilesOption = None
+    other_version: OtherVersionOption = False
+    remember: RememberOption = False
+
+    def open(self, *files: Path, runs_them: bool = True) -> "Log":
+        """Returns a log; warns of code from outside that its execution runs, or may not run."""
+        allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
+        log = terminal.open_with_progress(*files, **allowed)
+        if runs_them:
+            terminal.warn_user_laws(log)
+        return log
+
+
+def spread(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a command with an option for every field of its parameters that are tuples of options."""
+    given = inspect.signature(run).parameters
+    kinds = {n: p.annotation for n, p in given.items() if p.annotation in (MemberOptions, Reach, LawFiles)}
+    parameters = [
+        inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, outer in given.items()
+        for inner in (inspect.signature(kinds[name]).parameters.values() if name in kinds else [outer])
+    ]
+
+    @wraps(run)
+    def gather(**values: Any) -> Any:
+        for name, kind in kinds.items():
+            values[name] = kind(*map(values.pop, kind._fields))
+        return run(**values)
+
+    vars(gather)["__signature__"] = inspect.Signature(parameters)
+    gather.__annotations__ = {one.name: one.annotation for one in parameters}
+    return gather
 
 
 ResultsOption = Annotated[

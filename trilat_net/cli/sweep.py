@@ -16,7 +16,8 @@ import typer
 from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from . import options
-from .test import parse_seeds
+from .options import flag, value
+from .studies import parse_seeds, run_apart
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
@@ -106,18 +107,9 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
 
 
 def _run_live(name: str, scenario: "Scenario", cell: str) -> "LiveSession":
-    """Runs the scenario of a cell over a network, in a folder of its own."""
-    from sites.demo_session import run_demo
-
-    from ..files import make_results_folder
     from ..studies.sweep.live_confirmation import LiveSession
 
-    folder = make_results_folder(None, f"confirm-{name}-{cell}", force=False)
-    terminal.print_text(f"{cell}: {scenario.duration_s:g} s live, into {folder}")
-    outcome = run_demo(scenario, folder, terminal.out)
-    if outcome.interrupted:
-        terminal.err.print("interrupted")
-        raise typer.Exit(128 + outcome.interrupted)
+    outcome = run_apart(scenario, cell, f"confirm-{name}-{cell}")
     return LiveSession(outcome.log, outcome.problems)
 
 
@@ -257,29 +249,26 @@ def sweep_command(
     ] = None,
     over: Annotated[
         list[str] | None,
-        options.value(
+        value(
             "--over",
             "KEY=VALUES",
             "An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.",
         ),
     ] = None,
     seeds: Annotated[
-        str | None,
-        options.value("--seeds", "N|LIST", "How many seeds, or a list, as in 1..20; default: one."),
+        str | None, value("--seeds", "N|LIST", "How many seeds, or a list, as in 1..20; default: one.")
     ] = None,
     law: Annotated[
-        str | None, options.value("--law", "LAW,LAW...", "Sweep laws as well; default: the scenario's.")
+        str | None, value("--law", "LAW,LAW...", "Sweep laws as well; default: the scenario's.")
     ] = None,
     duration: options.DurationOption = None,
     longest: Annotated[
         float | None,
-        options.value(
-            "--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."
-        ),
+        value("--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."),
     ] = None,
     judge: Annotated[
         str,
-        options.value(
+        value(
             "--judge",
             "verdict|twins",
             "What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.",
@@ -287,24 +276,23 @@ def sweep_command(
     ] = "verdict",
     output: Annotated[
         Path | None,
-        options.value(
+        value(
             "-o --out",
             "DIR",
             "Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
         ),
     ] = None,
-    resume: Annotated[Path | None, options.value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
+    resume: Annotated[Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
     cell: Annotated[
-        int | None, options.value("--cell", "N", "With results: print the commands that make logs of a cell.")
+        int | None, value("--cell", "N", "With results: print the commands that make logs of a cell.")
     ] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Run an oversized sweep.")] = False,
+    yes: Annotated[bool, flag("--yes", "Run an oversized sweep.")] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[bool, _option("--map", help="Draw the stability map with theory lines.")] = False,
     width: Annotated[
-        float | None,
-        _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column."),
+        float | None, _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column.")
     ] = None,
     margin: Annotated[
         str | None,
@@ -315,8 +303,7 @@ def sweep_command(
         ),
     ] = None,
     tolerance: Annotated[
-        float,
-        _option("--tolerance", metavar="SHARE", help="Width of an edge relative to its value."),
+        float, _option("--tolerance", metavar="SHARE", help="Width of an edge relative to its value.")
     ] = 0.005,
     confirm: Annotated[
         int | None,

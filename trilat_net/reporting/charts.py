@@ -21,7 +21,7 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from . import style
-from .figures import arm_poses, loop_timing, sample_age
+from .figures import age_and_lateness, arm_poses
 from .palette import DARK_SITE_COLOURS, list_site_colours
 
 BUCKET_BUDGET = 48_000
@@ -77,13 +77,15 @@ class Charts:
     def _table(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> int:
         """Stores the columns of a site, decimated together, and returns the number of the table."""
         trace = decimate(tick, t_s, values, self._buckets)
-        self._tables.append(
-            {
-                "rate_hz": self._log.scenario.sites[site].rate_hz,
-                "tick": _packed(trace.tick.astype("<i4")),
-                "columns": [_packed(column.astype("<f4")) for column in trace.values.T],
-            }
-        )
+        return self._store(site, trace.tick, trace.values)
+
+    def _store(self, site: str, tick: Ints, values: NDArray[Any]) -> int:
+        table = {
+            "rate_hz": self._log.scenario.sites[site].rate_hz,
+            "tick": _packed(tick, "<i4"),
+            "columns": [_packed(column, "<f4") for column in values.T],
+        }
+        self._tables.append(table)
         return len(self._tables) - 1
 
     def _site_table(self, site: str, values: NDArray[Any]) -> int:
@@ -165,9 +167,9 @@ class Charts:
     def _timing(self) -> Iterator[JsonObject]:
         log = self._log
         yield from self._ages()
-        if sample_age.has_varying_delay(log):
+        if age_and_lateness.has_varying_delay(log):
             yield from self._distributions()
-        if not loop_timing.explain_missing_loop_times(log):
+        if not age_and_lateness.explain_missing_loop_times(log):
             tables = self._tables_of(lambda part: part.late_us[:, np.newaxis] * 1e-3)
             series = [columns[0] for columns in tables.values()]
             yield _chart("timing", "wake-up after the deadline", "ms", series, zero=True)
@@ -181,7 +183,7 @@ class Charts:
             series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)]
             lines = self._stated(site)
             drawn = np.concatenate([age_ms.ravel(), [line["value"] for line in lines]])
-            axis = {"margin": 0.025, "log": sample_age.needs_log_axis(drawn)}
+            axis = {"margin": 0.025, "log": age_and_lateness.needs_log_axis(drawn)}
             title = f"age of the samples that {site} uses"
             yield _chart("ages", title, "ms", series, lines=lines, sites=[site], links=True, **axis)
 
@@ -191,7 +193,7 @@ class Charts:
         lines: list[JsonObject] = []
         for peer in log[site].peers:
             states = list_stated_models(log, f"{peer}->{site}", self._changes)
-            t_s, mean_ms = sample_age.stated_delay_line(log, states)
+            t_s, mean_ms = age_and_lateness.stated_delay_line(log, states)
             for start, end, value in zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True):
                 if np.isfinite(value):
                     line = {"value": value, "colour": log.sites.index(peer), "from": start, "to": end}
@@ -200,29 +202,27 @@ class Charts:
         return [{"value": lines[0]["value"], "colour": LIMIT_COLOUR}] if same else lines
 
     def _distributions(self) -> Iterator[JsonObject]:
-        found = sample_age.measure_delay_distributions(self._log)
-        x_ms = sample_age.delay_axis_ms(found)
+        found = age_and_lateness.measure_delay_distributions(self._log)
+        x_ms = age_and_lateness.delay_axis_ms(found)
         for site in self._log.sites:
             series = []
             for link in (link for link in found if link.site == site):
                 for name, values, dash in (("age", link.age_ms, False), ("delay", link.delay_ms, True)):
-                    percent = _packed(sample_age.cumulative_percent(values, x_ms).astype("<f4"))
+                    percent = _packed(age_and_lateness.cumulative_percent(values, x_ms), "<f4")
                     entry = {"label": f"{name}, {link.peer}", "values": percent, "dash": dash}
                     series.append({**entry, "colour": self._log.sites.index(link.peer)})
             title = f"delay and age on the way to {site}"
-            yield _chart(
-                "delays", title, "ms", series, x=_packed(x_ms.astype("<f4")), log=bool(x_ms[0] > 0.0)
-            )
+            yield _chart("delays", title, "ms", series, x=_packed(x_ms, "<f4"), log=bool(x_ms[0] > 0.0))
 
     def _histograms(self) -> Iterator[JsonObject]:
         log = self._log
-        edges = loop_timing.loop_time_bin_edges(log)
+        edges = age_and_lateness.loop_time_bin_edges(log)
         periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
         titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
         for field, title in titles.items():
             series: list[JsonObject] = []
             for n, site in enumerate(log.sites):
-                counts = loop_timing.bin_loop_times(getattr(log[site], field), edges).tolist()
+                counts = age_and_lateness.bin_loop_times(getattr(log[site], field), edges).tolist()
                 series.append({"label": site, "colour": n, "counts": counts})
             axis = {"edges": edges.tolist(), "periods": periods}
             yield _chart("timing", f"{title}, histogram", "µs", series, **axis)
@@ -249,14 +249,8 @@ class Charts:
         )
         factor = picture_scale(self._log, self._bounds_m)
         points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * factor
-        self._tables.append(
-            {
-                "rate_hz": self._log.scenario.sites[site].rate_hz,
-                "tick": _packed(part.tick[rows].astype("<i4")),
-                "columns": [_packed(column.astype("<f4")) for column in points.reshape(len(rows), -1).T],
-            }
-        )
-        return {"points": points.shape[2], "table": len(self._tables) - 1}
+        table = self._store(site, part.tick[rows], points.reshape(len(rows), -1))
+        return {"points": points.shape[2], "table": table}
 
 
 def _chart(section: str, title: str, unit: str, series: list[JsonObject], **options: Any) -> JsonObject:
@@ -277,5 +271,5 @@ def picture_scale(log: Log, bounds_m: arm_poses.PictureBox) -> float:
     return PICTURE_SIDE / max(right - left, top - bottom)
 
 
-def _packed(column: NDArray[Any]) -> str:
-    return base64.b64encode(np.ascontiguousarray(column).tobytes()).decode()
+def _packed(column: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(column.astype(kind)).tobytes()).decode()

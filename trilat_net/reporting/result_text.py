@@ -5,6 +5,7 @@ the rooms below have a module here.
 """
 
 from collections.abc import Iterable
+from functools import partial
 from html import escape
 from importlib import import_module
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from typing import NamedTuple
 from rich.text import Text
 
 from ..results import Result
-from .terminal_output import sanitize
+from .terminal_output import MAX_LETTERS, sanitize
 from .text_table import TextTable
 
 
@@ -29,60 +30,54 @@ class MarkedText(NamedTuple):
     text: str
     failed: bool = False
 
-    @property
-    def plain(self) -> str:
-        """The line without colours."""
-        return f"{Text.from_markup(self.mark).plain} {self.text}" if self.mark else self.text
+    def lines(self) -> list[str]:
+        """Returns it without colours, as a line."""
+        return [f"{Text.from_markup(self.mark).plain} {self.text}" if self.mark else self.text]
+
+    def html(self) -> str:
+        """Returns it in HTML."""
+        text = escape(sanitize(self.lines()[0], MAX_LETTERS))
+        return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
 
 
 Block = str | MarkedText | TextTable
+"""A part of a result's text; "" is an empty line."""
 
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
     "LinearAnalysis": "linear_text:compose_linear",
     "Log": "summary_text:compose_log",
-    "LogCheckReport": "checks_text:compose_verification",
-    "LogCheckResult": "checks_text:compose_log_check",
+    "LogCheckReport": "summary_text:compose_verification",
+    "LogCheckResult": "summary_text:compose_log_check",
     "LogMetrics": "metrics_text:compose_metrics",
     "DoctorReport": "session_text:compose_doctor",
     "FileOverview": "overview_tables:compose_overview",
     "NetworkBenchmark": "session_text:compose_benchmark",
     "PingReport": "session_text:compose_ping",
-    "Recovery": "checks_text:compose_recovery",
+    "Recovery": "summary_text:compose_recovery",
     "PushedTwins": "certificate_text:compose_twins",
-    "Rerun": "rerun_text:compose_rerun",
+    "Rerun": "summary_text:compose_rerun",
 }
 """By type what composes its text."""
 
 
-def compose(result: Result) -> Iterable[Block]:
-    """Returns the lines and tables of a result, in order; "" is an empty line."""
+def compose(result: Result) -> list[MarkedText | TextTable]:
+    """Returns the lines and tables of a result, in order."""
     own = getattr(result, "blocks", None)
-    if own is not None:
-        return list(own())
-    known = next(one.__name__ for one in type(result).__mro__ if one.__name__ in _COMPOSERS)
-    module, _, name = _COMPOSERS[known].partition(":")
-    return list(getattr(import_module(f"{__package__}.{module}"), name)(result))
+    if own is None:
+        known = next(one.__name__ for one in type(result).__mro__ if one.__name__ in _COMPOSERS)
+        module, _, name = _COMPOSERS[known].partition(":")
+        own = partial(getattr(import_module(f"{__package__}.{module}"), name), result)
+    blocks: Iterable[Block] = own()
+    return [MarkedText("", block) if isinstance(block, str) else block for block in blocks]
 
 
 def summarize(result: Result) -> str:
     """Returns a result as plain text."""
-    lines: list[str] = []
-    for block in compose(result):
-        if isinstance(block, TextTable):
-            lines += block.lines() if any(block.titles) else block.lines()[1:]
-        else:
-            lines.append(block.plain if isinstance(block, MarkedText) else block)
-    return "\n".join(sanitize(line, 4000) for line in lines).strip("\n")
+    lines = (line for block in compose(result) for line in block.lines())
+    return "\n".join(sanitize(line, MAX_LETTERS) for line in lines).strip("\n")
 
 
 def render_html(result: Result) -> str:
     """Returns a result as HTML, with its tables as such."""
-    parts = []
-    for block in compose(result):
-        if isinstance(block, TextTable):
-            parts.append(block.html())
-        else:
-            text = sanitize(block.plain if isinstance(block, MarkedText) else block, 4000)
-            parts.append(f'<div style="white-space:pre-wrap">{escape(text) or "&nbsp;"}</div>')
-    return "\n".join(parts)
+    return "\n".join(block.html() for block in compose(result))

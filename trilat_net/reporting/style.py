@@ -1,14 +1,16 @@
 """Style of all figures: colours per site, line styles, axes, legends, and files that are equal byte for byte.
 
-Sites beyond the palette differ by dashes.
+Sites beyond the palette differ by dashes. A figure over the time of a run has panels, a line per site, event
+markers, time axis and legend.
 
 Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold no date, and
-fonts are embedded as TrueType.
+fonts are embedded as TrueType. A run without events has figures without markers; these show hold, brake and
+return of sites and applied changes.
 """
 
 import io
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,12 +25,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ..analysis.timeline import recorded_end_s
+from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
 from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..files import write_whole
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
 from ..scenario.arms import TASK_AXES
 from .figure_size import REPORT_SIZE, FigureSize
 from .palette import SITE_COLOURS, list_site_colours
@@ -210,12 +213,12 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class JointPanels(NamedTuple):
-    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and wide ones."""
+    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and a wide one."""
 
     joints: list[Axes]
     columns: int
     lowest: list[Axes]
-    wide: dict[str, Axes]
+    below: Axes | None
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
@@ -226,16 +229,14 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     return [places[first : first + columns] for first in range(0, len(places), columns)]
 
 
-def add_joint_panels(
-    figure: Figure, joints: int, form: FigureSize, above: Sequence[str] = (), below: Sequence[str] = ()
-) -> JointPanels:
-    """Returns a panel per joint, and wide ones above and below them by their names.
+def add_joint_panels(figure: Figure, joints: int, form: FigureSize, below: str = "") -> JointPanels:
+    """Returns a panel per joint, and below them a wide one if it has a name.
 
     Two joints share their axis of values; of more, each has its own, since wrists bear less than shoulders.
     """
     grid = arrange_joints(joints, form.narrow)
     columns = len(grid[0])
-    rows = [[name] * columns for name in above] + grid + [[name] * columns for name in below]
+    rows = [*grid, *([[below] * columns] if below else [])]
     panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
     made = [panels[str(n)] for n in range(joints)]
     for upper, lower in zip(made, made[columns:], strict=False):
@@ -244,7 +245,7 @@ def add_joint_panels(
     if joints == 2:
         made[1].sharey(made[0])
         made[1].tick_params(labelleft=False)
-    return JointPanels(made, columns, made[-columns:], {name: panels[name] for name in (*above, *below)})
+    return JointPanels(made, columns, made[-columns:], panels.get(below))
 
 
 def typeset(text: str) -> str:
@@ -314,3 +315,111 @@ def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
     with mpl.rc_context(_FILE_RC):
         drawn.savefig(drawing, format=kind, dpi=dpi, metadata=_UNDATED[kind])
     write_whole(path, drawing.getvalue())
+
+
+MOST_EXPLAINED_CHANGES = 12
+"""Changes that a figure explains; the page lists all of them."""
+
+SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
+"""Ticks, shape (K,), times, shape (K,), s, and values, shape (K, J), of a site."""
+
+_AWAY, _BACK = 0.22, 0.09
+_LETTERS_PER_IN = 120.0
+"""Of 1 pt type, on the average."""
+_MODE_VERBS = {
+    "hold": "holds",
+    "brake": "brakes",
+    "return": "returns (lighter)",
+    "waiting": "waits",
+    "fault": "is in fault",
+    "stopped": "is stopped",
+}
+_CHANGE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
+_NUMBER: dict[str, Any] = {
+    "xytext": (1.5, -0.5),
+    "textcoords": "offset points",
+    "va": "top",
+    "color": REFERENCE,
+    "bbox": {"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
+}
+
+
+def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
+    """Returns the signal of all sites whose values follow from their records."""
+    return lambda site: (log[site].tick, log[site].t_s, values(log[site]))
+
+
+@contextmanager
+def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
+    """Yields an empty figure in the style of all figures."""
+    with figure_style(form):
+        yield TimeFigure(log, form, height_in)
+
+
+class TimeFigure:
+    """A figure of a log over time."""
+
+    def __init__(self, log: Log, form: FigureSize, height_in: float) -> None:
+        self.log = log
+        self.figure = new_figure(height_in, form.width_in)
+        self._small_pt = form.small_pt
+        self._changes = list(enumerate(list_changes(log), 1))
+        self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
+
+    def trace(self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any) -> None:
+        """Draws values over the records of a site, shape (K,); `options` replace those of the site's line."""
+        part = self.log[site]
+        line = {**site_line(self.log, site, width), **options}
+        plot_decimated(axes, part.tick, part.t_s, values, **line)
+
+    def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
+        """Draws a signal of sites: a panel per joint, a line per site, markers."""
+        for site in sites:
+            tick, t_s, values = signal(site)
+            for axes, one in zip(row, values.T, strict=False):
+                plot_decimated(axes, tick, t_s, one, **site_line(self.log, site))
+        for axes in row:
+            self.mark(axes, sites)
+            if len(row) > 2:
+                flatten_rounding(axes)
+
+    def mark(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
+        """Marks a panel: shaded in the color of a site while it does not follow its peers, lines at changes.
+
+        Changes are those that the sites carried out, or of these those of one link.
+        """
+        for site in sites:
+            colour = site_colour(self.log, site)
+            for mode, from_s, to_s in self._modes[site]:
+                depth = _BACK if mode == "return" else _AWAY
+                axes.axvspan(from_s, to_s, color=colour, alpha=depth, linewidth=0.0, zorder=0.5)
+        for n, changed in self._changes:
+            if changed.site not in sites or (link and changed.change.link != link):
+                continue
+            at_s, place = changed.change.at_s, axes.get_xaxis_transform()
+            axes.axvline(at_s, zorder=0.6, **_CHANGE)
+            if numbered:
+                axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)
+
+    def finish(
+        self, lowest: Sequence[Axes], entries: LegendEntries, *, links: bool = False, title: str = ""
+    ) -> None:
+        """Gives the lowest panels their time axis, the figure its legend, and explains its markers.
+
+        With `links`, only changes of links are marked; the title stands above the legend.
+        """
+        set_time_axis(self.log, lowest)
+        add_legend(self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {}))
+        marked = [(n, c) for n, c in self._changes if c.change.link or not links]
+        words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
+        if len(marked) > MOST_EXPLAINED_CHANGES:
+            words.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
+        letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
+        lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
+        modes = {interval.mode for intervals in self._modes.values() for interval in intervals}
+        if modes:
+            doing = ", ".join(text for mode, text in _MODE_VERBS.items() if mode in modes)
+            lines += textwrap.wrap(f"Shaded in the color of a site: it {doing}", letters)
+        if lines:
+            text = typeset("\n".join(lines))
+            self.figure.supxlabel(text, x=0.01, ha="left", fontsize=self._small_pt, color=REFERENCE)

@@ -1,6 +1,6 @@
-"""Summary of a run in lines for the terminal.
+"""What is found of a run, as text: its summary, the checks of its log, a recovery, a rerun.
 
-Links, changes, modes, clocks, and messages of user laws and arms.
+The summary has links, changes, modes, clocks, and messages of user laws and arms.
 
 Invariant: a link with one constant delay and no loss gets no line.
 """
@@ -10,8 +10,13 @@ from collections.abc import Iterator, Sequence
 from ..analysis.health import ClockSummary, summarise_clock
 from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
+from ..execution.log_checks import LogCheckReport
+from ..execution.rerun import LinkEffect, LogAndRerun, Rerun
+from ..execution.rerun_request import describe_rerun_changes
 from ..log.log_reader import Log
-from .result_text import Block
+from ..log.recover import Recovery
+from ..log.session_check import LogCheckResult
+from .result_text import Block, MarkedText
 from .text_table import TextTable
 
 MOST_LINES = 12
@@ -19,6 +24,10 @@ MOST_LINES = 12
 MOST_LINE_CHARACTERS = 400
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
 """Kinds of the events about user laws and external arms."""
+_MAX_PLACES = 10
+"""Places of a failed check that are listed; the JSON has all."""
+_MAX_LOSSES = 10
+"""Losses that are listed."""
 
 
 def compose_log(log: Log) -> Iterator[Block]:
@@ -160,3 +169,104 @@ def _losses(use: LinkSummary, counts: SampleCounts) -> str:
 def _first(lines: list[str]) -> list[str]:
     more = len(lines) - MOST_LINES
     return lines if more <= 0 else [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
+
+
+def compose_verification(found: LogCheckReport) -> Iterator[Block]:
+    """Yields a line per check, and of a log that passed those of its run."""
+    for line in found.lines:
+        yield MarkedText("", f"{line.check}: {line.text}", failed=not line.passed)
+    if found.passed:
+        yield from format_run_lines(found.log)
+
+
+def compose_log_check(found: LogCheckResult) -> Iterator[Block]:
+    """Yields a line per check, and the places where it failed."""
+    for finding in found.findings:
+        mark = "[green]ok[/green]  " if finding.passed else "[red]FAIL[/red]"
+        yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
+        if finding.wrong == 1 and str(finding.places[0]) in finding.text:
+            continue
+        for place in finding.places[:_MAX_PLACES]:
+            where = f"{place.file}: " if len(found.files) > 1 and place.file else ""
+            yield f"       {where}{place}"
+        if finding.wrong > _MAX_PLACES:
+            yield f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}"
+
+
+def compose_recovery(found: Recovery) -> Iterator[Block]:
+    """Yields what was recovered and what was lost."""
+    how = "was finished" if found.finished else "was not finished"
+    yield f"{found.output}: made of {found.path}, which {how}"
+    rows = []
+    if there := found.coverage.judged:
+        rows.append(("records", ", ".join(f"{site} {count}" for site, count in there.items())))
+        rows.append(("of the run", str(found.coverage)))
+        rows.append(("source", f"digest chain {found.chain}"))
+    rows.append(("messages", f"{found.messages} in {found.duration_s:.3f} s"))
+    for name, lines in (("lost", found.lost), ("missing", found.missing)):
+        rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]
+        if len(lines) > _MAX_LOSSES:
+            rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
+    yield TextTable(("", ""), [(f"  {name}", text) for name, text in rows])
+
+
+def compose_rerun(again: Rerun) -> Iterator[Block]:
+    """Yields what was executed with which changes, a table of the sites, and the other effects."""
+    asked = again.request
+    others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
+    yield f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}"
+    for line in describe_rerun_changes(asked) or ["nothing is changed: this is the experiment of the log"]:
+        yield f"  {line}"
+    yield _tabulate_sites(again)
+    yield from _describe_effects(again)
+    yield from (f"note: {note}" for note in again.notes)
+
+
+def _tabulate_sites(again: Rerun) -> TextTable:
+    headers = ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here")
+    rows = []
+    for effect in again.sites.values():
+        figures = (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm)
+        cells = [cell for pair in figures for cell in _cells(pair)]
+        rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
+    return TextTable(("site", *headers), rows, align="lr")
+
+
+def _cells(pair: LogAndRerun | None) -> list[str]:
+    return ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
+
+
+def _describe_effects(again: Rerun) -> list[str]:
+    """Returns the other effects on sites and links, a sentence each."""
+    lines = []
+    for effect in again.sites.values():
+        if effect.q_max_rad:
+            most, at_s, rms = effect.q_max_rad, effect.q_max_at_s, effect.q_rms_rad
+            lines.append(
+                f"{effect.site}: q is up to {most:.3g} rad off the log, at {at_s:.3f} s; {rms:.3g} rad rms"
+            )
+        if effect.first is not None:
+            first = effect.first
+            at_s = first.tick / again.request.scenario.sites[effect.site].rate_hz
+            was, now = _values(first.logged, first.computed)
+            where = f"tick {first.tick} ({at_s:.3f} s)"
+            lines.append(
+                f"{effect.site}: the first difference is at {where}: {first.field} was {was}, is {now}"
+            )
+        if effect.diverged_at_s is not None:
+            lines.append(f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there")
+    return lines + [_link_line(link) for link in again.links.values() if link.differs]
+
+
+def _values(before: object, after: object) -> tuple[str, str]:
+    """Returns two values, with as many digits as tell them apart."""
+    short = tuple(f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after))
+    return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
+
+
+def _link_line(link: LinkEffect) -> str:
+    mean, largest = link.age_mean_ms, link.age_max_ms
+    before, after = (
+        f"{a:.4g} ms old on average, {b:.4g} ms at most" for a, b in zip(mean, largest, strict=True)
+    )
+    return f"link {link.link}: samples in use were {before}; are {after}"

@@ -52,7 +52,7 @@ PATIENCE_S = 1.0
 _EVERY_S = 0.1
 _MAX_DAMAGED = 3
 """Damaged parts that are listed."""
-_MAX_LETTERS = 4000
+MAX_LETTERS = 4000
 """Of a line."""
 _PIPE_WIDTH = 160
 """Columns that output has at least where it is no terminal."""
@@ -64,24 +64,24 @@ def sanitize(text: object, most: int = 300) -> str:
     return plain if len(plain) <= most else plain[:most] + "..."
 
 
-def print_text(text: object) -> None:
-    """Prints a line as it is, sanitized."""
-    out.print(sanitize(text, _MAX_LETTERS), markup=False, soft_wrap=True)
+def print_text(text: object, console: Console = out, head: str = "") -> None:
+    """Prints a line as it is, sanitized, behind a head."""
+    console.print(head + sanitize(text, MAX_LETTERS), markup=False, soft_wrap=True)
 
 
 def print_note(text: object) -> None:
     """Prints a note to standard error."""
-    err.print(f"note: {sanitize(text, _MAX_LETTERS)}", markup=False, soft_wrap=True)
+    print_text(text, err, "note: ")
 
 
 def print_error(text: object) -> None:
     """Prints an error to standard error."""
-    err.print(f"error: {sanitize(text, _MAX_LETTERS)}", markup=False, soft_wrap=True)
+    print_text(text, err, "error: ")
 
 
 def print_marked(mark: str, text: object) -> None:
     """Prints a line behind a mark, which is of Rich's markup."""
-    out.print(f"{mark} {escape(sanitize(text, _MAX_LETTERS))}", soft_wrap=True)
+    out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
 def print_paths(paths: Iterable[Path]) -> None:
@@ -119,14 +119,10 @@ def print_result(found: "Result", *, as_json: bool = False) -> None:
     for block in compose(found):
         if isinstance(block, TextTable):
             print_table(block)
-        elif isinstance(block, str):
-            print_text(block)
         elif block.mark:
             print_marked(block.mark, block.text)
         else:
-            (err if block.failed else out).print(
-                sanitize(block.text, _MAX_LETTERS), markup=False, soft_wrap=True
-            )
+            print_text(block.text, err if block.failed else out)
 
 
 @contextmanager
@@ -190,13 +186,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         display.stop()
 
 
-def open_with_progress(
-    first: Path,
-    *more: Path,
-    law: list[Path] | None = None,
-    other_version: bool = False,
-    remember: bool = False,
-) -> "Log":
+def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
     """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns of damage.
 
     Raises:
@@ -205,7 +195,6 @@ def open_with_progress(
     from ..log.log_reader import open_log
 
     with progress_bar(f"reading {first}") as progress:
-        allowed: Any = {"law": law or (), "other_version": other_version, "remember": remember}
         log = open_log(first, *more, progress=progress, **allowed)
     for path in (first, *more):
         warn_if_unfinished(path)

@@ -81,9 +81,11 @@ class TextTable(NamedTuple):
         return f"<table>{head}<tbody>{''.join(line(row, 'td') for row in self.rows)}</tbody></table>"
 
     def lines(self) -> list[str]:
-        """Returns its lines with columns aligned by spaces; the first holds the headers."""
-        table = [self.titles, *self.rows]
-        widths = [max(len(row[n]) for row in table if n < len(row)) for n in range(len(self.headers))]
+        """Returns its lines with columns aligned by spaces; the first holds the headers, if there are any."""
+        table = [self.titles, *self.rows] if any(self.titles) else self.rows
+        widths = [
+            max((len(row[n]) for row in table if n < len(row)), default=0) for n in range(len(self.headers))
+        ]
         return [
             "  ".join(
                 cell.rjust(width) if right else cell.ljust(width)

@@ -20,7 +20,6 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
-from .time_figure import time_figure
 
 _PARTS = {
     "kinetic": "r'Mr / 2",
@@ -51,7 +50,7 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
     balance = certificate.balance
     if balance is None:
         return style.empty_figure(certificate.verdict.text, form)
-    with time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
+    with style.time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
         rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
         _draw_functional_of_sites(log, certificate, balance, rows[0])
         _draw_parts(balance, rows[1], form)
@@ -79,7 +78,7 @@ def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = 
     panels = [kind for kind in _OBSERVED_PANELS if kind in kinds]
     if not panels:
         return style.empty_figure(observed.text, form)
-    with time_figure(log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8) as plot:
+    with style.time_figure(log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8) as plot:
         rows = style.add_panels(plot.figure, len(panels), 1, sharex=True)[:, 0]
         at = dict(zip(panels, rows, strict=True))
         for one in observed.curves:

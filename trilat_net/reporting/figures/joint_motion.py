@@ -1,7 +1,9 @@
-"""Figures of joint signals: torques, angles, errors, settling, phase portrait and parameter estimates.
+"""Figures of the arms' signals: torques, angles, errors, settling, estimates, paths, shares, contact.
 
 Invariant: torques of operators are those ON the arm, the negative of the record's tau_x. Settling times are
-those of `analysis.site_signals`.
+those of `analysis.site_signals`. Dominance factors follow from the scenario and the changes in the records,
+Eq. (6) and (7), wall forces from the scenario's walls at the logged states; `analysis.torque_sources` has the
+equations.
 """
 
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis.arm_rows import build_arm_rows
+from ...analysis.dominance_history import trace_dominance
 from ...analysis.site_signals import (
     SETTLED_ERROR_RAD,
     controller_torques,
@@ -30,13 +33,14 @@ from ...analysis.site_signals import (
     sites_with_operator,
     true_parameters,
 )
+from ...analysis.timeline import list_changes
+from ...analysis.torque_sources import list_walls, wall_depth, wall_force
 from ...core.chain import LINK_PARAMETERS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
-from .time_figure import SiteSignal, TimeFigure, site_records, time_figure
 
 _ROW_IN = 1.2
 """Height of a row of panels, where there are several."""
@@ -53,7 +57,7 @@ _STEP = 0.01
 
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques of the operators ON the arms over time, N m; Fig. 3 of the paper."""
-    signal = site_records(log, external_torques)
+    signal = style.site_records(log, external_torques)
     return _draw_joints(log, form, sites_with_operator(log), signal, "torque on the arm (N m)")
 
 
@@ -77,7 +81,7 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         stated = np.broadcast_to(log.scenario.sites[site].limits.tau_limit_nm, largest.shape)
         if (largest >= stated).any():
             limits[site] = stated
-    signal = site_records(log, controller_torques)
+    signal = style.site_records(log, controller_torques)
     return _draw_joints(log, form, log.sites, signal, "control torque (N m)", [*limits.values()])
 
 
@@ -85,14 +89,14 @@ def _draw_joints(
     log: Log,
     form: FigureSize,
     sites: Sequence[str],
-    signal: SiteSignal,
+    signal: style.SiteSignal,
     label: str,
     limits: Sequence[Array] = (),
 ) -> Figure:
     """Returns a signal over time: a panel per joint, a line per site, dashed ones at its limits."""
     count = len(style.name_joints(log))
     rows = len(style.arrange_joints(count, form.narrow))
-    with time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
+    with style.time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
         panels = style.add_joint_panels(plot.figure, count, form)
         style.title_joints(log, panels.joints)
         plot.joint_row(panels.joints, sites, signal)
@@ -110,7 +114,7 @@ def _draw_joints(
 
 
 def _add_joint_rows(
-    plot: TimeFigure, form: FigureSize, heads: Sequence[str], labels: Sequence[str], sharey: str
+    plot: style.TimeFigure, form: FigureSize, heads: Sequence[str], labels: Sequence[str], sharey: str
 ) -> tuple[list[list[Axes]], list[Axes]]:
     """Returns panels per quantity and joint, and the lowest of them.
 
@@ -141,13 +145,13 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     if not form.narrow:
         heads = ("torque on the arm (N m)", "joint angle (rad)")
     height_in = 2.9 if form.narrow else 3.4
-    with time_figure(log, form, _height_in(log, height_in)) as plot:
+    with style.time_figure(log, form, _height_in(log, height_in)) as plot:
         (upper, lower), lowest = _add_joint_rows(plot, form, heads, heads, "none")
         if len(upper) == 2:
             upper[1].sharey(upper[0])
             upper[1].tick_params(labelleft=False)
-        plot.joint_row(upper, sites_with_operator(log), site_records(log, external_torques))
-        plot.joint_row(lower, log.sites, site_records(log, joint_angles))
+        plot.joint_row(upper, sites_with_operator(log), style.site_records(log, external_torques))
+        plot.joint_row(lower, log.sites, style.site_records(log, joint_angles))
         plot.finish(lowest, style.site_legend_entries(log, log.sites))
     return plot.figure
 
@@ -164,7 +168,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     heads = [f"{site}: q (rad)" for site in log.sites]
     entries = [(f"{style.site_title(log, s)}, actual", style.site_line(log, s, 1.6)) for s in log.sites]
     height_in = 0.7 + (0.95 if form.narrow else 1.25) * len(log.sites)
-    with time_figure(log, form, _height_in(log, height_in)) as plot:
+    with style.time_figure(log, form, _height_in(log, height_in)) as plot:
         grid, lowest = _add_joint_rows(plot, form, heads, labels, "col")
         for site, row in zip(log.sites, grid, strict=True):
             actual, desired = joint_angles(log[site]), reference_angles(log[site])
@@ -187,11 +191,12 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     titles, unit = style.name_shared(log), shared_unit(log)
     count = len(titles)
     rows = len(style.arrange_joints(count, form.narrow))
-    with time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, count, form, below=["all"])
-        settling = panels.wide["all"]
+    with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, count, form, below="all")
+        settling = panels.below
+        assert settling is not None
         style.title_joints(log, panels.joints, titles)
-        plot.joint_row(panels.joints, log.sites, site_records(log, joint_errors))
+        plot.joint_row(panels.joints, log.sites, style.site_records(log, joint_errors))
         for axes in panels.joints[:: panels.columns]:
             axes.set_ylabel(f"tracking error ({unit})")
         low = high = SETTLED_ERROR_RAD
@@ -216,7 +221,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     A triangle marks the time at which a site settles; the legend has its value.
     """
     entries = []
-    with time_figure(log, form, 2.4) as plot:
+    with style.time_figure(log, form, 2.4) as plot:
         axes = style.add_panels(plot.figure, 1, 1)[0, 0]
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
@@ -256,7 +261,7 @@ def draw_parameter_estimates(
     if log.scenario.arms[chosen[0]].chain is not None:
         return _draw_link_estimates(log, form, chosen)
     rows = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
-    with time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
+    with style.time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
         panels = plot.figure.subplot_mosaic([[*row] for row in rows])
         for index, (_, unit) in enumerate(log.scenario.arms[chosen[0]].parameters):
             axes = panels[str(index + 1)]
@@ -274,7 +279,7 @@ def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Fi
     arm = max((log.scenario.arms[site] for site in sites), key=lambda each: each.counts.joints)
     columns = LINK_PARAMETERS // (2 if form.narrow else 1)
     rows = len(arm.theta) // columns
-    with time_figure(log, form, 0.8 + 0.74 * rows) as plot:
+    with style.time_figure(log, form, 0.8 + 0.74 * rows) as plot:
         grid = style.add_panels(plot.figure, rows, columns, sharex=True)
         panels: list[Axes] = [*grid.flat]
         for index, (axes, (name, unit)) in enumerate(zip(panels, arm.parameters, strict=True)):
@@ -298,7 +303,7 @@ def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Fi
 
 
 def _draw_estimate(
-    plot: TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
+    plot: style.TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
 ) -> None:
     """Draws the estimates of one parameter, and its true value once if all sites share it."""
     truths = {site: float(true_parameters(plot.log, site)[index]) for site in sites}
@@ -381,3 +386,63 @@ def thin_path(path: Array) -> Array:
     _, first = np.unique(np.floor(length / _STEP), return_index=True)
     kept: Array = path[np.union1d(first, [0, len(path) - 1])]
     return kept
+
+
+def sites_with_changing_dominance(log: Log) -> list[str]:
+    """Returns the sites whose shares change during the run, in scenario order."""
+    changing = {changed.change.dominance for changed in list_changes(log)}
+    return [site for site in log.sites if site in changing]
+
+
+def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the shares that change, and how far every arm is from where it started, rad."""
+    owners = sites_with_changing_dominance(log)
+    titles = style.name_joints(log)
+    rows = len(owners) + len(titles)
+    low = len(titles) > 2
+    with style.time_figure(log, form, 0.8 + (0.8 if low else 1.05) * rows) as plot:
+        column = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
+        for site, axes in zip(owners, column, strict=False):
+            part, peers = log[site], log.scenario.peers(site)
+            alpha = trace_dominance(log, site, part.t_s).alpha
+            for peer, share in zip(peers, alpha.T, strict=True):
+                plot.trace(axes, site, share, **style.site_line(log, peer))
+            axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
+            plot.mark(axes, [site])
+        for site in log.sites:
+            moved = joint_angles(log[site]) - np.array(log.scenario.sites[site].q0_rad)
+            for axes, values in zip(column[len(owners) :], moved.T, strict=False):
+                plot.trace(axes, site, values)
+        for title, axes in zip(titles, column[len(owners) :], strict=True):
+            style.label_row(axes, title, form) if low else axes.set_ylabel(f"{title} (rad)")
+            plot.mark(axes, log.sites)
+        plot.finish([column[-1]], style.site_legend_entries(log, log.sites))
+    return plot.figure
+
+
+def sites_with_walls(log: Log) -> list[str]:
+    """Returns the sites that have a wall in their way, in scenario order."""
+    return [site for site in log.sites if list_walls(log.scenario.sites[site])]
+
+
+def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the normal force of every wall over time, N, above the depth of the end effector in it, mm."""
+    sites = sites_with_walls(log)
+    with style.time_figure(log, form, 2.9) as plot:
+        column = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
+        for site in sites:
+            part, spec = log[site], log.scenario.sites[site]
+            end_effector = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd)
+            walls = list_walls(spec)
+            for wall, dashes in zip(walls, [*style.DASHES] * len(walls), strict=False):
+                depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
+                force = wall_force(wall, part.t_s, end_effector)
+                plot.trace(column[0], site, force, 1.1, linestyle=dashes)
+                plot.trace(column[1], site, depth_mm, 1.1, linestyle=dashes)
+        column[0].set_ylabel("force of wall (N)")
+        column[1].set_ylabel("depth in it (mm)")
+        for axes in column:
+            axes.set_ylim(bottom=0.0)
+            plot.mark(axes, sites)
+        plot.finish([column[-1]], style.site_legend_entries(log, sites))
+    return plot.figure

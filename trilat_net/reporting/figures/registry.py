@@ -5,7 +5,7 @@
 Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -29,13 +29,16 @@ from ...scenario.law_consent import find_user_laws
 from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
 from . import joint_motion
+from .age_and_lateness import (
+    draw_delay_distributions,
+    draw_loop_timing,
+    draw_sample_age,
+    explain_missing_loop_times,
+    has_varying_delay,
+)
 from .arm_poses import draw_arms
-from .authority import draw_authority, sites_with_changing_dominance
 from .certificate_energy import draw_functional, draw_observed_energy
-from .contact_force import draw_contact, sites_with_walls
-from .loop_timing import draw_loop_timing, explain_missing_loop_times
 from .run_overview import draw_overlay, draw_overview
-from .sample_age import draw_delay_distributions, draw_sample_age, has_varying_delay
 from .twin_differences import draw_twins
 
 NO_OPERATOR = "no site has an operator in this run"
@@ -117,13 +120,13 @@ FIGURES = {
     ),
     "contact": FigureEntry(
         "force of the walls, and depth in them",
-        draw_contact,
-        _unless(sites_with_walls, "no site has a wall in this run"),
+        joint_motion.draw_contact,
+        _unless(joint_motion.sites_with_walls, "no site has a wall in this run"),
     ),
     "authority": FigureEntry(
         "shares that change, and the motion of the arms",
-        draw_authority,
-        _unless(sites_with_changing_dominance, "the shares of all sites are constant"),
+        joint_motion.draw_authority,
+        _unless(joint_motion.sites_with_changing_dominance, "the shares of all sites are constant"),
     ),
     "certificate": _ReportEntry(
         "V, its parts, who changed it, the energy balance",
@@ -201,10 +204,9 @@ def write_figures(
     """
     form, wanted = make_print_size(width_in), list(dict.fromkeys(names)) or list_drawable_figures(log)
     kinds = _check_formats(formats)
-    chosen = {name: _find_figure(log, name).draw for name in wanted}
-    for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
-        refuse_existing(path, force=force)
-    return _write(log, make_folder(folder), chosen, form, kinds, progress)
+    chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
+    _refuse_figures(folder, chosen, kinds, force=force)
+    return _write(chosen, folder, form, kinds, progress)
 
 
 def write_overlay(
@@ -221,14 +223,14 @@ def write_overlay(
         UsageError: there is no such width or format, the logs differ in kind, or a file exists.
     """
     form, kinds = make_print_size(width_in), _check_formats(formats)
-    paths = [folder / f"overlay.{kind}" for kind in kinds]
-    for path in paths:
+    chosen = {"overlay": partial(draw_overlay, logs, form)}
+    _refuse_figures(folder, chosen, kinds, force=force)
+    return _write(chosen, folder, form, kinds)
+
+
+def _refuse_figures(folder: Path, names: Iterable[str], kinds: Sequence[str], *, force: bool) -> None:
+    for path in (folder / f"{name}.{kind}" for name in names for kind in kinds):
         refuse_existing(path, force=force)
-    drawn = draw_overlay(logs, form)
-    make_folder(folder)
-    for path in paths:
-        write_figure(drawn, path, form.dpi)
-    return paths
 
 
 def _check_formats(formats: Sequence[str]) -> list[str]:
@@ -251,29 +253,33 @@ def write_report_figures(
     Earlier figures in the folder are replaced. Without `twin`, the same experiment without operators,
     `hands_moved` is left out. Twins that are given are not made again.
     """
-    chosen = {name: FIGURES[name].draw for name in list_drawable_figures(log) if FIGURES[name].in_report}
+    chosen: dict[str, Callable[[], Figure]] = {
+        name: partial(FIGURES[name].draw, log, REPORT_SIZE)
+        for name in list_drawable_figures(log)
+        if FIGURES[name].in_report
+    }
     if twin is None:
         chosen.pop("hands_moved", None)
     else:
-        chosen["hands_moved"] = partial(joint_motion.draw_operator_displacement, twin=twin)
+        chosen["hands_moved"] = partial(joint_motion.draw_operator_displacement, log, twin=twin)
     if pushed is not None and "twins" in chosen:
-        chosen["twins"] = lambda log, form: draw_twins(PushedTwins(log, 0.0, pushed), form)
-    return _write(log, folder, chosen, REPORT_SIZE, ["png"], progress)
+        chosen["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
+    return _write(chosen, folder, REPORT_SIZE, ["png"], progress)
 
 
 def _write(
-    log: Log,
+    chosen: Mapping[str, Callable[[], Figure]],
     folder: Path,
-    chosen: Mapping[str, Draw],
     form: FigureSize,
     kinds: Sequence[str],
-    progress: Progress | None,
+    progress: Progress | None = None,
 ) -> list[Path]:
     paths = []
     for n, (name, draw) in enumerate(chosen.items()):
         if progress is not None:
             progress(n, len(chosen))
-        drawn = draw(log, form)
+        drawn = draw()
+        make_folder(folder)
         for kind in kinds:
             paths.append(folder / f"{name}.{kind}")
             write_figure(drawn, paths[-1], form.dpi)

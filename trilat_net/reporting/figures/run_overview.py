@@ -21,7 +21,6 @@ from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 from ..palette import SITE_COLOURS
-from .time_figure import time_figure
 
 _HEIGHT_IN, _NARROW_HEIGHT_IN = 3.9, 5.6
 _DECADES = 6.0
@@ -62,7 +61,7 @@ _PANELS = (
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns a run in four panels, a line per site, with what the certificate says of it."""
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
-    with time_figure(log, form, height_in) as plot:
+    with style.time_figure(log, form, height_in) as plot:
         panels = _add_panels(plot.figure, log, form)
         for panel, axes in zip(_PANELS, panels, strict=True):
             columns = {site: panel.column(log, site) for site in log.sites}

@@ -22,7 +22,6 @@ from ...core.vectors import Array
 from ...execution.twins import SMALLEST, TwinPath
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
-from .time_figure import time_figure
 
 _POINTS = 150
 """Of a line, about: each is the largest of the time around it."""
@@ -41,7 +40,7 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     log, growth, twins, worst = found.log, found.growth, found.growth.twins, found.growth.worst
     if twins is None or worst is None:
         return style.empty_figure(growth.text, form)
-    with time_figure(log, form, 5.4 if form.narrow else 4.4) as plot:
+    with style.time_figure(log, form, 5.4 if form.narrow else 4.4) as plot:
         above, below = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))[:, 0]
         lines = list(_list_lines(found))
         step = max(1, int((growth.to_s - found.at_s) * BUCKETS_PER_S / _POINTS))

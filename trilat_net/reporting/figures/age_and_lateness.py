@@ -1,6 +1,7 @@
-"""Figures of the links: age of the samples in use over time, and distributions of delay and age.
+"""Figures of links and loops: age of the samples in use, delays, lateness and computing time.
 
-Invariant: a measured link has no line of stated delay; a log of constant links has no distributions.
+Invariant: a measured link has no line of stated delay; a log of constant links has no distributions. Virtual
+time reads no clock, so its figure of the loops gives that reason in place of zeros.
 """
 
 from typing import Any, NamedTuple
@@ -15,14 +16,17 @@ from ...analysis.site_signals import sample_ages_ms
 from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...log.record_columns import Ints
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
-from .time_figure import time_figure
 
 _POINTS = 400
 _TALL = 6.0
 _STEP_MS = 1.5
 """A fall of an age by more is no sample more at a tick."""
+NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
+NO_LOOP_TIMES = "no lateness and no computing time in this log"
+_BINS_PER_DECADE = 20
 
 
 class DelayDistribution(NamedTuple):
@@ -37,7 +41,7 @@ class DelayDistribution(NamedTuple):
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
     lines = {link: stated_delay_line(log, states) for link, states in _stated_models(log).items()}
-    with time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
+    with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
         grid = style.add_panels(plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
         drawn: list[Array] = []
         spread = False
@@ -171,3 +175,62 @@ def _title_link(axes: Axes, peer: str, site: str) -> None:
 
 def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
     return [(f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8)) for site in log.sites]
+
+
+def explain_missing_loop_times(log: Log) -> str:
+    """Returns why there are no times to draw; "" if a lateness or a computing time is not zero."""
+    if any(np.any(log[name].late_us) or np.any(log[name].busy_us) for name in log.sites):
+        return ""
+    return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
+
+
+def loop_time_bin_edges(log: Log) -> Array:
+    """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the logarithm.
+
+    The last edge lies above every time in the log; times below the first, 1 us, count in the first bin.
+    """
+    largest = max(
+        (int(times.max()) for s in log.sites for times in (log[s].late_us, log[s].busy_us) if len(times)),
+        default=1,
+    )
+    decades = np.log10(max(largest, 10) * 1.1)
+    count = int(np.ceil(decades * _BINS_PER_DECADE))
+    edges: Array = np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
+    return edges
+
+
+def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
+    """Returns how many times, shape (K,), us, lie in each bin between `edges`, shape (B + 1,), us."""
+    return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
+
+
+def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns histograms of each site's lateness and computing time, us."""
+    edges = loop_time_bin_edges(log)
+    labels = ("lateness", "computing time")
+    if not form.narrow:
+        labels = ("wake-up after the deadline", "computing time of a tick")
+    with style.styled_figure(form, 0.6 + (1.3 if form.narrow else 1.05) * len(log.sites)) as figure:
+        grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
+        for site, (late, busy) in zip(log.sites, grid, strict=True):
+            _bars(log, site, late, log[site].late_us, edges, form)
+            _bars(log, site, busy, log[site].busy_us, edges, form)
+            late.set_ylabel("ticks (count)")
+        grid[0, 0].set_ylim(bottom=0.7)
+        for axes, text in zip(grid[-1], labels, strict=True):
+            axes.set_xlabel(f"{text} (µs)")
+        style.add_legend(figure, [("one period", style.LIMIT_LINE)])
+    return figure
+
+
+def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize) -> None:
+    axes.set(xscale="log", yscale="log")
+    counts, colour = bin_loop_times(times_us, edges), style.site_colour(log, site)
+    axes.stairs(counts, edges, baseline=0.5, fill=True, color=colour)
+    axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
+    if not len(times_us):
+        style.annotate_empty_panel(axes, f"no times of {site}")
+        return
+    p50, p99, largest = (f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0)))
+    between = "\n" if form.narrow else " "
+    axes.set_title(f"{site}: p50 {p50}, p99 {p99},{between}max {largest} µs", loc="left", pad=2.0)

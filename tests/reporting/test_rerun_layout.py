@@ -5,7 +5,7 @@ from pathlib import Path
 from tests.log.standard_files import SCENARIO
 from trilat_net.log.ros2.cdr import JOINT_STATE
 from trilat_net.log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
-from trilat_net.reporting.plot_layout import PlotLayout, build_plot_layout
+from trilat_net.reporting.rerun_viewer import PlotLayout, build_plot_layout
 
 
 def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:

@@ -1,0 +1,177 @@
+"""What a run is made of: scenarios, control laws of one's own, measured delays, keys."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..files import refuse_existing, write_whole
+from ..reporting import terminal_output as terminal
+from ..reporting.text_table import TextTable
+from . import options
+from .options import value
+
+
+def scenario_list_command(as_json: options.JsonOption = False) -> None:
+    """Lists the shipped scenarios."""
+    from ..scenario import list_shipped, load_scenario
+
+    chosen = [(name, load_scenario(name)) for name in list_shipped()]
+    if as_json:
+        facts = [
+            {"name": name, "sites": one.names, "duration_s": one.duration_s, "title": one.title}
+            for name, one in chosen
+        ]
+        return terminal.print_json(facts)
+    rows = [(name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen]
+    return terminal.print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
+
+
+def scenario_show_command(
+    name: options.ScenarioArgument,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+) -> None:
+    """Prints the resolved text of a scenario: every value of every site and link."""
+    sys.stdout.write(options.load_chosen_scenario(name, overrides, duration, seed).text)
+
+
+def scenario_check_command(
+    file: options.ScenarioArgument,
+    overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Checks a scenario, and prints what follows from it."""
+    from ..scenario.describe import describe_scenario
+    from ..scenario.validate import check_outside_arms
+
+    scenario = options.load_chosen_scenario(file, overrides, None, None)
+    check_outside_arms(scenario)
+    lines = describe_scenario(scenario)
+    if as_json:
+        facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
+        return terminal.print_json(facts)
+    for line in lines:
+        terminal.print_text(line)
+    return None
+
+
+def scenario_new_command(
+    file: Annotated[Path, typer.Argument(help="File to write.")], force: options.ForceOption = False
+) -> None:
+    """Writes a commented template, with the unit of every key."""
+    from ..scenario import read_template
+
+    write_whole(file, read_template(), force=force)
+    terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
+
+
+def new_law_command(
+    file: Annotated[Path, typer.Argument(help="File to write, as in mylaw.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Writes a control law of your own, working and with comments, and its test."""
+    from ..scenario.law_skeleton import name_skeleton_class, new_law
+
+    law, test = new_law(file, force=force)
+    code = f"{law.stem}:{name_skeleton_class(law.stem)}"
+    there = "" if law.parent == Path() else f"cd {law.parent}, and "
+    terminal.print_text(f"{law}: a law that works; {test.name}: its test. Change the law, {there}run")
+    terminal.print_text(f"  trilat sim paper --set control.law={code} -o {law.stem}.mcap")
+    terminal.print_text(f"  trilat certify {law.stem}.mcap")
+    terminal.print_text(f"  pytest {test.name}")
+
+
+def trace_import_command(
+    form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
+    file: Annotated[
+        Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a header.", metavar="FILE")
+    ],
+    out: Annotated[Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")] = None,
+    way: Annotated[
+        str,
+        value(
+            "--way",
+            "half|send|receive|whole",
+            "Half a round trip, one way of irtt (send or receive), or delays as they are. "
+            "Default: half of a round trip, a one-way delay as it is.",
+        ),
+    ] = "",
+    column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
+    every_s: Annotated[float, value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
+    as_json: options.JsonOption = False,
+    force: options.ForceOption = False,
+) -> None:
+    """Makes a trace for links from what another program measured, and prints statistics of the network."""
+    from ..scenario.measured_traces import import_trace
+
+    place = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
+    refuse_existing(place, force=force)
+    found = import_trace(file, form, way=way, column=column, every_s=every_s)
+    write_whole(place, found.write_rows())
+    if as_json:
+        terminal.print_json({**found.to_dict(), "file": str(place)})
+        return
+    terminal.print_line(found.summary())
+    terminal.print_line(f"{place}: use it with --set link.model=trace --set link.file={place}")
+
+
+def keys_new_command(
+    folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
+    members: Annotated[
+        list[str],
+        typer.Argument(
+            help="The sites; and recorder, operator, router if there are any.", metavar="MEMBER..."
+        ),
+    ],
+    hosts: Annotated[
+        list[str] | None,
+        value("--host", "NAME", "Host name or address at which a member listens; repeatable."),
+    ] = None,
+    days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
+) -> None:
+    """Makes keys: a private certificate authority, and for each member a folder for its machine alone.
+
+    Bring each folder to its machine by a channel that you trust, and give it as --keys. Members without keys,
+    or with keys of another authority, cannot connect; a member can send only under its own name. Keep the
+    folder `authority` where no member runs, or delete it: new keys are always made for all members at once.
+    """
+    from ..net.member_keys import create_keys
+
+    made = create_keys(folder, members, hosts or (), days)
+    for one in made:
+        terminal.print_line(f"{one}: for {one.name}")
+    terminal.print_line(
+        f"they are valid for {days} days; use them as in: trilat site {made[0].name} --keys {made[0]} ..."
+    )
+
+
+def keys_pair_command(
+    name: Annotated[Path, typer.Argument(help="Makes NAME.key and NAME.pub.", metavar="NAME")],
+) -> None:
+    """Makes a pair of Ed25519 keys, to sign logs and to check signatures.
+
+    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to those who check your logs.
+    """
+    from ..log.log_signature import create_signing_keys
+
+    private, public = create_signing_keys(name)
+    terminal.print_text(f"{private}: signs, as in: trilat log sign run.mcap --key {private}")
+    terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
+
+
+def keys_info_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
+    as_json: options.JsonOption = False,
+) -> None:
+    """Shows whose keys these are, until when they are valid, and the Zenoh settings that follow from them."""
+    from ..net.member_keys import read_member_keys
+
+    keys = read_member_keys(folder)
+    if as_json:
+        facts = {"member": keys.member, "members": list(keys.members), "until": keys.ends.isoformat()}
+        return terminal.print_json({**facts, "zenoh": keys.settings})
+    terminal.print_line(f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC")
+    return terminal.print_json(keys.settings)

@@ -1,0 +1,479 @@
+"""Processes that take part in a session: a site, the recorder, a log that is played again, a router."""
+
+import math
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from ..errors import LawWithheld, RunFailed, UsageError
+from ..reporting import terminal_output as terminal
+from ..reporting.text_table import TextTable
+from . import options
+from .options import flag, seconds, value
+
+if TYPE_CHECKING:
+    from recorder.play.play_process import PlaybackSummary
+    from recorder.play.player import PlayProgress
+    from recorder.play.session_reader import SessionHeader
+
+    from ..net.clock import Clock
+    from ..scenario import Scenario
+
+
+def site_command(
+    name: Annotated[
+        str, typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites)
+    ],
+    scenario: Annotated[
+        str,
+        typer.Option(
+            "--scenario",
+            "-s",
+            help="Name of a shipped scenario, or path of a TOML file.",
+            autocompletion=options.complete_scenarios,
+        ),
+    ],
+    session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
+    *,
+    ways: options.MemberOptions,
+    join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the others, s.")] = 60.0,
+    needs_recorder: options.NeedsRecorderOption = False,
+    cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
+    stay: Annotated[
+        float, seconds("--stay", "At the end, wait until the recorder has left, at most this long, s.")
+    ] = 0.0,
+    without: Annotated[
+        list[str] | None,
+        value(
+            "--without",
+            "SITE",
+            "Option of the first site: begin without SITE, which may join later; repeatable.",
+        ),
+    ] = None,
+    leave_timeout: Annotated[
+        float | None,
+        seconds(
+            "--leave-timeout",
+            "Under glide: time to go on without a site that has left, s; default: to the end.",
+        ),
+    ] = None,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+) -> None:
+    """Runs one site as one process: for separate terminals or machines.
+
+    Without endpoints, the sites of a session find each other on this machine: each listens at a loopback port
+    derived from session and site, and connects to the sites that precede it in the scenario.
+    """
+    from sites.site_parts import SiteOptions
+    from sites.site_process import run_site
+
+    from ..net.connection import default_endpoints
+    from ..scenario import find_site
+
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    find_site(chosen, name)
+    identity = options.check_session_name(session or chosen.name)
+    places = default_endpoints(identity, chosen.names, encrypted=ways.keys is not None)
+    before = chosen.names[: chosen.names.index(name)]
+    connection = ways.resolve([places[name]], [places[peer] for peer in before]).require(name)
+    how = SiteOptions(
+        session=identity,
+        connection=connection,
+        join_timeout_s=join_timeout,
+        needs_recorder=needs_recorder,
+        cpu=cpu,
+        stay_s=stay,
+        clock_offset_s=clock_offset,
+        clock_drift_ppm=clock_drift,
+        without=_check_without(chosen, name, without or []),
+        leave_timeout_s=leave_timeout,
+    )
+    raise typer.Exit(run_site(chosen, name, how, terminal.print_line))
+
+
+def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
+    """Refuses sites that cannot come late."""
+    from ..scenario import find_site
+
+    for late in without:
+        find_site(scenario, late)
+        if name != scenario.names[0] or late == name:
+            raise UsageError(
+                f"--without is an option of {scenario.names[0]}, the first site, and names other sites"
+            )
+        if not scenario.sites_may_return:
+            raise UsageError('--without asks for on_stale.action = "glide" at every site')
+    return tuple(without)
+
+
+def record_command(
+    session: Annotated[str, value("--session", "ID", "Session to record.")],
+    *,
+    ways: options.MemberOptions,
+    output: Annotated[
+        Path | None,
+        value(
+            "-o --out --output",
+            "FILE",
+            "Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
+        ),
+    ] = None,
+    join_timeout: Annotated[
+        float | None,
+        seconds("--join-timeout", "Longest wait for the session to begin, s; default: no limit."),
+    ] = None,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+    concluded: Annotated[
+        bool, flag("--conclude", "Afterwards verify the log, and write a report into its folder.")
+    ] = False,
+    include: Annotated[
+        list[str] | None,
+        value("--include", "KEYS", "Record only these channels, as in '**/m1/**'; repeatable."),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None, value("--exclude", "KEYS", "Leave these channels out, as in '**/link'; repeatable.")
+    ] = None,
+    split_size: Annotated[
+        float | None, value("--split-size", "MIB", "Split the log into parts of at most this size, MiB.")
+    ] = None,
+    split_duration: Annotated[
+        float | None, value("--split-duration", "S", "Split the log into parts of this duration, s.")
+    ] = None,
+    carry_on: Annotated[bool, flag("--continue", "If the log exists, write its next part.")] = False,
+    durable: Annotated[
+        bool, flag("--durable", "Sync to the disk at every flush instead of every second.")
+    ] = False,
+    views: options.ViewsOption = "100",
+    force: options.ForceOption = False,
+    png: options.PngOption = False,
+) -> None:
+    """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
+
+    Without endpoints it asks the first site, at its loopback port, for the others. Parts are named
+    FILE-001.mcap and so on. The name of a file ends in .active until the file is finished.
+    """
+    from recorder.record_process import record_session
+
+    from ..files import refuse_existing
+    from ..log.log_layout import find_parts, parse_channel_filter
+    from ..log.log_writer import LogStorage, parse_split
+    from ..log.ros2.viz_channels import parse_viz_rate
+    from ..net.clock import make_system_clock
+    from ..net.topics import RECORDER
+
+    options.check_session_name(session)
+    connection = ways.resolve().require(RECORDER)
+    path = _choose_path(output, session, concluded=concluded)
+    place = LogStorage(
+        path,
+        force=force,
+        durable=durable,
+        split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
+        split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
+        carry_on=carry_on,
+        choice=parse_channel_filter(include or [], exclude or []),
+        views_hz=parse_viz_rate(views),
+    )
+    place.first()  # refuses a taken name before anything waits
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
+    page = path.parent / "report.html"
+    if concluded:
+        refuse_existing(page, force=force)
+    clock = make_system_clock(clock_offset, clock_drift)
+    then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
+    try:
+        code = record_session(session, place, connection, join_timeout, clock, terminal.print_line, then)
+    finally:
+        if concluded and output is None:
+            with suppress(OSError):
+                path.parent.rmdir()  # nothing came into it
+    raise typer.Exit(code)
+
+
+def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
+    """Returns where the log goes; the folder of a log with a report is made."""
+    from ..files import make_folder, make_results_folder
+
+    if not concluded:
+        return output if output is not None else Path(f"{session}.mcap")
+    if output is None:
+        return make_results_folder(None, session, force=False) / "run.mcap"
+    make_folder(output.parent)
+    return output
+
+
+def _conclude(parts: list[Path], *, png: bool) -> None:
+    from ..execution.log_checks import choose_exit_code
+
+    log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
+    if (code := choose_exit_code(conclusion.lines)) == LawWithheld.exit_code:
+        raise LawWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
+    if code:
+        raise RunFailed(f"{parts[0]}: failed a check")
+    if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
+        raise RunFailed(f"{parts[0]}: {ended.text}")
+
+
+_MIB = 1 << 20
+
+
+def replay_command(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
+    ],
+    rate: Annotated[
+        str, value("--rate", "X", "Speed relative to the recording, or max: as fast as possible.")
+    ] = "1",
+    loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
+    start: Annotated[
+        float | None, value("--start", "S", "Start of the part to play, s since tick 0.")
+    ] = None,
+    stop: Annotated[float | None, value("--stop", "S", "End of the part to play, s since tick 0.")] = None,
+    duration: Annotated[
+        float | None, value("--duration", "S", "Duration of the part to play, s, instead of --stop.")
+    ] = None,
+    include: Annotated[
+        list[str] | None,
+        value(
+            "--include",
+            "KEYEXPR",
+            "Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
+        ),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        value("--exclude", "KEYEXPR", "Leave these channels out, as in '**/link'; repeatable."),
+    ] = None,
+    prefix: Annotated[
+        str, value("--prefix", "WORD", "Name the session WORD-NAME; with '' NAME, as recorded.")
+    ] = "replay",
+    session: Annotated[str | None, value("--session", "ID", "Name of the session, without a prefix.")] = None,
+    time: Annotated[
+        str, value("--time", "publish|log", "Play messages at their times of sending, or of arrival.")
+    ] = "publish",
+    low_cpu: Annotated[
+        bool, flag("--low-cpu", "Sleep until every deadline, which is about 0.1 ms less exact.")
+    ] = False,
+    needs_recorder: options.NeedsRecorderOption = False,
+    preload: Annotated[
+        int,
+        value(
+            "--preload",
+            "MIB",
+            "Largest log held in memory; another process reads a larger one during the replay.",
+        ),
+    ] = 256,
+    listen: options.ListenOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    insecure: options.InsecureOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Publishes a log over Zenoh with its original timing, as a session of its own.
+
+    To recorders, viewers and `trilat ping` it looks like a running session: it answers for the sites of the
+    log, and its messages are theirs, byte for byte. Without endpoints it listens where the session's first
+    site would.
+    """
+    from recorder.play.pace import parse_rate
+    from recorder.play.play_process import PlayOptions, play_log
+    from recorder.play.session_reader import parse_selection, preload_messages
+
+    from ..net.clock import SystemClock
+    from ..net.connection import default_endpoint
+    from ..process import Interrupt
+
+    if preload < 0:
+        raise UsageError(f"--preload is a number of MiB, not {preload}")
+    selection = parse_selection(include or (), exclude or (), start, stop, duration, _parse_time(time))
+    speed = parse_rate(rate)
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
+        facts, block = preload_messages(files, selection, preload * _MIB, progress)
+    name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
+    ways = options.MemberOptions(listen, connect, router, zenoh_config, None, insecure)
+    connection = ways.resolve([default_endpoint(name, 0)], [])
+    play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
+    tell = partial((terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True)
+    _announce_playback(facts, name, speed, tell)
+    reported = set(facts.torn)  # playing may add to them
+    _warn_torn(facts.torn)
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        outcome = play_log(
+            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, _line(clock)
+        )
+    if outcome is None:
+        raise typer.Exit(interrupt.exit_code)
+    if as_json:
+        terminal.print_json({"session": name, **_describe_playback(outcome, speed)})
+    else:
+        _show_playback(outcome)
+    _warn_of(outcome, reported)
+    if interrupt.requested():
+        terminal.err.print("interrupted")
+        raise typer.Exit(interrupt.exit_code)
+    if outcome.cut or outcome.strays:
+        raise typer.Exit(1)
+
+
+def _parse_time(text: str) -> Literal["publish", "log"]:
+    if text not in ("publish", "log"):
+        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {text!r}")
+    return "publish" if text == "publish" else "log"
+
+
+def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]) -> None:
+    from ..net.messages import VERSION
+
+    speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
+    tell(f"playing {', '.join(facts.boots)} as session {name}, {speed}; Ctrl-C ends it")
+    if facts.version != VERSION:
+        tell(
+            f"note: these messages are of schema version {facts.version}: recorders and sites of today take "
+            f"{VERSION} and count others as dropped; any other Zenoh subscriber gets them"
+        )
+
+
+def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
+    """Returns a function that shows the position on one line of a terminal."""
+    before: list[tuple[int, int]] = []
+
+    def show(progress: "PlayProgress") -> None:
+        now = (clock.monotonic_ns(), progress.position_ns)
+        then = before.pop() if before else now
+        before.append(now)
+        rate = (now[1] - then[1]) / (now[0] - then[0]) if now[0] > then[0] else 0.0
+        text = (
+            f"{progress.position_ns / 1e9:8.1f} s   x{rate:.2f}   {progress.published} messages   "
+            f"latest {progress.late_max_us / 1e3:.2f} ms late"
+        )
+        terminal.err.file.write(f"\r{text:<72}")
+        terminal.err.file.flush()
+
+    return show if terminal.err.is_interactive else lambda _: None
+
+
+def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
+    late = outcome.lateness
+    return {
+        "messages": outcome.counts,
+        "published": sum(outcome.counts.values()),
+        "rounds": outcome.rounds,
+        "rate": None if math.isinf(rate) else rate,
+        "took_s": round(outcome.took_s, 6),
+        "late_us": None if late is None else {"p50": late.p50_us, "p99": late.p99_us, "max": late.max_us},
+        "held_s": round(outcome.held_s, 3),
+        "cut": outcome.cut,
+        "strays": outcome.strays,
+        "recorders": outcome.recorders,
+        "stored": outcome.stored if outcome.recorders else None,
+        "told": outcome.refilled,
+        "torn": {str(path): text for path, text in outcome.torn.items()},
+    }
+
+
+def _show_playback(outcome: "PlaybackSummary") -> None:
+    if terminal.err.is_interactive:
+        terminal.err.file.write("\r" + " " * 72 + "\r")
+    rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
+    terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
+    late = outcome.lateness
+    total = f"{sum(outcome.counts.values())} messages in {outcome.took_s:.2f} s"
+    rounds = f", {outcome.rounds} rounds" if outcome.rounds > 1 else ""
+    how = f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us" if late else ""
+    held = f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
+    dropped = "" if outcome.cut else "; none dropped"
+    terminal.print_text(f"{total}{rounds}{how}{held}{dropped}")
+    if outcome.recorders:
+        has = "has everything" if outcome.stored else "has not confirmed that it has everything"
+        given = (
+            f"; {outcome.refilled} messages that it had missed were sent again" if outcome.refilled else ""
+        )
+        terminal.print_text(f"the recorder {has}{given}")
+
+
+def _warn_torn(torn: dict[Path, str]) -> None:
+    for path, text in torn.items():
+        terminal.print_note(
+            f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}"
+        )
+
+
+def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
+    """Warns of damage that was not `reported` before, and of messages that did not arrive or arrived late."""
+    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
+    if outcome.cut:
+        terminal.print_error(
+            f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "
+            "that were played then"
+        )
+    if outcome.strays:
+        terminal.print_error(
+            f"{outcome.strays} messages lie more than a minute from their place in the file, and were "
+            "played late; with a larger --preload they are played in order"
+        )
+
+
+LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
+
+
+def router_command(
+    listen: Annotated[
+        list[str] | None,
+        value(
+            "--listen",
+            "EP",
+            f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
+        ),
+    ] = None,
+    connect: options.ConnectOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    insecure: options.InsecureOption = False,
+    until_idle: Annotated[
+        float | None,
+        seconds("--until-idle", "End once all members have been gone for this long, s; default: never."),
+    ] = None,
+) -> None:
+    """Connects sites that cannot reach each other directly, for example behind NAT.
+
+    Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
+    continues when the router is restarted. Routers that --connect to each other act as one.
+    """
+    from ..net.access_rules import ROUTER
+    from ..net.clock import SystemClock
+    from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
+    from ..net.zenoh_bus import read_zenoh_file
+    from ..process import Interrupt
+
+    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
+    places = [LOOPBACK if keys is None else ANY_ADDRESS]
+    named = resolve_member_connection(listen, connect, None, file, places, (), routes=True)
+    connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)
+        if bus is None:
+            raise typer.Exit(interrupt.exit_code)
+        try:
+            _say_of_router(f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
+            run_router(bus, clock, interrupt.requested, _say_of_router, until_idle)
+        finally:
+            bus.close()
+        raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
+
+
+def _say_of_router(text: str) -> None:
+    terminal.print_line(f"router: {text}")

@@ -1,0 +1,381 @@
+"""Runs: a scenario in virtual time, and a log executed again, judged, measured, changed or drawn."""
+
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from ..errors import UsageError
+from ..process import Interrupt
+from ..reporting import terminal_output as terminal
+from ..reporting.text_table import TextTable
+from . import options
+from .options import flag, value
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..log.log_reader import Log
+    from ..theory import LinearAnalysis
+
+
+def sim_command(
+    scenario: options.ScenarioArgument,
+    output: Annotated[Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    views: options.ViewsOption = "100",
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs an experiment in virtual time, and writes the same kind of log as a live session."""
+    from ..execution.virtual import record_virtual
+    from ..log.ros2.viz_channels import parse_viz_rate
+
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    path = output if output is not None else Path(f"{chosen.name}.mcap")
+    views_hz = parse_viz_rate(views)
+    with Interrupt(compiles=True) as interrupt:
+        within = record_virtual(chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz)
+    if interrupt.requested():
+        terminal.err.print(f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True)
+        raise typer.Exit(interrupt.exit_code)
+    if as_json:
+        from ..log.log_reader import open_log
+
+        terminal.print_json(open_log(path).to_dict())
+    else:
+        terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+    if not within:
+        chains = any(spec.arm.urdf for spec in chosen.sites.values())
+        terminal.print_error(
+            f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there"
+            + ("; a urdf states such limits, and limits.qd_limit_rad_s others" if chains else "")
+        )
+        raise typer.Exit(1)
+
+
+def verify_command(
+    files: options.LogsArgument,
+    virtual: Annotated[
+        bool, flag("--virtual", "Compare with virtual time too, with and without the log's arrivals.")
+    ] = False,
+    resume_every: Annotated[
+        int,
+        value(
+            "--resume-every",
+            "N",
+            "Start sites afresh from the records every N ticks: shows what a law knows besides.",
+            min=0,
+        ),
+    ] = 0,
+    *,
+    laws: options.LawFiles,
+    min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Executes every site again from a log and compares every computed field of every record.
+
+    Exit code 0: all agrees, the log is as it was made, and enough of every site was judged. 1: something
+    differs, was changed, or is missing. 2: no log. 4: a site's law is code from outside that may not run
+    without --law; all else agrees.
+    """
+    from ..execution.log_checks import choose_exit_code, run_log_checks
+
+    log = laws.open(*files)
+    with terminal.progress_bar(f"executing {files[0]}") as progress:
+        result = run_log_checks(
+            log, virtual=virtual, progress=progress, min_coverage=min_coverage, resume_every=resume_every
+        )
+    terminal.print_result(result, as_json=as_json)
+    raise typer.Exit(choose_exit_code(result.lines))
+
+
+def certify_command(
+    files: options.LogsArgument,
+    accept: options.AcceptOption = None,
+    min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
+    own_laws: options.OwnLawsOption = False,
+    twins: options.TwinsOption = 8,
+    *,
+    laws: options.LawFiles,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
+
+    Executes the run again beside twins that get a small push, and no code of imported laws without --law or
+    --own-laws.
+    docs/certificate.md defines every word and every key of the JSON.
+
+    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
+    the reasons. 2: no log.
+    """
+    from ..theory.end_pose import certify_run
+
+    own_laws = own_laws or bool(laws.law)
+    log = laws.open(*files, runs_them=own_laws)
+    found = certify_run(log, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+    terminal.print_result(found, as_json=as_json)
+    if not found.accepts(accept or ()):
+        raise typer.Exit(1)
+
+
+_PUSHED = (
+    "Push a twin: m1.q1=1e-6 (rad), m1.qd1, m1.theta1, all of m1.q or of q; repeatable, a twin each. "
+    "Default: as certify does."
+)
+
+
+def twin_command(
+    files: options.LogsArgument,
+    at_s: Annotated[float, value("--at", "S", "The instant of the push, s.")] = 0.0,
+    push: Annotated[
+        list[str] | None, value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites)
+    ] = None,
+    delta: Annotated[
+        str, value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade.")
+    ] = "",
+    picture: Annotated[
+        Path | None, value("-o --out --output", "FILE", "Draw a figure: .png, .svg or .pdf.")
+    ] = None,
+    *,
+    laws: options.LawFiles,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Executes a run again, beside twins that get a small push at an instant: it dies away, or it grows.
+
+    Nothing of the difference is a model: the twins get the arrivals, delays, hands and changes of the run
+    (docs/certificate.md, "Twins"). Exit code 0 for any growth.
+    """
+    from ..analysis.twin_growth import twin
+
+    options.check_picture(picture, force=force)
+    log = laws.open(*files)
+    found = twin(log, at_s, push or (), delta)
+
+    def draw() -> "Figure":
+        from ..reporting.figures.twin_differences import draw_twins
+
+        return draw_twins(found)
+
+    options.print_drawn(found, picture, draw, as_json=as_json)
+
+
+def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
+    """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
+
+    Sites, links and walls are columns. A dash is a missing number; if the run could have one, the reason is
+    given below the table. docs/metrics.md has every formula.
+    """
+    from ..analysis.metrics.log_metrics import compute_log_metrics
+
+    log = terminal.open_with_progress(*file)
+    terminal.print_result(compute_log_metrics(log), as_json=as_json)
+
+
+def figure_command(
+    file: options.LogArgument,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Names of figures, see --list; default: all that FILE has.",
+            metavar="NAME",
+            autocompletion=options.complete_figures,
+        ),
+    ] = None,
+    width_in: Annotated[
+        float, value("--width", "3.5|7", "Width of one or two columns of a paper, in.")
+    ] = 3.5,
+    formats: Annotated[str, value("--format", "pdf,png,svg", "One or more formats.")] = "pdf,png",
+    folder: Annotated[Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")] = None,
+    others: Annotated[
+        list[Path] | None,
+        value("--with", "FILE", "Draw this log over FILE, as the figure overlay; repeatable."),
+    ] = None,
+    *,
+    laws: options.LawFiles,
+    listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
+    as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
+    force: options.ForceOption = False,
+) -> None:
+    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
+    log = laws.open(file)
+    if listed:
+        _list_figures(log, as_json=as_json)
+        return
+    from ..reporting.figures.registry import write_figures, write_overlay
+
+    place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
+    kinds = _formats(formats)
+    shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
+    if others:
+        if names:
+            raise UsageError("--with draws the figure overlay, and no other: leave the names out")
+        logs = {file.stem: log, **{one.stem: terminal.open_with_progress(one) for one in others}}
+        if len(logs) <= len(others):
+            raise UsageError("logs that are drawn over one another need names of their own")
+        paths = write_overlay(logs, place, **shape)
+    else:
+        with terminal.progress_bar("drawing") as progress:
+            paths = write_figures(log, place, names or (), progress=progress, **shape)
+    if as_json:
+        terminal.print_json([str(path) for path in paths])
+        return
+    terminal.print_paths(paths)
+
+
+def _formats(text: str) -> list[str]:
+    kinds = [kind.strip().lower() for kind in text.split(",") if kind.strip()]
+    if not kinds:
+        raise UsageError("--format names no format, as in --format pdf,png")
+    return kinds
+
+
+def _list_figures(log: "Log", *, as_json: bool) -> None:
+    """Prints every figure, and for which of them a log has nothing to show."""
+    from ..reporting.figures.registry import FIGURES
+
+    absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
+    if as_json:
+        rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
+        terminal.print_json(rows)
+        return
+    drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
+    terminal.print_table(TextTable(("figure", "shows"), drawable))
+    for name, why in absent.items():
+        if why:
+            terminal.out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)
+
+
+def report_command(
+    files: options.LogsArgument,
+    folder: Annotated[Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")] = None,
+    *,
+    laws: options.LawFiles,
+    min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
+    force: options.ForceOption = False,
+    png: options.PngOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Writes the page and the summary of a log, with --png its figures as well."""
+    from ..execution.log_checks import choose_exit_code
+    from ..files import make_results_folder
+    from ..reporting.conclude import conclude
+
+    log = laws.open(*files)  # before its folder is made
+    results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
+    with terminal.progress_bar("drawing") as progress:
+        conclusion = conclude(log, results, progress, min_coverage=min_coverage, png=png)
+    terminal.print_result(conclusion, as_json=as_json)
+    raise typer.Exit(choose_exit_code(conclusion.lines))
+
+
+def rerun_command(
+    files: options.LogsArgument,
+    replace: Annotated[
+        list[str] | None,
+        value(
+            "--replace", "SITE", "Execute this site again; repeatable.", autocompletion=options.complete_sites
+        ),
+    ] = None,
+    closed_loop: Annotated[
+        bool, flag("--closed-loop", "Execute all sites, over the network of the log.")
+    ] = False,
+    overrides: options.SetOption = None,
+    *,
+    laws: options.LawFiles,
+    output: Annotated[Path | None, value("-o --out --output", "FILE", "Write the result as a log.")] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Executes sites of a log again with changed settings, and compares the result with the log.
+
+    Without --closed-loop the other sites stay as recorded and do not react.
+    """
+    from ..execution.rerun import rerun
+
+    if output is not None:
+        _check_output(output, files, force=force)
+    log = laws.open(*files)
+    with terminal.progress_bar("executing") as progress:
+        again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
+    if output is not None:
+        again.save(output, force=force)
+    if as_json:
+        terminal.print_json({**again.to_dict(), "file": str(output) if output else None})
+    else:
+        terminal.print_result(again)
+        terminal.print_paths([output] if output else [])
+    if again.diverged or again.broken:
+        raise typer.Exit(1)
+
+
+def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
+    """Refuses a file that may not be written, before anything is executed."""
+    from ..files import refuse_existing
+    from ..log.log_layout import active_path
+
+    if any(output.exists() and file.exists() and output.samefile(file) for file in files):
+        raise UsageError(f"{output}: is the log itself; choose another name")
+    refuse_existing(output, force=force, unfinished=active_path(output))
+
+
+LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
+
+
+def linear_command(
+    scenario: options.ScenarioArgument,
+    overrides: options.SetOption = None,
+    pose: Annotated[
+        str | None, value("--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end.")
+    ] = None,
+    roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
+    over: Annotated[
+        list[str] | None, value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
+    ] = None,
+    ports: Annotated[bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")] = True,
+    picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
+    what: Annotated[
+        LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
+    ] = LinearFigure.ROOTS,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Linearises the loop about its equilibrium: stability of small motions, and the operators' impedances.
+
+    With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators and
+    environments off, passivity, Llewellyn's criterion, and impedance (docs/ports.md). Exit code 0 for
+    any verdict.
+    """
+    options.check_picture(picture, force=force)
+    from ..theory.linear_analysis import analyse_linear_loop
+
+    wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
+    found = analyse_linear_loop(
+        scenario, overrides or [], pose=_pose(pose), roots=roots, over=over or [], ports=wanted
+    )
+    shown = found if ports or as_json else replace(found, ports=None)
+    options.print_drawn(shown, picture, lambda: _draw(found, what), as_json=as_json)
+
+
+def _pose(text: str | None) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
+
+
+def _draw(found: "LinearAnalysis", what: LinearFigure) -> "Figure":
+    from ..reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
+    from ..reporting.figures.root_map import draw_root_map
+
+    if found.ports is None or what is LinearFigure.ROOTS:
+        return draw_root_map(found)
+    return (draw_port_impedance if what is LinearFigure.IMPEDANCE else draw_port_passivity)(found.ports)

@@ -1,0 +1,477 @@
+"""Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run here."""
+
+import re
+import tomllib
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import UsageError
+from ..reporting import terminal_output as terminal
+from ..reporting.session_text import MARKS
+from . import options
+from .options import flag, value
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sites.demo_session import SessionAttendant
+    from sites.running_session import RunningSession
+
+    from ..scenario import Scenario
+
+
+def demo_command(
+    scenario: options.ScenarioArgument = "paper",
+    duration: options.DurationOption = None,
+    folder: options.ResultsOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    force: options.ForceOption = False,
+    png: options.PngOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    run_and_report(chosen, folder, force=force, png=png, as_json=as_json)
+
+
+def run_and_report(
+    chosen: "Scenario",
+    folder: Path | None,
+    attend: "SessionAttendant | None" = None,
+    *,
+    force: bool,
+    png: bool,
+    as_json: bool,
+) -> None:
+    """Runs a scenario live, then verifies and reports; what `attend` yields may end it as planned."""
+    from sites.demo_session import run_demo
+
+    from ..files import make_results_folder
+
+    results = make_results_folder(folder, chosen.name, force=force)
+    with terminal.lines_aside(as_json):
+        terminal.print_text(chosen.title or chosen.name)
+        members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
+        terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
+        outcome = run_demo(chosen, results, terminal.out, attend)
+    for problem in outcome.problems:
+        terminal.print_error(problem)
+    there = outcome.log.exists()
+    if outcome.interrupted and not (attend and there):
+        kept = f"; {outcome.log} holds what there was" if there else ""
+        terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
+        raise typer.Exit(128 + outcome.interrupted)
+    if not there:
+        raise typer.Exit(outcome.exit_code)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
+    if outcome.problems or not conclusion.passed:
+        raise typer.Exit(outcome.exit_code)
+
+
+def live_command(
+    context: typer.Context,
+    scenario: options.ScenarioArgument = "play",
+    session: Annotated[
+        str | None, value("--session", "ID", "Show this running session instead of starting one.")
+    ] = None,
+    *,
+    reach: options.Reach,
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", help="Address of the page; beyond loopback it needs --insecure and has a token."
+        ),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
+    insecure: Annotated[
+        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
+    ] = False,
+    browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
+    duration: options.DurationOption = None,
+    folder: options.ResultsOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    force: options.ForceOption = False,
+    png: options.PngOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs a scenario live, with a page on which to watch it and take hold of the arms.
+
+    The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
+    page shows a session that already runs, and leaves it running.
+    """
+    from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
+    from live.terminal_watch import watch_session
+
+    from ..net.clock import SystemClock
+
+    clock, say = SystemClock(), terminal.print_line
+    page = PageOptions(host, port, insecure, browser)
+    page.check()
+    if session is not None:
+        alone = {"--duration", "--out", "--seed", "--set", "--force", "--png", "--json", "scenario"}
+        if extra := alone & set(options.given_options(context)):
+            raise UsageError(
+                f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
+            )
+        connection, name = reach.resolve(), options.check_session_name(session)
+        show = partial(show_on_page, page, clock, name, say)
+        raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
+    if any(reach):
+        raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
+    longest_s = LONGEST_S if duration is None else duration
+    chosen = options.load_chosen_scenario(scenario, overrides, longest_s, seed)
+    attend = partial(attend_with_page, page, clock)
+    run_and_report(chosen, folder, attend, force=force, png=png, as_json=as_json)
+
+
+def _check_count(value: int) -> int:
+    if not 5 <= value <= 10_000:
+        raise UsageError(f"--count is a number from 5 to 10000, not {value}")
+    return value
+
+
+def ping_command(
+    context: typer.Context,
+    session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
+    *,
+    reach: options.Reach,
+    count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
+    timeout: options.AnswerOption = 3.0,
+    benchmark: Annotated[
+        str | None,
+        value(
+            "--benchmark",
+            "SCENARIO",
+            "Measure the network instead, by size, rate and transport, for this scenario.",
+            autocompletion=options.complete_scenarios,
+        ),
+    ] = None,
+    overrides: options.SetOption = None,
+    seconds: Annotated[
+        float | None,
+        value(
+            "--seconds",
+            "S",
+            "Duration of all cases together, s; default 24. With --answer: time until it ends.",
+            callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None, value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
+    ] = None,
+    force: options.ForceOption = False,
+    answer: Annotated[
+        list[str] | None,
+        value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
+    ] = None,
+    insecure: options.InsecureOption = False,
+    as_json: options.JsonOption = False,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+) -> None:
+    """Shows round trip, clock offset and jitter between here and every member of a session.
+
+    The session may still wait for members. If it runs, the links that its sites measure are shown too.
+    Without endpoints it asks the first site, at its loopback port, for the others.
+
+    With --benchmark it needs no session: it measures if the network is good enough for a scenario, by the
+    delay margin of trilat linear. The far end is trilat ping --answer EP on another machine, given as
+    --connect EP; without one it runs here, over TCP, TLS and QUIC. This takes half a minute; exit code 1 if
+    the network is not good enough.
+    """
+    if benchmark is not None or answer:
+        _refuse_others(context, "--answer" if benchmark is None else "--benchmark")
+    if benchmark is not None:
+        return _benchmark(benchmark, overrides, seconds, reach, picture, force=force, as_json=as_json)
+    if answer:
+        return _answer(answer, reach.keys, seconds, insecure=insecure)
+    _refuse_others(context, "")
+    from sites.session_ping import ping_session
+
+    from ..net.clock import make_system_clock
+    from ..process import Interrupt
+
+    connection = reach.resolve(operates=False)
+    clock = make_system_clock(clock_offset, clock_drift)
+    with Interrupt() as interrupt:
+        found = ping_session(
+            connection, clock, options.check_session_name(session), count, timeout, interrupt.requested
+        )
+        if found is None:
+            raise typer.Exit(interrupt.exit_code)
+    terminal.print_result(found, as_json=as_json)
+    if not any(member["answers"] for member in found.members):
+        raise typer.Exit(1)
+    return None
+
+
+_OF_BENCHMARK = {"--benchmark", "--set", "--seconds", "--figure", "--force", "--connect", "--keys", "--json"}
+_OF_ANSWER = {"--answer", "--seconds", "--keys", "--insecure"}
+
+
+def _refuse_others(context: typer.Context, way: str) -> None:
+    """Refuses options that have no meaning beside --benchmark, --answer, or neither."""
+    given = set(options.given_options(context))
+    own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER}.get(way)
+    alone = {"--set", "--seconds", "--figure", "--force", "--insecure"}
+    if other := sorted(given & alone if own is None else given - own):
+        raise UsageError(f"{other[0]}: {f'not with {way}' if way else 'only with --benchmark or --answer'}")
+
+
+def _benchmark(
+    scenario: str,
+    overrides: list[str] | None,
+    seconds: float | None,
+    reach: options.Reach,
+    picture: Path | None,
+    *,
+    force: bool,
+    as_json: bool,
+) -> None:
+    options.check_picture(picture, force=force)
+    from sites.network_benchmark import DEFAULT_S, ping_benchmark
+
+    found = ping_benchmark(
+        scenario, overrides or [], duration_s=seconds or DEFAULT_S, connect=reach.connect, keys=reach.keys
+    )
+
+    def draw() -> "Figure":
+        from ..reporting.figures.network_delays import draw_network_delays
+
+        return draw_network_delays(found.to_dict())
+
+    options.print_drawn(found, picture, draw, as_json=as_json)
+    if not found.good:
+        raise typer.Exit(1)
+
+
+def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool) -> None:
+    from math import inf
+
+    from sites.network_benchmark import run_far_end
+
+    from ..process import Interrupt
+
+    with Interrupt() as interrupt:
+        stopped, last_s = interrupt.requested, seconds or inf
+        run_far_end(endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line)
+    if interrupt.requested():
+        raise typer.Exit(interrupt.exit_code)
+
+
+def watch_command(
+    session: Annotated[str, value("--session", "ID", "Session to watch.")],
+    *,
+    reach: options.Reach,
+    timeout: options.AnswerOption = 10.0,
+) -> None:
+    """Shows a running session in a terminal, with a line per site, until the session ends or Ctrl-C.
+
+    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the arm. The line
+    above has V. Without endpoints it asks the first site, at its loopback port, for the others.
+    """
+    from live.terminal_watch import show_in_terminal, watch_session
+
+    from ..net.clock import SystemClock
+
+    name, clock = options.check_session_name(session), SystemClock()
+    show = partial(show_in_terminal, clock, name, terminal.out)
+    raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
+
+
+SessionOption = Annotated[str, value("--session", "ID", "The session.")]
+SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
+
+
+def _find(session: str, reach: options.Reach) -> "RunningSession":
+    from sites.running_session import RunningSession
+
+    connection = reach.resolve(operates=False)
+    return RunningSession(options.check_session_name(session), connection)
+
+
+def _print_answers(answers: list[str]) -> None:
+    for text in answers:
+        terminal.print_text(text)
+
+
+def stop_command(
+    session: SessionOption,
+    sites: SitesArgument = None,
+    end: Annotated[bool, flag("--end", "End the whole session instead; recorders get every record.")] = False,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Stops arms at once while the session goes on: they come to rest where they are.
+
+    They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
+    Without endpoints it asks sites on this machine at once where their files say that they are, else the
+    first site, at its loopback port, for the others.
+    """
+    if end and sites:
+        raise UsageError("--end ends the whole session: name no site")
+    running = _find(session, reach)
+    _print_answers(running.end() if end else running.stop(*(sites or ())))
+
+
+def enable_command(
+    session: SessionOption,
+    sites: SitesArgument = None,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Lets stopped arms follow again: they wait for their peers and align with them."""
+    _print_answers(_find(session, reach).enable(*(sites or ())))
+
+
+def reset_command(
+    session: SessionOption,
+    sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="The sites in fault.")],
+    *,
+    reach: options.Reach,
+) -> None:
+    """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
+    _print_answers(_find(session, reach).reset(*sites))
+
+
+_UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
+
+
+def parse_milliseconds(text: str) -> float:
+    """Returns a time with its unit, as in 350ms or 0.35s, in ms."""
+    match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
+    try:
+        if match:
+            return float(match[1]) * _UNITS[match[2]]
+    except ValueError:
+        pass
+    raise UsageError(f"a time is a number and its unit, as in 350ms or 0.35s, not {text!r}")
+
+
+def parse_share(text: str) -> float:
+    """Returns a share, as in 5% or 0.05."""
+    number = text.strip().removesuffix("%")
+    try:
+        return float(number) / (100.0 if number != text.strip() else 1.0)
+    except ValueError:
+        raise UsageError(f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}") from None
+
+
+def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
+    """Returns KEY=VALUE texts as a table; a value is TOML or a bare word."""
+    table: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
+        try:
+            table[key.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
+            table[key.strip()] = value.strip()
+    return table
+
+
+def set_command(
+    context: typer.Context,
+    session: Annotated[str | None, value("--session", "ID", "Session to change; required.")] = None,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Changes a link, or a row of the dominance matrix, while a session runs.
+
+    Without endpoints it asks the first site, at its loopback port, for the others.
+    """
+    name = None if session is None else options.check_session_name(session)
+    context.obj = name, reach.resolve()
+
+
+def set_link_command(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
+    delay: Annotated[str | None, typer.Option("--delay", help="New delay, as in 350ms.")] = None,
+    loss: Annotated[str | None, typer.Option("--loss", help="New loss, as in 5%.")] = None,
+    preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
+    to: Annotated[
+        list[str] | None, value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable.")
+    ] = None,
+) -> None:
+    """Changes the given keys of a directed link; a model or a preset replaces all of them."""
+    table = parse_pairs(to or [], "deviation_ms=20")
+    if preset is not None:
+        table["preset"] = preset
+    if delay is not None:
+        table["delay_ms"] = parse_milliseconds(delay)
+    if loss is not None:
+        table["loss"] = parse_share(loss)
+    if not table:
+        raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
+    _, arrow, receiver = name.partition("->")
+    if not arrow:
+        raise UsageError(f"a link is FROM->TO in quotes, as in 'm1->s', not {name!r}")
+    _send_change(context, receiver, {"link": name, "to": table})
+
+
+def set_dominance_command(
+    context: typer.Context,
+    site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
+    shares: Annotated[
+        list[str], typer.Argument(metavar="PEER=SHARE...", help="New shares of its peers, which sum to 1.")
+    ],
+    ramp: Annotated[str, typer.Option("--ramp", help="Duration of the change, as in 2s.")] = "1s",
+) -> None:
+    """Changes one row of the dominance matrix along a linear ramp; it sums to 1 throughout."""
+    table = {peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()}
+    _send_change(context, site, {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3})
+
+
+def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
+    from sites.running_session import RunningSession
+
+    from ..net.requests import ChangeRequest
+    from ..scenario.fields import check_finite
+
+    session, connection = context.obj
+    check_finite(order, "")  # a message holds no others
+    if session is None:
+        raise UsageError("the session is missing: trilat set --session ID ...")
+    reply = RunningSession(session, connection).change(site, ChangeRequest(**order))
+    if not reply.accepted:
+        raise UsageError(f"refused: {reply.text}")
+    terminal.print_text(reply.text)
+
+
+def doctor_command(
+    *,
+    ways: options.MemberOptions,
+    session: Annotated[
+        str | None, value("--session", "ID", "Also ask the members of this session for their clocks.")
+    ] = None,
+    folder: Annotated[Path, value("--out -o", "DIR", "Folder where results would go.")] = Path("runs"),
+    as_json: options.JsonOption = False,
+) -> None:
+    """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per finding.
+
+    Give it the options that a site, recorder or router on this machine would get. Exit code 1 if a check
+    fails.
+    """
+    from sites.doctor import examine_machine
+
+    from ..net.clock import SystemClock
+
+    connection = ways.find_endpoints()
+    name = None if session is None else options.check_session_name(session)
+    examined = examine_machine(connection, ways.keys, folder, name, SystemClock(), insecure=ways.insecure)
+    findings = []
+    for finding in examined:
+        findings.append(finding)
+        if not as_json:
+            terminal.print_marked(MARKS[finding.state], f"{finding.check:<10}  {finding.text}")
+    if as_json:
+        terminal.print_json([finding._asdict() for finding in findings])
+    if any(finding.state == "fail" for finding in findings):
+        raise typer.Exit(1)

@@ -1,0 +1,261 @@
+"""Studies of some runs: scenarios with what they [expect], logs side by side, laws that one procedure tunes.
+
+Invariant: numbers are printed and nothing is ranked.
+"""
+
+import os
+import platform
+import re
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..errors import UsageError
+from ..reporting import terminal_output as terminal
+from . import options
+from .options import flag, value
+
+if TYPE_CHECKING:
+    from sites.demo_session import SessionResult
+
+    from ..scenario import Scenario
+    from ..studies.trials.trial import Trial, TrialResult
+    from ..studies.trials.trial_report import TrialReport
+    from ..studies.tuning import TuningPlan
+
+
+MAX_SEEDS = 100_000
+
+
+def test_command(
+    scenarios: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO]...",
+            help="Names or paths; default: all shipped scenarios with \\[expect].",
+            autocompletion=options.complete_scenarios,
+        ),
+    ] = None,
+    live: Annotated[
+        bool, flag("--live/--virtual", "Run live over a network, one after the other, or in virtual time.")
+    ] = False,
+    seeds: Annotated[
+        str | None, value("--seeds", "LIST", "Seeds, as in 1..20 or 1,5,9; default: the scenario's.")
+    ] = None,
+    junit: Annotated[Path | None, value("--junit", "FILE", "Write the results as JUnit XML as well.")] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what failed."""
+    from ..files import write_whole
+    from ..net.clock import SystemClock
+    from ..studies.executor import check_workers
+    from ..studies.trials.trial_report import encode_junit_xml
+
+    if live and on is not None:
+        raise UsageError("--on runs in virtual time: leave it out, or --live")
+    check_workers(jobs, on)
+    if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
+        raise UsageError(f"{junit}: cannot be written")
+    batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
+    began_unix_ns = SystemClock().unix_ns()
+    with terminal.lines_aside(as_json):
+        report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
+    terminal.print_result(report, as_json=as_json)
+    if junit is not None:
+        write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
+    if not report.held:
+        raise typer.Exit(1)
+
+
+def parse_seeds(text: str | None) -> list[int]:
+    """Returns the seeds that a text such as 1..20 or 1,5,9 or 1..3,8 names; none for None.
+
+    Raises:
+        UsageError: it names none, or too many.
+    """
+    seeds: list[int] = []
+    for part in [] if text is None else text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first:
+            raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
+        if len(seeds) + last - first >= MAX_SEEDS:
+            raise UsageError(f"--seeds {text} are more than {MAX_SEEDS}")
+        seeds += range(first, last + 1)
+    return seeds
+
+
+def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: bool) -> "list[Trial]":
+    """Returns all trials; without sources, of every shipped scenario that expects something."""
+    from ..scenario import list_shipped, load_scenario
+    from ..studies.trials.trial import trials
+
+    chosen = sources or [name for name in list_shipped() if load_scenario(name).expect.asks]
+    return [
+        trial for source in dict.fromkeys(chosen) for trial in trials(source, seeds, overrides, live=live)
+    ]
+
+
+def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
+    """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
+    from rich.progress import Progress
+
+    from ..studies.trials.trial_runner import run_trials
+
+    to_do = Counter(trial.source for trial in batch)
+    with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:
+        task = progress.add_task("runs", total=len(batch))
+
+        def done(result: "TrialResult") -> None:
+            progress.advance(task)
+            source = result.trial.source
+            to_do[source] -= 1
+            if not to_do[source] and not terminal.out.is_terminal:
+                terminal.print_text(f"{source}: ran")
+
+        return run_trials(batch, jobs, done, on)
+
+
+def _run_live(batch: "list[Trial]") -> "TrialReport":
+    from ..net.clock import SystemClock
+    from ..studies.trials.trial import evaluate_live_log
+    from ..studies.trials.trial_report import TrialReport
+
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    results = []
+    for trial in batch:
+        began_ns = clock.monotonic_ns()
+        outcome = run_apart(trial.scenario, str(trial), f"test-{trial}")
+        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
+    return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def run_apart(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, into a folder of its own; ends the command if that is interrupted."""
+    from sites.demo_session import run_demo
+
+    from ..files import make_results_folder
+
+    folder = make_results_folder(None, folder_name, force=False)
+    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
+    outcome = run_demo(scenario, folder, terminal.out)
+    if outcome.interrupted:
+        terminal.err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return outcome
+
+
+def _run_tuning(
+    asked: "TuningPlan", folder: Path | None, jobs: int | None, on: str | None, *, force: bool, as_json: bool
+) -> None:
+    """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
+    from ..files import make_results_folder
+    from ..studies.executor import count_workers
+    from ..studies.tuning.tuning_report import write_tuning
+
+    workers = count_workers(jobs, on)
+    chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
+    if not as_json:
+        _print_procedure(asked, workers)
+    with terminal.progress_bar("searching") as progress:
+        found = asked.run(jobs, progress, on)
+    paths = write_tuning(found, chosen)
+    if not as_json:
+        terminal.out.print()
+    terminal.print_result(found, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
+
+
+def _print_procedure(asked: "TuningPlan", workers: int) -> None:
+    from ..studies.sweep.sweep_run import format_wall_time
+    from ..studies.tuning.tuning_report import describe_procedure
+
+    laws = ", ".join(space.law for space in asked.spaces)
+    terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
+    for line in describe_procedure(asked):
+        terminal.print_text(f"  {line}")
+    cores = "1 core" if workers == 1 else f"{workers} cores"
+    duration = format_wall_time(asked.estimate_s(workers))
+    terminal.print_text(
+        f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
+    )
+
+
+_option = partial(value, rich_help_panel="Tune laws")
+
+
+def compare_command(
+    context: typer.Context,
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Two or more MCAP logs.", metavar="FILE FILE...")
+    ] = None,
+    tune: Annotated[
+        str | None, _option("--tune", "SCENARIO", "Compare tuned control laws in this scenario instead.")
+    ] = None,
+    law: Annotated[
+        str | None,
+        _option(
+            "--law",
+            "LAW,LAW...",
+            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
+            "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
+            "authority, impedance, smith, and your own, as in mylaws:Law.",
+        ),
+    ] = None,
+    budget: Annotated[int, _option("--budget", "N", "Candidates per law.")] = 64,
+    seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
+    seeds: Annotated[
+        int, _option("--seeds", "N", "Seeds of the scenario that each candidate is the mean of.")
+    ] = 1,
+    objective: Annotated[
+        str, _option("--objective", "error|settling", "The objective besides effort.")
+    ] = "error",
+    gravity: Annotated[
+        float, _option("--gravity", "PERCENT", "Gravity that all laws assume, in % of the truth.")
+    ] = 100.0,
+    duration: options.DurationOption = None,
+    overrides: options.SetOption = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    output: Annotated[
+        Path | None, _option("--out -o", "DIR", "Folder of the results; default: the next free runs/tune-...")
+    ] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Compares logs and the differences of their experiments; or control laws, all tuned by one procedure.
+
+    Ranks nothing: arms that hang, or that no operator moves, also have small errors.
+    """
+    if tune is None:
+        for name in options.given_options(context):
+            if name not in ("files", "--json"):
+                raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
+        from ..studies.log_comparison import compare_logs
+
+        logs = [terminal.open_with_progress(file) for file in files or []]
+        terminal.print_result(compare_logs(logs), as_json=as_json)
+        return
+    if files:
+        raise UsageError("--tune makes its own runs: leave the logs out, or --tune")
+    from ..studies.tuning import plan_tuning
+
+    asked = plan_tuning(
+        tune,
+        options.list_overrides(overrides, duration),
+        laws=options.split_names(law),
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity,
+        seeds=seeds,
+    )
+    _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
