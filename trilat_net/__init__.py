@@ -51,7 +51,7 @@ if _TYPE_CHECKING:
     from .scenario.law_skeleton import new_law
     from .scenario.measured_traces import import_trace
     from .studies.trials.trial import trials
-    from .studies.trials.trial_runner import check
+    from .studies.trials.trial_report import check
 
     __version__: str
 
@@ -99,7 +99,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "check": "trilat_net.studies.trials.trial_runner",
+    "check": "trilat_net.studies.trials.trial_report",
     "compiled": "trilat_net.core.compiled_law",
     "create_keys": "trilat_net.net.member_keys",
     "create_signing_keys": "trilat_net.log.log_signature",
