@@ -29,7 +29,7 @@ from trilat_net.analysis.certificate.energy_balance import EnergyBalance, comput
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
-from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
+from trilat_net.studies.sweep.sweep_cell import CellClass, classify_cell
 from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
 from trilat_net.studies.tuning.search_space import build_model_information, select_search_spaces
 from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges

@@ -55,7 +55,7 @@ if _TYPE_CHECKING:
     from .scenario.law_skeleton import new_law as new_law
     from .scenario.measured_traces import import_trace as import_trace
     from .studies.trials.trial import trials as trials
-    from .studies.trials.trial_runner import check as check
+    from .studies.trials.trial_report import check as check
 
     __version__: str
 
@@ -78,7 +78,7 @@ _NAMES = {
     "trilat_net.scenario.law_skeleton": "new_law",
     "trilat_net.scenario.measured_traces": "import_trace",
     "trilat_net.studies.trials.trial": "trials",
-    "trilat_net.studies.trials.trial_runner": "check",
+    "trilat_net.studies.trials.trial_report": "check",
 }
 """By module what is offered of it."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -41,7 +41,7 @@ from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.digest_chain import ChainState, Integrity
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.cell_result import classify_cell
+from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.theory.end_pose import find_end_pose_roots
 from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root

@@ -31,7 +31,7 @@ def test_studies_take_tables_or_a_scenario() -> None:
     assert {site.control.code for site in scenario.sites.values()} == {"tests.own_laws:PD"}
     for source in (TABLES, scenario):
         swept = plan_sweep(source, ["control.d=4"], over=["control.K=10,30"], laws=[PD, "p_d"])
-        cells = [swept.written.scenario(*swept.cell(n).overrides) for n in range(4)]
+        cells = [swept.scenario(*swept.cell(n).overrides) for n in range(4)]
         controls = [cell.sites["s"].control for cell in cells]
         assert [control.settings for control in controls[:2]] == [{"K": K, "d": 4} for K in (10, 30)]
         assert [(control.K[0], control.d[0]) for control in controls[2:]] == [(10.0, 4.0), (30.0, 4.0)]

@@ -10,7 +10,7 @@ from tests.certificate.adversaries import RunInMemory
 from tests.core.chain_references import Array, ChainState, chain_references
 from trilat_net.analysis.run_end import Stability
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.cell_result import CellClass, classify_cell
+from trilat_net.studies.sweep.sweep_cell import CellClass, classify_cell
 from trilat_net.theory import iterate_linear_edges
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.linear_edge import LinearEdge, find_contact_growth

@@ -106,7 +106,7 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
     """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
     from rich.progress import Progress
 
-    from ..studies.trials.trial_runner import run_trials
+    from ..studies.trials.trial_report import run_trials
 
     to_do = Counter(trial.source for trial in batch)
     with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:

@@ -24,10 +24,9 @@ if TYPE_CHECKING:
     from ..studies.sweep import FinishedSweep
     from ..studies.sweep.live_confirmation import LiveSession
     from ..studies.sweep.margin_search import SearchRange
-    from ..studies.sweep.sweep_folder import SweepFolder
     from ..studies.sweep.sweep_plan import SweepPlan
     from ..studies.sweep.sweep_results import SweepResults
-    from ..studies.sweep.sweep_run import DurationEstimate
+    from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder
 
 
 _option = partial(typer.Option, rich_help_panel="Maps and edges")
@@ -121,7 +120,7 @@ def _start_sweep(
     asked: "SweepPlan", output: Path | None, jobs: int | None, on: str | None, *, yes: bool
 ) -> "FinishedSweep":
     """Runs a sweep, or continues it if its folder holds it."""
-    from ..studies.sweep.sweep_folder import PLAN_FILE, prepare_sweep_folder
+    from ..studies.sweep.sweep_run import PLAN_FILE, prepare_sweep_folder
 
     if output is not None and (output / PLAN_FILE).exists():
         return _resume_sweep(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
@@ -153,7 +152,7 @@ def _estimate(
 
 
 def _print_plan(asked: "SweepPlan") -> None:
-    from ..studies.sweep.sweep_run import describe_sweep_plan
+    from ..studies.sweep.sweep_results import describe_sweep_plan
 
     for line in describe_sweep_plan(asked):
         terminal.print_text(line)
@@ -189,7 +188,7 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
-    from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
+    from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
 
     for line in [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]:
         terminal.print_text(line)
@@ -224,7 +223,7 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_run import build_reproduce_command
+    from ..studies.sweep.sweep_results import build_reproduce_command
 
     results = read_results(path)
     if as_json:
@@ -408,7 +407,7 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 def _is_results(source: str) -> bool:
     """True if a source names the results of a sweep; names of shipped scenarios never do."""
     from ..scenario import list_shipped
-    from ..studies.sweep.sweep_folder import PLAN_FILE
+    from ..studies.sweep.sweep_run import PLAN_FILE
 
     return source not in list_shipped() and (
         source.endswith(".parquet") or (Path(source) / PLAN_FILE).exists()

@@ -60,7 +60,15 @@ class LogComparison(Result):
         yield from ("", _tabulate_quantities(self.metrics, self.means), "")
         for name, lines in self.remarks.items():
             yield from (MarkedText("[bold]note[/bold]", f"{name}: {line}") for line in lines)
-        yield from _list_reasons(self.metrics)
+        reasons = [
+            f"{name}: no {row.quantity.name}: {entry.why}"
+            for row in self.metrics.rows
+            for name, entry in zip(self.metrics.columns, row.entries, strict=True)
+            if entry.value is None and entry.applies
+        ]
+        yield from reasons[:_MOST_REASONS]
+        if len(reasons) > _MOST_REASONS:
+            yield f"and {len(reasons) - _MOST_REASONS} more, which --json names"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --json`."""
@@ -137,15 +145,3 @@ def _tabulate_quantities(found: MetricComparison, means: Sequence[MeanInterval |
             rows.append([f"  {row.quantity.name}", row.quantity.unit or "-", *values])
     heads = ("", "unit", *found.columns, *(["mean, 95 %"] if means else []))
     return TextTable(heads, rows, align="llr")
-
-
-def _list_reasons(found: MetricComparison) -> Iterator[str]:
-    reasons = [
-        f"{name}: no {row.quantity.name}: {entry.why}"
-        for row in found.rows
-        for name, entry in zip(found.columns, row.entries, strict=True)
-        if entry.value is None and entry.applies
-    ]
-    yield from reasons[:_MOST_REASONS]
-    if len(reasons) > _MOST_REASONS:
-        yield f"and {len(reasons) - _MOST_REASONS} more, which --json names"

@@ -4,7 +4,6 @@ Invariant: batches of a site follow each other without a gap, however long the r
 what it needs, so that the memory of a run is its taker's.
 """
 
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -75,53 +74,41 @@ class BatchedRun(NamedTuple):
     late_samples: int
 
 
-class _PendingRecords:
-    """Records of one site that were not passed on yet."""
+def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
+    """Returns the batch of columns q, qd, q_des, tau, tau_x and x, which is empty in joint space."""
+    q, qd, q_des, tau, tau_x, x = vectors
+    e = find_task_errors(x, q_des, axes) if x.size else q - q_des
+    return RecordBatch(t_ns, q, qd, e, tau, tau_x, used)
 
-    def __init__(self, take: Callable[[RecordBatch], None], axes: Sequence[float]) -> None:
-        self._take, self._axes = take, axes
-        self._t_ns, self._used, self._floats = array("q"), array("q"), array("d")
-        self._lengths: tuple[int, ...] = ()
 
-    def add(self, output: TickRecord) -> None:
-        """Takes one record."""
-        self._t_ns.append(output.t_ns)
-        self._used.extend(output.used)
-        vectors = (output.q, output.qd, output.q_des, output.tau, output.tau_x, output.x)
-        for vector in vectors:
-            self._floats.extend(vector)
-        self._lengths = tuple(map(len, vectors))
-        if len(self._t_ns) >= BATCH_RECORDS:
-            self.flush()
-
-    def flush(self) -> None:
-        """Passes the pending records on."""
-        if not self._t_ns:
-            return
-        t_ns = np.array(self._t_ns, dtype=np.int64)
-        used = np.array(self._used, dtype=np.int64).reshape(len(t_ns), -1)
-        rows = np.array(self._floats).reshape(len(t_ns), -1)
-        vectors = np.split(rows, np.cumsum(self._lengths)[:-1], axis=1)
-        q, qd, q_des, tau, tau_x, x = map(np.ascontiguousarray, vectors)
-        e = find_task_errors(x, q_des, self._axes) if x.size else q - q_des
-        self._take(RecordBatch(t_ns, q, qd, e, tau, tau_x, used))
-        for column in (self._t_ns, self._used, self._floats):
-            del column[:]
+def _pack_records(axes: Sequence[float], records: Sequence[TickRecord]) -> RecordBatch:
+    rows = [(one.q, one.qd, one.q_des, one.tau, one.tau_x, one.x) for one in records]
+    t_ns = np.array([one.t_ns for one in records], dtype=np.int64)
+    used = np.array([one.used for one in records], dtype=np.int64)
+    return _make_batch(axes, t_ns, used, *map(np.array, zip(*rows, strict=True)))
 
 
 def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]) -> BatchedRun:
     """Runs a scenario in virtual time and passes every site's records on, batch by batch."""
-    pending = {name: _PendingRecords(taker, scenario.arms[name].axes) for name, taker in take.items()}
+    pending: dict[str, list[TickRecord]] = {name: [] for name in take}
     sites: dict[str, Site] = {}
     diverged_at_s: float | None = None
+
+    def flush(name: str) -> None:
+        if pending[name]:
+            take[name](_pack_records(scenario.arms[name].axes, pending[name]))
+            pending[name].clear()
+
     with process.pause_gc():
         for site, _, output in virtual.execute_virtual(scenario):
             sites[site.name] = site
-            pending[site.name].add(output)
+            pending[site.name].append(output)
+            if len(pending[site.name]) == BATCH_RECORDS:
+                flush(site.name)
             if output.mode is Mode.DIVERGED and diverged_at_s is None:
                 diverged_at_s = output.t_ns / NS_PER_S
-    for records in pending.values():
-        records.flush()
+    for name in pending:
+        flush(name)
     return BatchedRun(diverged_at_s, sum(count.late for site in sites.values() for count in site.counts()))
 
 
@@ -141,8 +128,8 @@ def run_compiled_in_batches(
         for name, place, (t_ns, rows) in zip(scenario.names, columns, run.take_records(), strict=True):
             if not len(t_ns):
                 continue
-            q, qd, q_des, tau, tau_x = (rows[:, place[key]] for key in ("q", "qd", "q_des", "tau", "tau_x"))
-            x, axes = rows[:, place.get("x", slice(0, 0))], scenario.arms[name].axes
-            e = find_task_errors(x, q_des, axes) if x.size else q - q_des
-            take[name](RecordBatch(t_ns, q, qd, e, tau, tau_x, np.zeros((len(t_ns), 0), np.int64)))
+            keys = ("q", "qd", "q_des", "tau", "tau_x", "x")
+            vectors = (rows[:, place.get(key, slice(0, 0))] for key in keys)
+            used = np.zeros((len(t_ns), 0), np.int64)
+            take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
     return run.diverged_s

@@ -1,14 +1,16 @@
 """The journal of a study: a line per finished run, in a file that is only ever appended to.
 
-Invariant: each line carries a CRC-32 over the study and its text, so a torn line is ignored, and so is one of
-another study; a process that dies at any moment loses no earlier line and spoils no later one.
+A line is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
+
+Invariant: by that checksum a torn line is ignored, and so is one of another study; a process that dies at any
+moment loses no earlier line and spoils no later one.
 """
 
 import errno
 import json
 import os
 import zlib
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -46,11 +48,14 @@ class RunJournal(Generic[E]):
     """
 
     def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
-        self._path, self._study, self._kind, self._remedy = path, study, kind, remedy
+        self._path, self._study, self._remedy = path, study, remedy
         self.done: dict[tuple[Any, int], E] = {}
         before = path.read_bytes() if path.exists() else b""
-        for entry in self._entries(before):
-            self.done.setdefault((entry.cell, entry.seed), entry)
+        for line in before.split(b"\n"):
+            text, tab, digits = line.rpartition(b"\t")
+            if tab and digits == b"%08x" % self._checksum(text):
+                entry = msgspec.convert(json.loads(text), kind)  # unlike msgspec, json knows infinity
+                self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = path.open("ab", buffering=0)
         if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
             self._put(b"\n")
@@ -70,7 +75,8 @@ class RunJournal(Generic[E]):
         """
         if (entry.cell, entry.seed) in self.done:
             return
-        self._put(encode_journal_line(entry, self._study))
+        text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
+        self._put(b"%s\t%08x\n" % (text, self._checksum(text)))
         self.done[entry.cell, entry.seed] = entry
 
     def _put(self, data: bytes) -> None:
@@ -80,18 +86,5 @@ class RunJournal(Generic[E]):
         except OSError as error:
             raise describe_write_error(self._path, error, self._remedy) from None
 
-    def _entries(self, data: bytes) -> Iterator[E]:
-        for one in data.split(b"\n"):
-            text, tab, digits = one.rpartition(b"\t")
-            if tab and digits == b"%08x" % _checksum(text, self._study):
-                yield msgspec.convert(json.loads(text), self._kind)  # unlike msgspec, json knows infinity
-
-
-def encode_journal_line(entry: JournalEntry, study: str) -> bytes:
-    """Returns the line of a run: JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits."""
-    text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
-    return b"%s\t%08x\n" % (text, _checksum(text, study))
-
-
-def _checksum(text: bytes, study: str) -> int:
-    return zlib.crc32(text, zlib.crc32(study.encode()))
+    def _checksum(self, text: bytes) -> int:
+        return zlib.crc32(text, zlib.crc32(self._study.encode()))

@@ -5,8 +5,8 @@ from itertools import product
 from typing import Any
 
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.map_plane import MapPlane, build_plane
+from trilat_net.studies.sweep.sweep_cell import CellClass
 
 P_D = load_scenario("p_d_margin")
 DELAYS_MS = (0, 100, 200, 300, 400)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tests.studies.tuning.experiments import TRIO
 from trilat_net.analysis.run_end import EndBehaviour
-from trilat_net.studies.sweep.cell_result import CellClass, CellResult
+from trilat_net.studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_sweep
 
 SHORT = TRIO.replace("duration_s = 2.0", "duration_s = 0.5")

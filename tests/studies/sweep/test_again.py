@@ -10,8 +10,8 @@ from tests.cli.running import trilat
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.cell_result import classify_end
-from trilat_net.studies.sweep.sweep_run import build_reproduce_command
+from trilat_net.studies.sweep.sweep_cell import classify_end
+from trilat_net.studies.sweep.sweep_results import build_reproduce_command
 
 from .quick import SHORT, asked
 
@@ -50,7 +50,7 @@ def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResul
 
 
 def test_where_the_scenario_has_changed_the_rows_own_is_named(results: SweepResults, tmp_path: Path) -> None:
-    source = Path(results.plan.written.source)
+    source = Path(results.plan.written.called)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
     try:

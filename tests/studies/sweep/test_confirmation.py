@@ -9,8 +9,7 @@ import pytest
 from trilat_net.errors import UsageError
 from trilat_net.execution import virtual
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep import cell_result
-from trilat_net.studies.sweep.cell_result import CellClass
+from trilat_net.studies.sweep import sweep_cell
 from trilat_net.studies.sweep.live_confirmation import (
     LiveSession,
     SessionRunner,
@@ -18,6 +17,7 @@ from trilat_net.studies.sweep.live_confirmation import (
     confirm_cell,
 )
 from trilat_net.studies.sweep.map_page import tabulate_confirmations
+from trilat_net.studies.sweep.sweep_cell import CellClass
 
 from .maps import KEYS, Row, by_the_line, rows
 
@@ -30,7 +30,7 @@ WILD = load_scenario(
 
 def cell(scenario: Scenario) -> Row:
     """A cell's row, as its own run makes it."""
-    outcome = cell_result.classify_cell(scenario.text, scenario.duration_s)
+    outcome = sweep_cell.classify_cell(scenario.text, scenario.duration_s)
     return {
         "cell": 3,
         **dict.fromkeys(KEYS, 1.0),

@@ -14,9 +14,9 @@ from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_layout import collect_provenance
 from trilat_net.studies.run_journal import RunJournal
-from trilat_net.studies.sweep import sweep_folder as folders
+from trilat_net.studies.sweep import sweep_run as folders
 from trilat_net.studies.sweep.sweep_cell import CellRun
-from trilat_net.studies.sweep.sweep_folder import (
+from trilat_net.studies.sweep.sweep_run import (
     PLAN_FILE,
     open_sweep_folder,
     prepare_sweep_folder,

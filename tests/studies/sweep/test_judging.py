@@ -13,7 +13,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.cell_result import (
+from trilat_net.studies.sweep.sweep_cell import (
     CellClass,
     CellResult,
     classify_cell,

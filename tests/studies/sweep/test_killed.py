@@ -11,7 +11,7 @@ import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
 from tests.net.waiting import until
-from trilat_net.studies.sweep.sweep_folder import JOURNAL_FILE
+from trilat_net.studies.sweep.sweep_run import JOURNAL_FILE
 
 from .quick import SHORT
 

@@ -11,23 +11,20 @@ from tests.json_outline import is_documented
 from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
-from trilat_net.studies.sweep import cell_result, margin_search
-from trilat_net.studies.sweep.cell_result import CellClass, CellResult
+from trilat_net.studies.sweep import margin_search, sweep_cell
 from trilat_net.studies.sweep.map_plane import StableInterval
 from trilat_net.studies.sweep.margin_search import (
     SCAN_POINTS,
     GridPointMargin,
     KeyMargin,
     SearchRange,
-    build_margin_command,
-    build_margin_page,
+    SweepMargins,
     format_range_axis,
-    margins_to_json,
     parse_search_range,
     search_key_margin,
     search_margins,
-    tabulate_margins,
 )
+from trilat_net.studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_sweep
 
 WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
@@ -50,7 +47,7 @@ def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
         motion = EndBehaviour.CONVERGED if stable else EndBehaviour.DIVERGED
         return CellResult(verdict, motion, 1.0, 0, 0.0, 0.0, None, None, 0.0, None, None)
 
-    monkeypatch.setattr(cell_result, "classify_cell", judge)
+    monkeypatch.setattr(sweep_cell, "classify_cell", judge)
 
 
 @pytest.fixture
@@ -104,9 +101,8 @@ def found(*spans: StableInterval, stable: bool | None = None) -> GridPointMargin
 
 def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     edges = (StableInterval(0.49, 0.492, False, True), StableInterval(1.8, 2.1, True, False))
-    grid = tabulate_margins(
-        asked(), WITHIN, [found(*edges), found(stable=True), found(stable=False), found()]
-    )
+    every = [found(*edges), found(stable=True), found(stable=False), found()]
+    grid = SweepMargins(asked(), WITHIN, every).table()
     edge = grid.headers.index("edge of d (N m s/rad)")
     assert [row[edge] for row in grid.rows] == [
         "0.49 to 0.492",
@@ -119,19 +115,13 @@ def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     linear = grid.headers.index("linear")
     assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
     assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
-    assert "not monotone in 1 of 2 places" in build_margin_page(
-        asked(), WITHIN, [found(*edges), found(stable=True)]
-    )
+    assert "not monotone in 1 of 2 places" in SweepMargins(asked(), WITHIN, every[:2]).page()
 
 
 def test_the_facts_are_json_and_name_the_command() -> None:
-    told = json.loads(
-        json.dumps(
-            margins_to_json(asked(), WITHIN, [found(StableInterval(0.49, 0.492, False, True))]),
-            allow_nan=False,
-        )
-    )
-    assert told["command"] == build_margin_command(asked(), WITHIN)
+    margins = SweepMargins(asked(), WITHIN, [found(StableInterval(0.49, 0.492, False, True))])
+    told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
+    assert told["command"] == margins.command
     assert told["command"].endswith("--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005")
     (place,) = told["places"]
     assert place.pop("link.delay_ms") == 100.0

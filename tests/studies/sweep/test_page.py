@@ -12,7 +12,6 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from trilat_net.reporting.figure_size import make_print_size
-from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.map_page import (
     CLASS_COLOURS,
     build_map_page,
@@ -23,6 +22,7 @@ from trilat_net.studies.sweep.map_page import (
 )
 from trilat_net.studies.sweep.map_plane import CELL_CLASSES, MapPlane
 from trilat_net.studies.sweep.stability_map import MapLine, StabilityMap
+from trilat_net.studies.sweep.sweep_cell import CellClass
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 

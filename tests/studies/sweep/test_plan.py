@@ -34,8 +34,9 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
 @given(places=st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 1), st.integers(0, 1)))
 def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...]) -> None:
     law, delay, pose, order = places
-    cell = cube.cell(((law * 3 + delay) * 2 + pose) * 2 + order)
-    assert cell == cube.cell_at(places)
+    number = ((law * 3 + delay) * 2 + pose) * 2 + order
+    cell = cube.cell(number)
+    assert cell.number == number
     assert cell.law == ["p_d", "adaptive"][law]
     assert cell.values == (20.0 * delay, [0.1, 0.2][pose], ["newest", "in_order"][order])
 
@@ -66,8 +67,7 @@ def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
 
 @given(number=st.integers(0, 23), seed=st.integers(1, 3))
 def test_a_cell_is_what_its_overrides_make_of_the_scenario(cube: SweepPlan, number: int, seed: int) -> None:
-    task = cube.task(number, seed)
-    scenario = task.written.scenario(*task.overrides, f"seed={seed}")
+    scenario = cube.scenario(*cube.cell(number).overrides, f"seed={seed}")
     delay_ms, pose, order = cube.cell(number).values
     assert {link.delay_ms for link in scenario.links.values()} == {delay_ms}
     assert {link.order for link in scenario.links.values()} == {order}
@@ -93,7 +93,7 @@ def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
 
 def test_a_law_that_all_sites_have_keeps_the_gains_of_the_scenario() -> None:
     found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
-    stays, other = (found.written.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
+    stays, other = (found.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
     assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
     assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
 
@@ -101,7 +101,7 @@ def test_a_law_that_all_sites_have_keeps_the_gains_of_the_scenario() -> None:
 def test_another_law_replaces_that_of_every_site_its_own_gains_too() -> None:
     found = plan_sweep("contact", laws=["p_f", "p_d"])
     assert found.cell(0).overrides == ()
-    of_all = found.written.scenario(*found.cell(1).overrides)
+    of_all = found.scenario(*found.cell(1).overrides)
     assert {spec.control for spec in of_all.sites.values()} == {
         load_scenario("paper", ["control.law=p_d"]).sites["s"].control
     }

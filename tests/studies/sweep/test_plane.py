@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import list_shipped
-from trilat_net.studies.sweep.cell_result import CellClass
 from trilat_net.studies.sweep.map_plane import (
     CELL_CLASSES,
     PlaneAxis,
@@ -20,6 +19,7 @@ from trilat_net.studies.sweep.map_plane import (
     label_axis,
     label_setting,
 )
+from trilat_net.studies.sweep.sweep_cell import CellClass
 
 from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 

@@ -7,20 +7,15 @@ import pytest
 
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.studies.sweep import (
-    cell_result,
     open_sweep_folder,
     prepare_sweep_folder,
     run_sweep,
+    sweep_cell,
 )
-from trilat_net.studies.sweep.cell_result import CellClass
+from trilat_net.studies.sweep.sweep_cell import CellClass
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_run import (
-    DurationEstimate,
-    describe_sweep_plan,
-    estimate_sweep,
-    refuse_oversized_sweep,
-    summarize_sweep,
-)
+from trilat_net.studies.sweep.sweep_results import describe_sweep_plan, summarize_sweep
+from trilat_net.studies.sweep.sweep_run import DurationEstimate, estimate_sweep, refuse_oversized_sweep
 
 from .quick import DELAYS, Judge, asked
 
@@ -28,7 +23,7 @@ from .quick import DELAYS, Judge, asked
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
     found = Judge()
-    monkeypatch.setattr(cell_result, "classify_cell", found)
+    monkeypatch.setattr(sweep_cell, "classify_cell", found)
     return found
 
 
@@ -141,7 +136,7 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
 
 
 def test_a_summary_counts_every_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cell_result, "classify_cell", Judge())
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = asked(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     first, *others = summarize_sweep(results)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.studies.sweep import SweepResults, cell_result, prepare_sweep_folder, read_results, run_sweep
-from trilat_net.studies.sweep.cell_result import CellClass
-from trilat_net.studies.sweep.sweep_cell import CellRun, diff_lines
+from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, read_results, run_sweep, sweep_cell
+from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import (
     GRID_POINTS_FILE,
@@ -36,7 +35,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults,
     path = tmp_path_factory.mktemp("swept")
     sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(cell_result, "classify_cell", judge := Judge())
+        patched.setattr(sweep_cell, "classify_cell", judge := Judge())
         return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
 
 
@@ -147,7 +146,7 @@ def test_without_polars_or_with_an_old_one_the_cure_is_named(monkeypatch: pytest
 
 @pytest.fixture
 def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
-    monkeypatch.setattr(cell_result, "classify_cell", Judge())
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
     return collect_grid_points(run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results)
 

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as Xml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.studies.trials.expectations import ExpectationResult
+from trilat_net.studies.trials.trial import ExpectationResult
 from trilat_net.studies.trials.trial_report import (
     MAX_FAILURES_SHOWN,
     TrialReport,

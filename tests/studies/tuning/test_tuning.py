@@ -21,7 +21,6 @@ from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 from trilat_net.studies.tuning.tuning_report import (
     tabulate_front,
     tabulate_laws,
-    tuning_to_json,
     write_tuning,
 )
 
@@ -103,7 +102,7 @@ def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> N
 def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
     """A speed limit that nothing keeps: no front, and no silence about it."""
     found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
-    law = tuning_to_json(found)["laws"]["p_d"]
+    law = found.to_dict()["laws"]["p_d"]
     assert law["outcomes"] == {word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass}
     assert law["front"] == []
     assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4

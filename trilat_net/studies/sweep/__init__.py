@@ -13,10 +13,9 @@ In a folder that holds the same sweep, `run_sweep` continues from its journal; `
 one. `on="tcp://SCHEDULER:8786"` runs the cells on a Dask cluster.
 """
 
-from .sweep_folder import open_sweep_folder, prepare_sweep_folder
 from .sweep_plan import SweepPlan, plan_sweep
 from .sweep_results import SweepResults, read_results
-from .sweep_run import FinishedSweep, run_sweep
+from .sweep_run import FinishedSweep, open_sweep_folder, prepare_sweep_folder, run_sweep
 
 __all__ = [
     "FinishedSweep",

@@ -15,7 +15,7 @@ from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
 from ...scenario import Scenario, parse_scenario
-from .cell_result import CellClass, classify_end
+from .sweep_cell import CellClass, classify_end
 from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0

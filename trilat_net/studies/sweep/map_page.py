@@ -28,7 +28,6 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
 from ...reporting.text_table import TextTable
-from .cell_result import CellClass
 from .live_confirmation import ConfirmedCell
 from .map_plane import (
     CELL_CLASSES,
@@ -40,6 +39,7 @@ from .map_plane import (
     label_axis,
 )
 from .stability_map import MapLine, StabilityMap
+from .sweep_cell import CellClass
 
 CLASS_COLOURS = {
     CellClass.CONVERGED: "#d3e4f3",
@@ -57,6 +57,9 @@ _LINE_STYLES: tuple[dict[str, Any], ...] = (
 )
 _VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
 _EXPONENTS = LinearSegmentedColormap.from_list("exponents", ["#004488", "#ffffff", "#a23b53"], 257)
+_CLASSES_OF_SHARES = (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
+_SHARES = LinearSegmentedColormap.from_list("share", [CLASS_COLOURS[one] for one in _CLASSES_OF_SHARES])
+"""Colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
 _HALO_PT = 2.6
 _COUNT_PT = 5.0
 _LETTERS_PER_IN = 13
@@ -127,7 +130,7 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
             axes.vlines(np.interp(at, plane.x.values, plane.x.places), *ends, **_VERDICT_EDGE)
     elif plane.seeds > 1:
         shown = np.ma.masked_invalid(panel.share)
-        axes.pcolormesh(x, y, shown, cmap=_shares(), vmin=0.0, vmax=1.0, rasterized=True)
+        axes.pcolormesh(x, y, shown, cmap=_SHARES, vmin=0.0, vmax=1.0, rasterized=True)
     else:
         classes = np.ma.masked_where(panel.runs == 0, panel.counts.argmax(axis=2))
         norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
@@ -207,12 +210,6 @@ def _scale(axes: Axes, plane: MapPlane) -> None:
         axes.spines[spine].set_visible(True)
 
 
-def _shares() -> LinearSegmentedColormap:
-    """Returns the colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
-    classes = (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
-    return LinearSegmentedColormap.from_list("share", [CLASS_COLOURS[one] for one in classes])
-
-
 def _find_exponent_limit(plane: MapPlane) -> float:
     """Returns the exponent of the darkest colours, 1/s, a round number that four fifths are below."""
     found = np.abs(np.concatenate([panel.exponents_per_s.ravel() for panel in plane.panels]))
@@ -225,7 +222,7 @@ def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
     """Draws what the colours of shares or of exponents mean; a pointed end has all beyond it."""
     twins = plane.judged_by_twins
     limit = _find_exponent_limit(plane) if twins else 1.0
-    colours = ScalarMappable(cmap=_EXPONENTS if twins else _shares())
+    colours = ScalarMappable(cmap=_EXPONENTS if twins else _SHARES)
     colours.set_clim(-limit if twins else 0.0, limit)
     ends = "both" if twins else "neither"
     bar = figure.colorbar(colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=ends)

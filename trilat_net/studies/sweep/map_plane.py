@@ -19,7 +19,7 @@ from ...core.vectors import Array
 from ...errors import UsageError
 from ...scenario import Scenario
 from ...scenario.fields import is_number
-from .cell_result import CellClass
+from .sweep_cell import CellClass
 
 _UNITS = {
     "_nm_s_rad": "N m s/rad",

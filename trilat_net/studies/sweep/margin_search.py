@@ -9,7 +9,7 @@ function of its scenario, its seed and the range.
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +25,7 @@ from ...scenario import Scenario
 from ...scenario.law_consent import list_imported_laws
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from . import cell_result
+from . import sweep_cell
 from .map_plane import StableInterval, label_axis
 from .stability_map import (
     build_sweep_command,
@@ -34,8 +34,7 @@ from .stability_map import (
     format_override,
     format_override_value,
 )
-from .sweep_cell import SweepCell, SweepSource
-from .sweep_plan import SweepPlan
+from .sweep_plan import SweepCell, SweepPlan
 
 SCAN_POINTS = 9
 """Values of the scan: islands that are wider than an eighth of the range are seen."""
@@ -136,10 +135,9 @@ class SearchRange(NamedTuple):
 class MarginTask(NamedTuple):
     """A grid point to be searched: picklable, and all that a process needs."""
 
-    written: SweepSource
+    plan: SweepPlan
     cell: SweepCell
     seed: int
-    longest_s: float
     range: SearchRange
 
     def __str__(self) -> str:
@@ -208,8 +206,8 @@ def search_margins(
     for number in range(0, plan.cells, 2):  # the last axis has the two ends of the range
         end = plan.cell(number)
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
-        seeds = plan.seeds if plan.written.scenario(*end.overrides).random else plan.seeds[:1]
-        searches += [MarginTask(plan.written, cell, seed, plan.longest_s, within) for seed in seeds]
+        seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
+        searches += [MarginTask(plan, cell, seed, within) for seed in seeds]
     laws = list_imported_laws([plan.base])
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(search_margin_task, searches, progress)
@@ -225,12 +223,12 @@ def search_margin_task(task: MarginTask) -> GridPointMargin:
 
     def at(value: float) -> Scenario:
         more = format_override(key, value), f"seed={task.seed}"
-        return task.written.scenario(*task.cell.overrides, *more)
+        return task.plan.scenario(*task.cell.overrides, *more)
 
     def stable(value: float) -> bool | None:
         scenario = at(value)
-        longest_s = max(task.longest_s, scenario.duration_s)
-        return cell_result.classify_cell(scenario.text, longest_s).verdict.stable
+        longest_s = max(task.plan.longest_s, scenario.duration_s)
+        return sweep_cell.classify_cell(scenario.text, longest_s).verdict.stable
 
     try:
         at(low + (high - low) / 3.0**0.5)
@@ -243,27 +241,6 @@ def search_margin_task(task: MarginTask) -> GridPointMargin:
     return GridPointMargin(task.cell, task.seed, margin, linear, remark, closed)
 
 
-def tabulate_margins(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> TextTable:
-    """Returns margins as a table, a row per edge, or per place that has none."""
-    axes = plan.axes[:-1]
-    seeds = len({one.seed for one in found}) > 1
-    closed = any(one.closed is not None for one in found)
-    heads = [*(label_axis(axis.key, plan.base) for axis in axes), *(["law"] if plan.laws else [])]
-    heads += [*(["seed"] if seeds else []), f"edge of {label_axis(within.key, plan.base)}", "stable is"]
-    heads += ["linear", "difference", *(["closed form", "difference"] if closed else []), "runs"]
-    rows = []
-    for one in found:
-        place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values]
-        place += [*([one.cell.law] if plan.laws else []), *([str(one.seed)] if seeds else [])]
-        for span in one.margin.spans or (None,):
-            near = within.low if span is None else span.middle
-            linear = min(one.linear, key=lambda edge, near=near: abs(edge - near), default=None)  # type: ignore[misc]
-            cells = [*place, *_edge_cells(one.margin, span), *_theory_cells(span, linear)]
-            cells += _theory_cells(span, one.closed) if closed else []
-            rows.append((*cells, str(one.margin.runs)))
-    return TextTable(tuple(heads), rows)
-
-
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
     """The edges of every place of a plan and every seed, in a range along one key."""
@@ -272,9 +249,38 @@ class SweepMargins(Result):
     within: SearchRange
     found: list[GridPointMargin]
 
+    @property
+    def command(self) -> str:
+        """The command that searches them."""
+        key, *numbers = self.within
+        low, high, tolerance = map(format_override_value, numbers)
+        words = ["--margin", f"{key}={low}:{high}", "--tolerance", tolerance]
+        return build_sweep_command(self.plan._replace(axes=self.plan.axes[:-1]), *words)
+
+    def table(self) -> TextTable:
+        """Returns a row per edge, or per place that has none."""
+        plan, axes = self.plan, self.plan.axes[:-1]
+        seeds = len({one.seed for one in self.found}) > 1
+        closed = any(one.closed is not None for one in self.found)
+        heads = [*(label_axis(axis.key, plan.base) for axis in axes), *(["law"] if plan.laws else [])]
+        heads += [*(["seed"] if seeds else []), f"edge of {label_axis(self.within.key, plan.base)}"]
+        heads += ["stable is", "linear", "difference"]
+        heads += [*(["closed form", "difference"] if closed else []), "runs"]
+        rows = []
+        for one in self.found:
+            place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values]
+            place += [*([one.cell.law] if plan.laws else []), *([str(one.seed)] if seeds else [])]
+            for span in one.margin.spans or (None,):
+                near = self.within.low if span is None else span.middle
+                linear = min(one.linear, key=lambda edge, near=near: abs(edge - near), default=None)  # type: ignore[misc]
+                cells = [*place, *_edge_cells(one.margin, span), *_theory_cells(span, linear)]
+                cells += _theory_cells(span, one.closed) if closed else []
+                rows.append((*cells, str(one.margin.runs)))
+        return TextTable(tuple(heads), rows)
+
     def blocks(self) -> Iterator[TextTable]:
         """Yields its text."""
-        yield tabulate_margins(self.plan, self.within, self.found)
+        yield self.table()
 
     def headline(self) -> str:
         """Returns how many edges were found where."""
@@ -284,7 +290,27 @@ class SweepMargins(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat sweep --margin --json`."""
-        return margins_to_json(self.plan, self.within, self.found)
+        keys = [axis.key for axis in self.plan.axes[:-1]]
+        return {
+            "command": self.command,
+            "scenario_sha256": self.plan.base.sha256,
+            **self.within._asdict(),
+            "places": [
+                {
+                    **dict(zip(keys, one.cell.values, strict=True)),
+                    **({"law": one.cell.law} if self.plan.laws else {}),
+                    "seed": one.seed,
+                    "edges": [span._asdict() for span in one.margin.spans],
+                    "stable_everywhere": one.margin.stable,
+                    "undecided": one.margin.undecided,
+                    "runs": one.margin.runs,
+                    "linear": list(one.linear),
+                    "closed_form": one.closed,
+                    "remark": one.remark,
+                }
+                for one in self.found
+            ],
+        }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per edge, or per place that has none."""
@@ -294,58 +320,24 @@ class SweepMargins(Result):
             for edge in place["edges"] or [{}]
         ]
 
+    def page(self) -> str:
+        """Returns them as a page in Markdown."""
+        base = self.plan.base
+        parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
+        parts.append(self.table().markdown())
+        remarks = dict.fromkeys(one.remark for one in self.found if one.remark)
+        parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
+        if islands := sum(len(one.margin.spans) > 1 for one in self.found):
+            where = f"in {islands} of {len(self.found)} places"
+            parts.append(f"Stability is not monotone {where}: they have several edges.")
+        return "\n\n".join(parts) + "\n"
+
     def write(self, folder: Path) -> list[Path]:
         """Writes margin.json and margin.md, and returns their paths."""
         paths = [folder / "margin.json", folder / "margin.md"]
         write_whole(paths[0], json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
-        write_whole(paths[1], build_margin_page(self.plan, self.within, self.found))
+        write_whole(paths[1], self.page())
         return paths
-
-
-def build_margin_page(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> str:
-    """Returns margins as a page in Markdown."""
-    command = build_margin_command(plan, within)
-    remarks = dict.fromkeys(one.remark for one in found if one.remark)
-    parts = [f"# {plan.base.title or plan.base.name}: margin", f"```sh\n{command}\n```"]
-    parts.append(tabulate_margins(plan, within, found).markdown())
-    parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
-    islands = sum(len(one.margin.spans) > 1 for one in found)
-    if islands:
-        where = f"in {islands} of {len(found)} places"
-        parts.append(f"Stability is not monotone {where}: they have several edges.")
-    return "\n\n".join(parts) + "\n"
-
-
-def margins_to_json(plan: SweepPlan, within: SearchRange, found: Sequence[GridPointMargin]) -> dict[str, Any]:
-    """Returns margins as plain values, for JSON."""
-    keys = [axis.key for axis in plan.axes[:-1]]
-    return {
-        "command": build_margin_command(plan, within),
-        "scenario_sha256": plan.base.sha256,
-        **within._asdict(),
-        "places": [
-            {
-                **dict(zip(keys, one.cell.values, strict=True)),
-                **({"law": one.cell.law} if plan.laws else {}),
-                "seed": one.seed,
-                "edges": [span._asdict() for span in one.margin.spans],
-                "stable_everywhere": one.margin.stable,
-                "undecided": one.margin.undecided,
-                "runs": one.margin.runs,
-                "linear": list(one.linear),
-                "closed_form": one.closed,
-                "remark": one.remark,
-            }
-            for one in found
-        ],
-    }
-
-
-def build_margin_command(plan: SweepPlan, within: SearchRange) -> str:
-    """Returns the command that searches margins."""
-    reach = f"{within.key}={format_override_value(within.low)}:{format_override_value(within.high)}"
-    words = ["--margin", reach, "--tolerance", format_override_value(within.tolerance)]
-    return build_sweep_command(plan._replace(axes=plan.axes[:-1]), *words)
 
 
 def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:

@@ -10,8 +10,7 @@ computed, from tick to tick; of the roots' line only those with scheme `digital`
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -29,7 +28,6 @@ from ...theory import GrowthColumn, compute_growth_column
 from ..commands import format_command, set_options
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .map_plane import MapPanel, MapPlane, PlaneAxis, build_plane
-from .sweep_cell import SweepSource
 from .sweep_plan import SweepPlan
 from .sweep_results import SweepResults
 
@@ -241,15 +239,14 @@ def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | N
         excess = [np.nan if one is None else one.excess for one in column]
         edges: dict[int, float] = {}
         for n in _changes(excess):
-            edge = find_criterion_edge(partial(_criterion_at, at, right), *y.values[n : n + 2])
+            edge = find_criterion_edge(
+                lambda up, right=right: evaluate_criterion(at(right, up)),  # type: ignore[misc]
+                *y.values[n : n + 2],
+            )
             edges |= {} if edge is None else {n: edge}
         columns.append(_straighten(y.values, excess, edges))
     line = MapLine(first.symbol, first.text, first.source, np.array(columns).T, 0)
     return line if line.there else None
-
-
-def _criterion_at(at: ScenarioAt, right: float, up: float) -> StabilityCriterion | None:
-    return evaluate_criterion(at(right, up))
 
 
 def trace_linear_analysis(columns: Sequence[GrowthColumn], y: PlaneAxis) -> tuple[MapLine | None, list[str]]:
@@ -324,14 +321,14 @@ class StabilityMap(NamedTuple):
 class PanelScenarios(NamedTuple):
     """The scenarios of a panel along the keys x and y, of its cells and between them. Picklable."""
 
-    written: SweepSource
+    plan: SweepPlan
     fixed: tuple[str, ...]
     x: str
     y: str
 
     def scenario(self, right: float, up: float) -> Scenario:
         """Returns the scenario of a place."""
-        return self.written.scenario(*self.fixed, format_override(self.x, right), format_override(self.y, up))
+        return self.plan.scenario(*self.fixed, format_override(self.x, right), format_override(self.y, up))
 
 
 def build_stability_map(
@@ -355,26 +352,21 @@ def build_stability_map(
     if not drawn.y.key or len(drawn.y.values) < 2:
         return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
-    zeros = map(trace_zero_exponent, drawn.panels)
-    lines = [[next(zeros), trace_closed_form(one.scenario, drawn.x, drawn.y)] for one in at]
+    lines = [
+        [trace_zero_exponent(panel), trace_closed_form(one.scenario, drawn.x, drawn.y)]
+        for panel, one in zip(drawn.panels, at, strict=True)
+    ]
     remarks: dict[str, None] = {}
     if linearly:
-        for some, columns in zip(lines, _columns(drawn, at, jobs, on, progress), strict=True):
-            line, why = trace_linear_analysis(columns, drawn.y)
+        tasks = [(one, x, drawn.y) for one in at for x in drawn.x.values]
+        with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+            columns = iter(pool.map(_column, tasks, progress))
+        for some in lines:
+            line, why = trace_linear_analysis([next(columns) for _ in drawn.x.values], drawn.y)
             some.append(line)
             remarks |= dict.fromkeys(why)
     kept = tuple(tuple(line for line in some if line is not None) for some in lines)
     return StabilityMap(drawn, kept, tuple(remarks), commands, title)
-
-
-def _columns(
-    drawn: MapPlane, at: Sequence[PanelScenarios], jobs: int | None, on: Workers, progress: Progress
-) -> Iterator[tuple[GrowthColumn, ...]]:
-    """Yields per panel how fast the loop grows, column by column."""
-    tasks = [(one, x, drawn.y) for one in at for x in drawn.x.values]
-    with open_worker_pool(jobs, on, most=len(tasks)) as pool:
-        found = iter(pool.map(_column, tasks, progress))
-    return zip(*[found] * len(drawn.x.values), strict=True)
 
 
 def _column(task: tuple[PanelScenarios, float, PlaneAxis]) -> GrowthColumn:
@@ -385,15 +377,14 @@ def _column(task: tuple[PanelScenarios, float, PlaneAxis]) -> GrowthColumn:
 def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
     """Returns what makes the scenario of any place of a panel."""
     settings = dict(panel.settings)
-    law = settings.pop(LAW_AXIS, plan.laws[0] if plan.laws else None)
-    fixed = () if law is None else plan.law_overrides[plan.laws.index(law)]
+    fixed = plan.laws.get(settings.pop(LAW_AXIS, next(iter(plan.laws), "")), ())
     others = tuple(format_override(key, value) for key, value in settings.items())
-    return PanelScenarios(plan.written, (*fixed, *others), x, y)
+    return PanelScenarios(plan, (*fixed, *others), x, y)
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     """Returns the command that makes a sweep."""
-    words = set_options(plan.written.overrides)
+    words = set_options(plan.overrides)
     words += [word for one in plan.axes for word in ("--over", one.asked)]
     own, count = plan.base.seed, len(plan.seeds)
     if plan.seeds == tuple(range(own, own + count)):
@@ -404,7 +395,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     words += ["--judge", plan.judge] if plan.judge != "verdict" else []
     if plan.longest_s != plan.default_longest_s:
         words += ["--longest", format_override_value(plan.longest_s)]
-    return format_command("sweep", plan.written.source, *words, *more)
+    return format_command("sweep", plan.written.called, *words, *more)
 
 
 def format_override(key: str, value: Any) -> str:

@@ -1,25 +1,240 @@
-"""One cell of a sweep: its overrides, its runs, and the command that repeats a run.
+"""One run of a cell: its class and its numbers, and its scenario as what differs from the experiment.
 
-Invariant: a cell's scenario is loaded through the same settings that its command names. A run keeps its
-scenario as a line diff against the base text: `apply_diff(diff_lines(text, base), base) == text` for every
-two texts.
+A run that is undecided when its time is over is extended, and classified by how it ends.
+
+Invariant: a result is a function of the cell's scenario and its longest extension; the class follows from
+the same numbers as the certificate, so a log of the same run gets the same one. A run keeps its scenario as a
+line diff against the base text: `apply_diff(diff_lines(text, base), base) == text` for every two texts.
 """
 
+import math
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from enum import StrEnum
 from itertools import chain
-from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
-from ...errors import ScenarioError
-from ...scenario import Scenario
-from ...scenario.laws import identify_law
-from ...scenario.scenario_reader import ExperimentText
-from ..commands import format_command, set_options
-from . import cell_result
-from .cell_result import CellResult
+from ...analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend
+from ...analysis.json_values import finite_or_none
+from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
+from ...execution.fused import FusedRun, RunTotals, check_fusable
+from ...scenario import Scenario, parse_scenario
+from ...scenario.validate import refuse_live_only
+
+
+class CellClass(StrEnum):
+    """Class of a cell; the text is the word for people and in results."""
+
+    CONVERGED = "converged"
+    BOUNDED = "bounded oscillation"
+    DIVERGED = "diverged"
+    UNDECIDED = "undecided"
+
+    @property
+    def stable(self) -> bool | None:
+        """True if the run is stable, False if it is not; None if that is open."""
+        return None if self is CellClass.UNDECIDED else self is CellClass.CONVERGED
+
+
+def classify_end(end: RunEnd) -> CellClass:
+    """Returns the class of a cell for the judgement of its run; what drifts or grows has left."""
+    if end.stability is Stability.NOT_STABLE:
+        return CellClass.BOUNDED if end.behaviour is EndBehaviour.BOUNDED else CellClass.DIVERGED
+    return CellClass.CONVERGED if end.stability is Stability.STABLE else CellClass.UNDECIDED
+
+
+class CellResult(msgspec.Struct, frozen=True):
+    """Result of one cell.
+
+    Attributes:
+        verdict: its class.
+        motion: the word of the certificate, which tells growing from diverged and decaying from converged.
+        reasons: what leaves the run open, in words.
+        ran_s: how long it ran in the end, extensions and an early stop included, s.
+        extended: how often its time was doubled because it had not been decided.
+        end_error_rad: the largest abs(e) of the last second, rad.
+        end_speed_rad_s: the largest abs(qd) of the last second, rad/s.
+        error_rate_per_s: the trend of abs(e) over the second half: it goes as exp(rate t), 1/s; None where it
+            has none.
+        speed_rate_per_s: the same of abs(qd).
+        peak_error_rad: the largest abs(e) of the run, rad.
+        settled_s: since when abs(e) is below 0.01 rad; None where it is not at the end.
+        diverged_s: when the first site left its limits, or None.
+        rms_error_rad: this and the others down to `walls_j` are those of `RunTotals`, over the duration of
+            the scenario, extensions left out.
+        exponent_per_s: the growth exponent of its twins over the duration of the scenario, 1/s, see
+            `measure_exponent`; None where no twins were asked for, or none moved.
+    """
+
+    verdict: CellClass
+    motion: EndBehaviour
+    ran_s: float
+    extended: int
+    end_error_rad: float
+    end_speed_rad_s: float
+    error_rate_per_s: float | None
+    speed_rate_per_s: float | None
+    peak_error_rad: float
+    settled_s: float | None
+    diverged_s: float | None
+    rms_error_rad: float | None = None
+    effort_nm: float | None = None
+    force_peak_n: float | None = None
+    walls_j: float | None = None
+    reasons: str = ""
+    exponent_per_s: float | None = None
+
+
+TWINS_OF_A_CELL = 4
+"""All joints at once, and some of them alone; of the adaptive law the estimates too."""
+FLAT_LOG_CHANGE = 0.02
+"""An envelope whose logarithm changes by no more over half a run is that of a limit cycle."""
+
+
+def check_sweepable(scenario: Scenario) -> None:
+    """Refuses what cannot be run without a network, or not fast.
+
+    Raises:
+        ScenarioError: see `refuse_live_only` and `check_fusable`.
+    """
+    refuse_live_only(scenario)
+    check_fusable(scenario)
+
+
+def classify_cell(text: str, longest_s: float) -> CellResult:
+    """Runs a cell in virtual time and returns what became of it.
+
+    A run that is not conclusive when its time is over (see `is_conclusive`) goes on for as long again, and
+    so on; its numbers are those of one run. Where that never comes, the certificate's word stands, except for
+    a trend of a run in which anything is drawn: such errors wander, and a slow trend is chance. A run that
+    looks stable and of which a joint moves on is undecided unless the pushes of its twins die away. If small
+    motions grow in contact with a sampled wall it is not extended: such chatter may die in minutes, when the
+    estimates have drifted, and that makes no cell stable.
+
+    Args:
+        text: the canonical text of the cell's scenario, whose `duration_s` is the time it has.
+        longest_s: how long it may run in the end, s; not more than its own time: it is never extended.
+    """
+    scenario = parse_scenario(text)
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    ends_s = scenario.duration_s
+    growth_per_s = _advance_in_contact(scenario, run)
+    totals, extended = run.totals, 0
+    if growth_per_s > 0.0:
+        outcome = _cell_result(run, scenario, totals, extended)
+        left = outcome.verdict is CellClass.DIVERGED
+        verdict = CellClass.DIVERGED if left else CellClass.BOUNDED
+        reason = f"in contact with a sampled wall small motions grow by {growth_per_s:+.3g} /s"
+        return msgspec.structs.replace(outcome, verdict=verdict, reasons=reason)
+    while not is_conclusive(outcome := _cell_result(run, scenario, totals, extended)) and ends_s < longest_s:
+        ends_s = min(2.0 * ends_s, longest_s)
+        extended += 1
+        run.advance(ends_s)
+    trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
+    if scenario.links_random and trend and not _pronounced(outcome):
+        return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED)
+    if outcome.verdict is CellClass.CONVERGED and _moves_on(run):
+        twins = _measure_twins(scenario, run)
+        if twins.trend not in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
+            return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED, reasons=twins.text)
+    return outcome
+
+
+def measure_exponent(scenario: Scenario) -> float | None:
+    """Returns the growth exponent of a run, 1/s: the largest rate of its twins over the judged part.
+
+    A small push goes there as exp(exponent t); None if no push moved anything. See `analysis.twin_growth`.
+    """
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance(scenario.duration_s)
+    found = _measure_twins(scenario, run)
+    return max((one.rate_per_s for one in found.pushes if math.isfinite(one.rate_per_s)), default=None)
+
+
+def _measure_twins(scenario: Scenario, run: FusedRun) -> TwinGrowth:
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    return measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+
+
+def _moves_on(run: FusedRun) -> bool:
+    """True if the largest speed of a joint did not halve from the first to the last quarter of the half."""
+    for site in run.buckets:
+        joints = site.shape[1] // 3
+        half = site[len(site) // 2 :, joints : 2 * joints]
+        quarter = len(half) // 4
+        first, last = half[:quarter].max(axis=0), half[-quarter:].max(axis=0)
+        if (last > np.maximum(0.5 * first, FLOOR_RAD)).any():
+            return True
+    return False
+
+
+def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
+    """Makes a run of a scenario's own time; returns how fast small motions grow at a sampled wall, 1/s.
+
+    0 if they do not, and without one that is touched in the last quarter, see `find_contact_growth`.
+    """
+    if not any(one.actor.sampled for spec in scenario.sites.values() for one in spec.environment):
+        run.advance(scenario.duration_s)
+        return 0.0
+    states = run.advance_watching(scenario.duration_s)
+    if run.diverged_s is not None:
+        return 0.0
+    # SciPy takes a worker half a second, which only sampled walls need
+    from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
+    from ...theory.linear_edge import find_contact_growth
+
+    growth_per_s = find_contact_growth(scenario, *states)
+    return growth_per_s if growth_per_s > STABILITY_EDGE_PER_S else 0.0
+
+
+def is_conclusive(outcome: CellResult) -> bool:
+    """True where a longer run would hardly be called something else.
+
+    That is: it left its limits; or it came to rest; or it grows, and the largest speed at least doubled over
+    the second half; or neither that nor the largest error changed by more than `FLAT_LOG_CHANGE`; or it
+    drifts. Near the edge of stability a finite run looks steady whatever it does later, and what decays may
+    hide what grows slowly until it is gone.
+    """
+    if outcome.motion is EndBehaviour.BOUNDED:
+        return max(map(abs, _changes(outcome))) <= FLAT_LOG_CHANGE
+    if outcome.motion is EndBehaviour.GROWS:
+        return _pronounced(outcome)
+    return outcome.motion in (EndBehaviour.DIVERGED, EndBehaviour.CONVERGED, EndBehaviour.DRIFTS)
+
+
+def _pronounced(outcome: CellResult) -> bool:
+    """True where over the second half the largest speed doubled, or that and the largest error halved."""
+    error, speed = _changes(outcome)
+    return speed >= math.log(2.0) or max(error, speed) <= -math.log(2.0)
+
+
+def _changes(outcome: CellResult) -> tuple[float, float]:
+    """Returns by how much the logarithms of the largest |e| and |qd| change over the second half."""
+    half_s = 0.5 * outcome.ran_s
+    return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
+
+
+def _cell_result(run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int) -> CellResult:
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    return CellResult(
+        verdict=classify_end(end),
+        motion=end.behaviour,
+        ran_s=run.ran_s,
+        extended=extended,
+        end_error_rad=end.end_error_rad,
+        end_speed_rad_s=end.end_speed_rad_s,
+        error_rate_per_s=finite_or_none(end.error.rate_per_s),
+        speed_rate_per_s=finite_or_none(end.speed.rate_per_s),
+        peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
+        settled_s=run.settled_s,
+        diverged_s=end.diverged_at_s,
+        **totals._asdict(),
+        reasons="; ".join(end.reasons),
+    )
+
 
 LineDiff = tuple[str | tuple[int, int], ...]
 """In order: lines of the base, as first and last number, and lines that it has not."""
@@ -51,61 +266,6 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
     return "\n".join(chain.from_iterable(lines))
 
 
-class SweepSource(NamedTuple):
-    """The experiment that is swept, as its author wrote it, see `ExperimentText`.
-
-    Attributes:
-        source: what a command calls it: a shipped name or a path.
-        text: its TOML text.
-        folder: where the files lie that it names; None: it is resolved.
-        overrides: what is changed of it everywhere, as texts KEY=VALUE.
-    """
-
-    source: str
-    text: str
-    folder: str | None
-    overrides: tuple[str, ...]
-
-    def scenario(self, *more: str) -> Scenario:
-        """Returns it, with some more overrides.
-
-        Raises:
-            ScenarioError: it is not valid with them.
-        """
-        folder = None if self.folder is None else Path(self.folder)
-        return ExperimentText(self.source, self.text, folder).load([*self.overrides, *more])
-
-
-class SweepCell(NamedTuple):
-    """One place of a sweep.
-
-    Attributes:
-        number: row by row, from 0: laws change slowest, the last axis fastest.
-        law: which of the swept laws, or "".
-        values: along every axis, numbers as numbers.
-        overrides: what makes it of the experiment, as texts KEY=VALUE.
-    """
-
-    number: int
-    law: str
-    values: tuple[float | str, ...]
-    overrides: tuple[str, ...]
-
-
-class CellTask(NamedTuple):
-    """One run of a cell, to be made: picklable, with all that a worker needs."""
-
-    written: SweepSource
-    number: int
-    overrides: tuple[str, ...]
-    seed: int
-    longest_s: float
-    judge: str = "verdict"
-
-    def __str__(self) -> str:
-        return f"cell {self.number} ({', '.join(self.overrides)}), seed {self.seed}"
-
-
 class CellRun(msgspec.Struct, frozen=True):
     """One finished run.
 
@@ -122,51 +282,3 @@ class CellRun(msgspec.Struct, frozen=True):
     sha256: str
     scenario: LineDiff
     outcome: CellResult
-
-
-def run_cell(task: CellTask) -> CellRun:
-    """Runs one task, in whatever process.
-
-    Raises:
-        ScenarioError: there is no such experiment; says of which cell.
-    """
-    try:
-        scenario = task.written.scenario(*task.overrides, f"seed={task.seed}")
-        cell_result.check_sweepable(scenario)
-    except ScenarioError as error:
-        raise ScenarioError(f"cell {task.number} ({', '.join(task.overrides)}): {error}") from None
-    outcome = cell_result.classify_cell(scenario.text, max(task.longest_s, scenario.duration_s))
-    if task.judge == "twins":
-        outcome = msgspec.structs.replace(outcome, exponent_per_s=cell_result.measure_exponent(scenario))
-    return CellRun(
-        task.number,
-        task.seed,
-        scenario.random,
-        join_law_names(scenario),
-        scenario.sha256,
-        diff_lines(scenario.text, _base_text(task.written)),
-        outcome,
-    )
-
-
-@lru_cache(maxsize=4)
-def _base_text(written: SweepSource) -> str:
-    return written.scenario().text
-
-
-def join_law_names(scenario: Scenario) -> str:
-    """Returns the laws of a scenario's sites, each once."""
-    return ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
-
-
-def build_sim_command(
-    written: SweepSource, overrides: Sequence[str], seed: int, duration_s: float, log: str
-) -> str:
-    """Returns the command that makes a log of a run."""
-    others = [
-        text
-        for text in (*written.overrides, *overrides)
-        if text.partition("=")[0].strip() not in ("seed", "duration_s")
-    ]
-    run = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
-    return format_command("sim", written.source, *set_options(others), *run)

@@ -22,10 +22,9 @@ from ...scenario.fields import is_number, suggest_nearest
 from ...scenario.imported_law import name_law_classes
 from ...scenario.law_consent import allow_own_laws
 from ...scenario.laws import LAWS, identify_law
-from ...scenario.scenario_reader import read_experiment
+from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ..commands import format_toml_value
-from . import cell_result
-from .sweep_cell import CellTask, SweepCell, SweepSource
+from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
 """An end that is no further than this from the grid, in steps, lies on it."""
@@ -188,25 +187,41 @@ _CHECKED_VALUES = 32
 """Values of an axis that are tried before anything runs."""
 
 
+class SweepCell(NamedTuple):
+    """One place of a sweep.
+
+    Attributes:
+        number: row by row, from 0: laws change slowest, the last axis fastest.
+        law: which of the swept laws, or "".
+        values: along every axis, numbers as numbers.
+        overrides: what makes it of the experiment, as texts KEY=VALUE.
+    """
+
+    number: int
+    law: str
+    values: tuple[float | str, ...]
+    overrides: tuple[str, ...]
+
+
 class SweepPlan(NamedTuple):
     """A sweep.
 
     Attributes:
         written: the experiment, as its author wrote it.
+        overrides: what is changed of it everywhere, as texts KEY=VALUE.
         base: the same, resolved.
         axes: what is swept; the last changes fastest.
-        laws: swept around the axes, slowest; none: the experiment's own.
-        law_overrides: per law what puts it into force.
+        laws: what puts each law into force; swept around the axes, slowest; none: the experiment's own.
         seeds: of the runs of a cell in which anything is random; in others the first alone is run.
         longest_s: how long a cell may be extended, s.
         judge: of `JUDGES`.
     """
 
-    written: SweepSource
+    written: ExperimentText
+    overrides: tuple[str, ...]
     base: Scenario
     axes: tuple[SweepAxis, ...]
-    laws: tuple[str, ...]
-    law_overrides: tuple[tuple[str, ...], ...]
+    laws: dict[str, tuple[str, ...]]
     seeds: tuple[int, ...]
     longest_s: float
     judge: str = "verdict"
@@ -234,33 +249,30 @@ class SweepPlan(NamedTuple):
         """
         if not 0 <= number < self.cells:
             raise UsageError(f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}")
-        places: list[int] = []
+        rest, places = number, list[int]()
         for count in reversed(self.shape):
-            number, place = divmod(number, count)
+            rest, place = divmod(rest, count)
             places.insert(0, place)
-        return self.cell_at(places)
-
-    def cell_at(self, places: Sequence[int]) -> SweepCell:
-        """Returns a cell by its place: number of the law (0 where none is swept), then along every axis."""
-        number = 0
-        for count, place in zip(self.shape, places, strict=True):
-            number = number * count + place
-        place, *others = places
-        law, fixed = (self.laws[place], self.law_overrides[place]) if self.laws else ("", ())
+        place, *others = places  # of the law, 0 where none is swept
+        law, fixed = list(self.laws.items())[place] if self.laws else ("", ())
         along = list(zip(self.axes, others, strict=True))
         values = tuple(axis.value(n) for axis, n in along)
         return SweepCell(number, law, values, (*fixed, *(axis.override(n) for axis, n in along)))
 
-    def task(self, number: int, seed: int) -> CellTask:
-        """Returns one run of a cell, to be made."""
-        return CellTask(self.written, number, self.cell(number).overrides, seed, self.longest_s, self.judge)
+    def scenario(self, *more: str) -> Scenario:
+        """Returns the experiment, with some more overrides.
+
+        Raises:
+            ScenarioError: it is not valid with them.
+        """
+        return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
         """Returns all that names it, as plain values; `plan_from_json` reads them."""
         return {
-            "source": self.written.source,
-            "folder": self.written.folder,
-            "overrides": list(self.written.overrides),
+            "source": self.written.called,
+            "folder": None if self.written.folder is None else str(self.written.folder),
+            "overrides": list(self.overrides),
             "over": [one.asked for one in self.axes],
             "laws": list(self.laws),
             "seeds": list(self.seeds),
@@ -300,19 +312,29 @@ def plan_sweep(
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
         UsageError: another argument cannot be right.
     """
-    read = read_experiment(source)
-    folder = None if read.folder is None else str(read.folder)
-    written = SweepSource(read.called, read.text, folder, tuple(overrides))
-    base = written.scenario()
+    written, texts = read_experiment(source), tuple(overrides)
+    base = written.load(texts)
     axes = tuple(map(parse_axis, list_axes(over)))
     named = [laws] if isinstance(laws, str | type) else laws
-    chosen: tuple[str, ...] = tuple(dict.fromkeys(map(name_law_classes, named)))
-    _refuse_twice(axes, chosen)
-    forced = tuple(_law_overrides(written, base, law) for law in chosen)
+    chosen = list(map(name_law_classes, named))
+    keys = Counter(one.key for one in axes)
+    for key, count in keys.items():
+        if count > 1:
+            raise ScenarioError("is swept twice: give one --over with all its values", path=key)
+    if chosen and "control.law" in keys:
+        raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
+    forced = {law: _law_overrides(written, texts, base, law) for law in chosen}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
-    plan = SweepPlan(written, base, axes, chosen, forced, _seeds(seeds, base.seed), 0.0, judge)
-    plan = plan._replace(longest_s=_longest_s(longest_s, plan))
+    plan = SweepPlan(written, texts, base, axes, forced, _seeds(seeds, base.seed), 0.0, judge)
+    if longest_s is None:
+        longest_s = plan.default_longest_s
+    elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
+        raise UsageError(
+            f"--longest is how long an undecided cell may run, from its {base.duration_s:g} s to "
+            f"{MAX_SCENARIO_S:g} s, not {longest_s:g}"
+        )
+    plan = plan._replace(longest_s=longest_s)
     for law in range(plan.shape[0]):
         _refuse_unfit(plan, law)
     return plan
@@ -324,21 +346,13 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     Raises:
         ScenarioError: it cannot run here.
     """
-    written = SweepSource(facts["source"], facts["text"], facts["folder"], tuple(facts["overrides"]))
-    base = allow_own_laws(written.scenario())
-    axes, laws = tuple(map(parse_axis, facts["over"])), tuple(facts["laws"])
+    folder = None if facts["folder"] is None else Path(facts["folder"])
+    written, texts = ExperimentText(facts["source"], facts["text"], folder), tuple(facts["overrides"])
+    base = allow_own_laws(written.load(texts))
+    axes = tuple(map(parse_axis, facts["over"]))
+    forced = {law: _law_overrides(written, texts, base, law) for law in facts["laws"]}
     judge = facts.get("judge", "verdict")
-    forced = tuple(_law_overrides(written, base, law) for law in laws)
-    return SweepPlan(written, base, axes, laws, forced, tuple(facts["seeds"]), facts["longest_s"], judge)
-
-
-def _refuse_twice(axes: Sequence[SweepAxis], laws: Sequence[str]) -> None:
-    keys = Counter(one.key for one in axes)
-    for key, count in keys.items():
-        if count > 1:
-            raise ScenarioError("is swept twice: give one --over with all its values", path=key)
-    if laws and "control.law" in keys:
-        raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
+    return SweepPlan(written, texts, base, axes, forced, tuple(facts["seeds"]), facts["longest_s"], judge)
 
 
 def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
@@ -354,19 +368,9 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(asked)) or (own,)
 
 
-def _longest_s(asked: float | None, plan: SweepPlan) -> float:
-    if asked is None:
-        return plan.default_longest_s
-    base = plan.base
-    if not base.duration_s <= asked <= MAX_SCENARIO_S:
-        raise UsageError(
-            f"--longest is how long an undecided cell may run, from its {base.duration_s:g} s to "
-            f"{MAX_SCENARIO_S:g} s, not {asked:g}"
-        )
-    return asked
-
-
-def _law_overrides(written: SweepSource, base: Scenario, law: str) -> tuple[str, ...]:
+def _law_overrides(
+    written: ExperimentText, overrides: Sequence[str], base: Scenario, law: str
+) -> tuple[str, ...]:
     """Returns what puts a law into force at every site."""
     ours = [name for name in LAWS if name != "own"]
     if law not in ours and ":" not in law:
@@ -375,7 +379,7 @@ def _law_overrides(written: SweepSource, base: Scenario, law: str) -> tuple[str,
     if all(identify_law(spec.control) == law for spec in base.sites.values()):
         return ()
     tables = tomllib.loads(written.text)
-    apply_overrides(tables, written.overrides)
+    apply_overrides(tables, overrides)
     own = [name for name, site in tables["sites"].items() if "control" in site]
     return (f"control.law={law}", *(f"sites.{name}.control.law={law}" for name in own))
 
@@ -395,7 +399,7 @@ def _refuse_unfit(plan: SweepPlan, law: int) -> None:
                     f"{seen[scenario.sha256]} and {text} are the same experiment: nothing here follows this "
                     "key; a site or link may have one of its own, as in sites.NAME.control or links.A->B",
                     path=one.key,
-                    source=plan.written.source,
+                    source=plan.written.called,
                 )
             seen[scenario.sha256] = text
     ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in plan.axes)]
@@ -409,11 +413,14 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
     Raises:
         ScenarioError: there is none, or it cannot run here; says with which law where several are swept.
     """
-    cell = plan.cell_at(places)
+    number = 0
+    for count, place in zip(plan.shape, places, strict=True):
+        number = number * count + place
+    cell = plan.cell(number)
     try:
-        scenario = plan.written.scenario(*cell.overrides)
-        cell_result.check_sweepable(scenario)
+        scenario = plan.scenario(*cell.overrides)
+        sweep_cell.check_sweepable(scenario)
     except ScenarioError as error:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
-        raise ScenarioError(problem, path=error.path, source=plan.written.source) from None
+        raise ScenarioError(problem, path=error.path, source=plan.written.called) from None
     return scenario

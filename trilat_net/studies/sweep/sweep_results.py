@@ -1,14 +1,17 @@
-"""The results of a sweep as self-describing Parquet.
+"""The results of a sweep in words and as self-describing Parquet.
 
 One row per run, and one row per grid point over its seeds.
 
 Invariant: the bytes are a function of the runs alone, whatever their order or the number of processes.
 Each row's scenario, run again, reproduces the row. A grid point counts every run once; its stable share
-is taken over the decided runs and carries a 95 % Wilson interval within [0, 1].
+is taken over the decided runs and carries a 95 % Wilson interval within [0, 1]. Every command shown works: a
+reproduced run has the scenario hash of its row; if the swept scenario has changed since, the row's own text
+is written out and named instead.
 """
 
 import io
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,13 +20,14 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...errors import UsageError
+from ...errors import ScenarioError, UsageError
 from ...execution.fused import RunTotals
-from ...files import import_extra
+from ...files import import_extra, write_whole
 from ...results import Result
+from ...scenario.scenario_reader import read_source
+from ..commands import format_command, set_options
 from ..intervals import MeanInterval, mean_interval, wilson_interval
-from .cell_result import CellClass, CellResult
-from .sweep_cell import CellRun, apply_diff, build_sim_command
+from .sweep_cell import CellClass, CellResult, CellRun, apply_diff
 from .sweep_plan import SweepPlan, plan_from_json
 
 RESULTS_FILE = "results.parquet"
@@ -59,8 +63,6 @@ class SweepResults(Result):
 
     def blocks(self) -> Iterator[str]:
         """Yields its text."""
-        from .sweep_run import describe_sweep_plan, summarize_sweep
-
         yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
 
     def to_rows(self) -> Sequence[ResultRow]:
@@ -90,28 +92,39 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     """Returns the rows that runs make, in their order."""
     order = {seed: n for n, seed in enumerate(plan.seeds)}
     seeds = Counter(entry.cell for entry in entries)
-    return [
-        _row(plan, entry, alone=seeds[entry.cell] == 1)
-        for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed]))
+    rows: list[ResultRow] = []
+    for entry in sorted(entries, key=lambda one: (one.cell, order[one.seed])):
+        cell = plan.cell(entry.cell)
+        which = "" if seeds[entry.cell] == 1 else f"-seed-{entry.seed}"
+        lasts_s = reproduction_duration_s(plan, entry.outcome)
+        log = f"cell-{cell.number}{which}.mcap"
+        rows.append(
+            {
+                "cell": cell.number,
+                **{one.key: value for one, value in zip(plan.axes, cell.values, strict=True)},
+                "law": entry.law,
+                "seed": entry.seed,
+                "random": entry.random,
+                **msgspec.to_builtins(entry.outcome),
+                "scenario_sha256": entry.sha256,
+                "command": build_sim_command(plan, cell.overrides, entry.seed, lasts_s, log),
+                "scenario": apply_diff(entry.scenario, plan.base.text),
+            }
+        )
+    return rows
+
+
+def build_sim_command(
+    plan: SweepPlan, overrides: Sequence[str], seed: int, duration_s: float, log: str
+) -> str:
+    """Returns the command that makes a log of a run."""
+    others = [
+        text
+        for text in (*plan.overrides, *overrides)
+        if text.partition("=")[0].strip() not in ("seed", "duration_s")
     ]
-
-
-def _row(plan: SweepPlan, entry: CellRun, *, alone: bool) -> ResultRow:
-    cell = plan.cell(entry.cell)
-    text = apply_diff(entry.scenario, plan.base.text)
-    log = f"cell-{cell.number}.mcap" if alone else f"cell-{cell.number}-seed-{entry.seed}.mcap"
-    lasts_s = reproduction_duration_s(plan, entry.outcome)
-    return {
-        "cell": cell.number,
-        **{one.key: value for one, value in zip(plan.axes, cell.values, strict=True)},
-        "law": entry.law,
-        "seed": entry.seed,
-        "random": entry.random,
-        **msgspec.to_builtins(entry.outcome),
-        "scenario_sha256": entry.sha256,
-        "command": build_sim_command(plan.written, cell.overrides, entry.seed, lasts_s, log),
-        "scenario": text,
-    }
+    run = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
+    return format_command("sim", plan.written.called, *set_options(others), *run)
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
@@ -243,3 +256,110 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
         cells = (one.cell, *one.values, one.law, sum(one.counts), *one.counts, share, low, high, *numbers)
         rows.append(dict(zip(kinds, cells, strict=True)))
     return _encode_parquet(rows, kinds)
+
+
+_TOTALS = {
+    "rms_error_rad": ("RMS e", "rad"),
+    "effort_nm": ("effort", "N m"),
+    "force_peak_n": ("peak force", "N"),
+    "walls_j": ("work of the walls", "J"),
+}
+_MAX_DOUBTFUL_SHOWN = 8
+"""Most doubtful grid points printed; all stand in the file."""
+
+
+def describe_sweep_plan(plan: SweepPlan) -> list[str]:
+    """Returns the plan in lines, before it runs."""
+    sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
+    laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
+    count = len(plan.seeds)
+    seeds = f"seed {plan.seeds[0]}" if count == 1 else f"{count} seeds each where anything is random"
+    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{laws}), {seeds}"]
+    for one in plan.axes:
+        texts = one.texts
+        count = len(texts)
+        shown = [texts[0], texts[1], "...", texts[-1]] if count > 4 else [texts[n] for n in range(count)]
+        lines.append(f"  over {one.asked}: {', '.join(shown)}")
+    first_s, longest_s = plan.base.duration_s, plan.longest_s
+    extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
+    twins = ", judged by twins" if plan.judge == "twins" else ""
+    return [*lines, f"  {first_s:g} s each{extended}{twins}"]
+
+
+def summarize_sweep(results: SweepResults) -> Iterator[str]:
+    """Yields a summary: verdicts, extensions, seeds."""
+    rows = results.rows
+    counts = Counter(row["verdict"] for row in rows)
+    words = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
+    yield f"{len(rows)} runs of {results.plan.cells} cells: {words}"
+    extended = [row for row in rows if row["extended"]]
+    if extended:
+        longest_s = max(row["ran_s"] for row in extended)
+        first_s = results.plan.base.duration_s
+        continued = f"and continued, the longest to {longest_s:g} s"
+        yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
+    kept = [row for row in rows if row["diverged_s"] is None]
+    ranges = []
+    for key, (name, unit) in _TOTALS.items():
+        values = [row[key] for row in kept if row.get(key) is not None]
+        ranges += [f"{name} {min(values):.3g} to {max(values):.3g} {unit}"] if values else []
+    if ranges:
+        yield f"within their limits {len(kept)}: {', '.join(ranges)}"
+    found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
+    if found:
+        grow = f"{sum(one > 0.0 for one in found)} of {len(found)} grow"
+        yield f"growth exponents of small pushes {min(found):+.3g} to {max(found):+.3g} /s: {grow}"
+    if len(results.plan.seeds) > 1:
+        yield from _of_seeds(results)
+
+
+def _of_seeds(results: SweepResults) -> Iterator[str]:
+    fixed = sum(not row["random"] for row in results.rows)
+    if fixed:
+        yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
+    doubtful = [place for place in collect_grid_points(results) if place.doubtful]
+    if doubtful:
+        yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
+    for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
+        axes = zip(results.plan.axes, place.values, strict=True)
+        where = [*([place.law] if results.plan.laws else []), *(f"{one.key} {value}" for one, value in axes)]
+        low, high = (100.0 * end for end in place.interval)
+        yield (
+            f"  cell {place.cell} ({', '.join(where)}): {place.stable} of {place.decided} stable, "
+            f"95 % interval {low:.0f} to {high:.0f} %"
+        )
+    if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
+        yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in places.parquet"
+
+
+def _cells(count: int) -> str:
+    return "1 cell" if count == 1 else f"{count} cells"
+
+
+def list_next_commands(folder: Path) -> list[str]:
+    """Returns commands that use the results."""
+    where = shlex.quote(str(folder))
+    return [
+        f"trilat sweep {where} --cell 0      # the command that makes a log of a cell",
+        f"trilat sweep {where} --map         # its map, with the lines of theory",
+    ]
+
+
+def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> tuple[str, str]:
+    """Returns the command that repeats a row, and a note on it or ""."""
+    plan = results.plan
+    source = plan.written.called
+    try:  # is it still what was swept?
+        text, home = read_source(source)
+        now = plan._replace(written=plan.written._replace(text=text, folder=home))
+        again = now.scenario(*plan.cell(row["cell"]).overrides, f"seed={row['seed']}").sha256
+    except ScenarioError:
+        again = ""
+    if again == row["scenario_sha256"]:
+        return row["command"], ""
+    name = f"cell-{row['cell']}-seed-{row['seed']}"
+    file = folder / f"{name}.toml"
+    write_whole(file, row["scenario"])
+    lasts_s = reproduction_duration_s(plan, results.outcome(row))
+    command = format_command("sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap")
+    return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"

@@ -1,32 +1,158 @@
-"""Runs a sweep: estimates its duration, runs the cells that are missing, writes the results and sums them up.
+"""Runs a sweep in its folder: its plan, the journal of finished runs, and at the end the results.
 
-Invariant: results are a function of the plan; the number of processes, their order and the number of
-interruptions do not enter. A run that is in the journal is never made again. Every command shown works: a
-reproduced run has the scenario hash of its row; if the swept scenario has changed since, the row's own text
-is written out and named instead.
+Estimates its duration, runs the cells that are missing, and writes the results.
+
+Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed in. Results
+are a function of the plan; the number of processes, their order and the number of interruptions do not enter.
+A run that is in the journal is never made again.
 """
 
+import hashlib
+import json
 import math
-import shlex
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
+
+from ...core.fingerprint import compute_fingerprint
 from ...errors import ScenarioError, UsageError
-from ...files import write_whole
+from ...files import make_results_folder, write_whole
+from ...log.log_layout import collect_provenance
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.law_consent import list_imported_laws
-from ...scenario.scenario_reader import read_source
+from ...scenario.laws import identify_law
+from ...scenario.scenario_reader import ExperimentText
 from .. import executor
 from ..commands import format_command
 from ..run_journal import RunJournal
-from . import cell_result, sweep_results
-from .cell_result import CellClass
-from .sweep_cell import CellRun, SweepSource, run_cell
-from .sweep_folder import SweepFolder, build_resume_hint
-from .sweep_plan import SweepPlan
+from . import sweep_cell, sweep_results
+from .sweep_cell import CellRun
+from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json
+
+JOURNAL_FILE = "cells.journal"
+
+
+def build_resume_hint(folder: Path) -> str:
+    """Returns how to go on with a sweep that the disk interrupted."""
+    command = format_command("sweep", "--resume", str(folder))
+    return f"what is done is kept: make room, and go on with: {command}"
+
+
+PLAN_FILE = "plan.json"
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+_DIFFERENCES = {
+    "text": "another text of the scenario",
+    "scenario_sha256": "another scenario",
+    "overrides": "other settings",
+    "over": "other axes",
+    "laws": "other laws",
+    "seeds": "other seeds",
+    "longest_s": "another longest time",
+    "judge": "another judge",
+    "arithmetic": "another kind of arithmetic",
+    "versions": "another version of the program",
+}
+"""What two sweeps may differ in, in words, in the order of messages."""
+
+
+class SweepFolder(NamedTuple):
+    """A folder of results; its facts name the sweep, its arithmetic, and the versions it is made with."""
+
+    path: Path
+    plan: SweepPlan
+    facts: Mapping[str, Any]
+
+    @property
+    def results(self) -> Path:
+        """Where the results are, once all runs are done."""
+        return self.path / sweep_results.RESULTS_FILE
+
+    def journal(self) -> RunJournal[CellRun]:
+        """Opens the journal."""
+        study = hashlib.sha256(_text(self.facts).encode()).hexdigest()
+        return RunJournal(self.path / JOURNAL_FILE, study, CellRun, build_resume_hint(self.path))
+
+
+def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
+    """Returns the folder of a sweep, made, or as it was left.
+
+    Raises:
+        UsageError: it holds something else, or another sweep, or cannot be made.
+    """
+    facts = _describe(plan)
+    if path is not None and (path / PLAN_FILE).exists():
+        return open_sweep_folder(path, facts)
+    chosen = make_results_folder(path, f"sweep-{plan.base.name}", force=None)
+    write_whole(chosen / PLAN_FILE, _text(facts), remedy=build_resume_hint(chosen))
+    return SweepFolder(chosen, plan, facts)
+
+
+def open_sweep_folder(path: Path, asked: Mapping[str, Any] | None = None) -> SweepFolder:
+    """Returns the folder of a sweep that was begun.
+
+    Args:
+        path: of the folder.
+        asked: the facts of the sweep that it must hold; None: any that this arithmetic and program began.
+
+    Raises:
+        UsageError: there is none, or it is another one.
+        ScenarioError: its scenario cannot run here.
+    """
+    before = _read(path)
+    now = _describe(plan_from_json(before)) if asked is None else asked
+    for key, words in _DIFFERENCES.items():
+        if before.get(key) != now.get(key):
+            there, here = (_shown(key, facts) for facts in (before, now))
+            raise UsageError(
+                f"{path}: holds a sweep of {words}: there {there}, here {here}; results are not mixed: "
+                "choose another folder"
+            )
+    return SweepFolder(path, plan_from_json(before), before)
+
+
+def _shown(key: str, facts: Mapping[str, Any]) -> str:
+    value = facts.get(key, JUDGES[0])
+    if key in ("text", "scenario_sha256"):
+        digest = hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
+        return f"{facts.get('name')} (sha256 {digest[:12]})"
+    if isinstance(value, dict):
+        return ", ".join(f"{name.removeprefix('version_')} {one}" for name, one in value.items())
+    if key == "seeds" and isinstance(value, list) and value == list(range(value[0], value[-1] + 1)):
+        return f"{value[0]}..{value[-1]}"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g} s" if isinstance(value, float) else str(value)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    file = path / PLAN_FILE
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no sweep was begun there: it has no {PLAN_FILE}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "is not JSON"
+        raise UsageError(f"{file}: cannot be read: {reason}") from None
+    needed = {"source", "folder", "name", *_DIFFERENCES} - {"judge"}  # older plans name none
+    if not isinstance(facts, dict) or not needed <= facts.keys():
+        raise UsageError(f"{file}: is no plan of a sweep")
+    return facts
+
+
+def _describe(plan: SweepPlan) -> dict[str, Any]:
+    """Returns all that results depend on."""
+    known = collect_provenance()
+    versions = {name: known[name] for name in _VERSIONS}
+    return {**plan.facts(), "arithmetic": compute_fingerprint(), "versions": versions}
+
+
+def _text(facts: Mapping[str, Any]) -> str:
+    return json.dumps(facts, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
+
 
 MAX_RUNS = 1_000_000
 MAX_SWEEP_S = 86_400.0
@@ -62,6 +188,43 @@ class FinishedSweep(NamedTuple):
     speed: SweepSpeed
 
 
+class CellTask(NamedTuple):
+    """One run of a cell, to be made: picklable, with all that a worker needs."""
+
+    plan: SweepPlan
+    cell: SweepCell
+    seed: int
+
+    def __str__(self) -> str:
+        return f"cell {self.cell.number} ({', '.join(self.cell.overrides)}), seed {self.seed}"
+
+
+def run_cell(task: CellTask) -> CellRun:
+    """Runs one task, in whatever process.
+
+    Raises:
+        ScenarioError: there is no such experiment; says of which cell.
+    """
+    plan, cell = task.plan, task.cell
+    try:
+        scenario = plan.scenario(*cell.overrides, f"seed={task.seed}")
+        sweep_cell.check_sweepable(scenario)
+    except ScenarioError as error:
+        raise ScenarioError(f"cell {cell.number} ({', '.join(cell.overrides)}): {error}") from None
+    outcome = sweep_cell.classify_cell(scenario.text, max(plan.longest_s, scenario.duration_s))
+    if plan.judge == "twins":
+        outcome = msgspec.structs.replace(outcome, exponent_per_s=sweep_cell.measure_exponent(scenario))
+    laws = ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
+    text = sweep_cell.diff_lines(scenario.text, _base_text(plan.written, plan.overrides))
+    return CellRun(cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome)
+
+
+@lru_cache(maxsize=4)
+def _base_text(written: ExperimentText, overrides: tuple[str, ...]) -> str:
+    """Returns the text of a plan's base; one that came from another process writes its defaults out."""
+    return written.load(overrides).text
+
+
 def estimate_sweep(
     plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
 ) -> DurationEstimate:
@@ -71,13 +234,13 @@ def estimate_sweep(
     """
     known = set(done)
     places = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
-    probes = [plan.task(n, plan.seeds[0]) for n in places if (n, plan.seeds[0]) not in known]
+    seed = plan.seeds[0]
+    probes = [CellTask(plan, plan.cell(n), seed) for n in places if (n, seed) not in known]
     if not probes:
         return DurationEstimate(plan.cells * len(plan.seeds) - len(known), 0.0, [])
-    first = probes[0]
     brief_s = min(1.0, plan.base.duration_s)
-    warm = plan.written.scenario(*first.overrides, f"duration_s={brief_s!r}")
-    cell_result.classify_cell(warm.text, brief_s)  # compiles, once for all processes
+    warm = plan.scenario(*probes[0].cell.overrides, f"duration_s={brief_s!r}")
+    sweep_cell.classify_cell(warm.text, brief_s)  # compiles, once for all processes
     clock = SystemClock()
     began_ns = clock.monotonic_ns()
     entries: list[CellRun] = []
@@ -171,7 +334,7 @@ def _run_cells(
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
         before = len(journal.done)
-        tasks = (plan.task(*key) for key in runs if key not in journal.done)
+        tasks = (CellTask(plan, plan.cell(n), seed) for n, seed in runs if (n, seed) not in journal.done)
         for _, entry in pool.each(run_cell, tasks, count=count - before):
             journal.add(entry)
             progress(len(journal.done), count)
@@ -181,131 +344,9 @@ def _run_cells(
     make(((number, seed) for number in again for seed in others), plan.cells + len(again) * len(others))
 
 
-_TOTALS = {
-    "rms_error_rad": ("RMS e", "rad"),
-    "effort_nm": ("effort", "N m"),
-    "force_peak_n": ("peak force", "N"),
-    "walls_j": ("work of the walls", "J"),
-}
-_MAX_DOUBTFUL_SHOWN = 8
-"""Most doubtful grid points printed; all stand in the file."""
-
-
-def describe_sweep_plan(plan: SweepPlan) -> list[str]:
-    """Returns the plan in lines, before it runs."""
-    sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
-    laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
-    count = len(plan.seeds)
-    seeds = f"seed {plan.seeds[0]}" if count == 1 else f"{count} seeds each where anything is random"
-    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{laws}), {seeds}"]
-    for one in plan.axes:
-        texts = one.texts
-        count = len(texts)
-        shown = [texts[0], texts[1], "...", texts[-1]] if count > 4 else [texts[n] for n in range(count)]
-        lines.append(f"  over {one.asked}: {', '.join(shown)}")
-    first_s, longest_s = plan.base.duration_s, plan.longest_s
-    extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
-    twins = ", judged by twins" if plan.judge == "twins" else ""
-    return [*lines, f"  {first_s:g} s each{extended}{twins}"]
-
-
-def summarize_sweep(results: sweep_results.SweepResults) -> Iterator[str]:
-    """Yields a summary: verdicts, extensions, seeds."""
-    rows = results.rows
-    counts = Counter(row["verdict"] for row in rows)
-    words = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
-    yield f"{len(rows)} runs of {results.plan.cells} cells: {words}"
-    extended = [row for row in rows if row["extended"]]
-    if extended:
-        longest_s = max(row["ran_s"] for row in extended)
-        first_s = results.plan.base.duration_s
-        continued = f"and continued, the longest to {longest_s:g} s"
-        yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
-    yield from _describe_totals(rows)
-    found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
-    if found:
-        grow = f"{sum(one > 0.0 for one in found)} of {len(found)} grow"
-        yield f"growth exponents of small pushes {min(found):+.3g} to {max(found):+.3g} /s: {grow}"
-    if len(results.plan.seeds) > 1:
-        yield from _of_seeds(results)
-
-
-def _describe_totals(rows: Sequence[sweep_results.ResultRow]) -> Iterator[str]:
-    """Yields the ranges of the numbers of all runs that stayed within their limits."""
-    kept = [row for row in rows if row["diverged_s"] is None]
-    words = []
-    for key, (name, unit) in _TOTALS.items():
-        values = [row[key] for row in kept if row.get(key) is not None]
-        if values:
-            words.append(f"{name} {min(values):.3g} to {max(values):.3g} {unit}")
-    if words:
-        yield f"within their limits {len(kept)}: {', '.join(words)}"
-
-
-def _of_seeds(results: sweep_results.SweepResults) -> Iterator[str]:
-    fixed = sum(not row["random"] for row in results.rows)
-    if fixed:
-        yield f"in {_cells(fixed)} nothing is random: one seed was run there, for all"
-    doubtful = [place for place in sweep_results.collect_grid_points(results) if place.doubtful]
-    if doubtful:
-        yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
-    for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
-        yield f"  {_describe_grid_point(results.plan, place)}"
-    if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
-        yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in places.parquet"
-
-
-def _cells(count: int) -> str:
-    return "1 cell" if count == 1 else f"{count} cells"
-
-
-def _describe_grid_point(plan: SweepPlan, place: sweep_results.GridPoint) -> str:
-    where = [f"{one.key} {value}" for one, value in zip(plan.axes, place.values, strict=True)]
-    law = [place.law] if plan.laws else []
-    low, high = (100.0 * end for end in place.interval)
-    return (
-        f"cell {place.cell} ({', '.join([*law, *where])}): {place.stable} of {place.decided} stable, "
-        f"95 % interval {low:.0f} to {high:.0f} %"
-    )
-
-
 def describe_sweep_speed(speed: SweepSpeed) -> str:
     """Returns the speed in words."""
     on = "1 process" if speed.jobs == 1 else f"{speed.jobs} processes"
     times = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
     took = f"{speed.simulated_s:.4g} s simulated in {format_wall_time(speed.wall_s)} by {on}"
     return f"speed: {times:.3g} times real time per process; {took}"
-
-
-def list_next_commands(folder: Path) -> list[str]:
-    """Returns commands that use the results."""
-    where = shlex.quote(str(folder))
-    return [
-        f"trilat sweep {where} --cell 0      # the command that makes a log of a cell",
-        f"trilat sweep {where} --map         # its map, with the lines of theory",
-    ]
-
-
-def build_reproduce_command(
-    results: sweep_results.SweepResults, row: sweep_results.ResultRow, folder: Path
-) -> tuple[str, str]:
-    """Returns the command that repeats a row, and a note on it or ""."""
-    source = results.plan.written.source
-    if _source_unchanged(results.plan.written, results.plan.cell(row["cell"]).overrides, row):
-        return row["command"], ""
-    name = f"cell-{row['cell']}-seed-{row['seed']}"
-    file = folder / f"{name}.toml"
-    write_whole(file, row["scenario"])
-    lasts_s = sweep_results.reproduction_duration_s(results.plan, results.outcome(row))
-    command = format_command("sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap")
-    return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"
-
-
-def _source_unchanged(written: SweepSource, overrides: tuple[str, ...], row: sweep_results.ResultRow) -> bool:
-    """Returns True if the source that the row's command names is still the swept one."""
-    try:
-        text, folder = read_source(written.source)
-        now = written._replace(text=text, folder=str(folder))
-        return bool(now.scenario(*overrides, f"seed={row['seed']}").sha256 == row["scenario_sha256"])
-    except ScenarioError:
-        return False

@@ -143,21 +143,18 @@ class SiteStats:
         apart = np.flatnonzero(largest >= self._synchronised_rad)
         if len(apart):
             self.apart_ns = int(rows.t_ns[apart[-1]])
-        self._add_ages(rows)
-        self._buckets = rows.reduce(self._buckets)
-        for stretch in filter(None, self.stretches):
-            stretch.add(rows)
-        self._tail.append(rows)
-        while len(self._tail) > 1 and self._tail[1].t_ns[0] < rows.t_ns[-1] - _END_NS:
-            del self._tail[0]
-
-    def _add_ages(self, rows: RecordBatch) -> None:
         known = rows.used >= 0
         age_ms = (rows.t_ns[:, None] - rows.used * NS_PER_S // self._peer_rates) * 1e-6
         age_ms[~known] = 0.0
         self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
         self._age_sum_ms += age_ms.sum(axis=0)
         self._age_records += known.sum(axis=0)
+        self._buckets = rows.reduce(self._buckets)
+        for stretch in filter(None, self.stretches):
+            stretch.add(rows)
+        self._tail.append(rows)
+        while len(self._tail) > 1 and self._tail[1].t_ns[0] < rows.t_ns[-1] - _END_NS:
+            del self._tail[0]
 
     @property
     def last_ns(self) -> int:

@@ -1,25 +1,35 @@
-"""The results of many trials as a text table and as JUnit XML for GitLab, Jenkins and GitHub Actions.
+"""Runs many trials, and shows them as a text table and as JUnit XML for GitLab, Jenkins and GitHub Actions.
 
-Invariant: a row shows the worst of its runs; every failed run appears with the command that repeats it.
+Invariant: results come in the order of the trials, whatever ran them; a trial that ends its worker process
+again and again costs itself and no other. A row shows the worst of its runs; every failed run appears with
+the command that repeats it.
 The XML follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per run, one `failure` with
 everything that did not hold, an `error` for a run without a result.
 """
 
 import re
 import xml.etree.ElementTree as Xml
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from msgspec.structs import asdict
 
+from ...core.jit import is_core_cached
+from ...errors import TrilatError
+from ...execution import virtual
+from ...net.clock import SystemClock
 from ...reporting.result_text import Block, MarkedText
 from ...reporting.text_table import TextTable
 from ...results import Result
+from ...scenario import Scenario
+from ...scenario.law_consent import list_imported_laws
+from ..executor import MAX_LOSSES, Workers, open_worker_pool
 from ..intervals import MeanInterval, mean_interval
-from .expectations import ExpectationResult
-from .trial import TrialResult
+from .trial import ExpectationResult, Trial, TrialResult, trials
 
 MAX_FAILURES_SHOWN = 5
 """Failed runs of a scenario that are printed in full; of the others the seeds."""
@@ -67,11 +77,34 @@ class TrialReport(Result):
 
     def rows(self) -> list[ExpectationRow]:
         """Returns the table: a row per scenario and expectation."""
-        return [row for name, results in self.scenarios.items() for row in _rows(name, results)]
+        rows = []
+        for name, results in self.scenarios.items():
+            by_key: dict[str, list[ExpectationResult]] = {}
+            for outcome in (outcome for result in results for outcome in result.outcomes):
+                by_key.setdefault(outcome.key, []).append(outcome)
+            for key, outcomes in by_key.items():  # the worst is the first that failed, then by margin
+                worst = min(outcomes, key=lambda one: (one.held, one.margin or 0.0))
+                held, mean = sum(one.held for one in outcomes), mean_interval([one.value for one in outcomes])
+                rows.append(ExpectationRow(name, key, worst, held, len(outcomes), mean))
+            if broken := [result.error for result in results if result.error]:
+                worst = ExpectationResult("a result", False, broken[0], "")
+                whole = len(results) - len(broken)
+                rows.append(ExpectationRow(name, worst.key, worst, whole, len(results)))
+        return rows
 
     def failures(self) -> list[str]:
         """Returns what failed and the commands that repeat it, line by line."""
-        return [line for results in self.scenarios.values() for line in _failure_lines(results)]
+        lines = []
+        for results in self.scenarios.values():
+            failed = [result for result in results if not result.held]
+            for result in failed[:MAX_FAILURES_SHOWN]:
+                trial = result.trial
+                lines.append(f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}")
+                lines += [f"  {line}" for line in _repeat_lines(result)]
+            if more := failed[MAX_FAILURES_SHOWN:]:
+                seeds = ", ".join(str(result.trial.scenario.seed) for result in more)
+                lines.append(f"  and {len(more)} more, seeds {seeds}")
+        return lines
 
     def remarks(self) -> list[str]:
         """Returns what else there is to know: what ran once, and how fast it went."""
@@ -134,48 +167,89 @@ class TrialReport(Result):
         ]
 
 
+def _run_trial(trial: Trial) -> TrialResult:
+    """Runs a trial in a worker; an error that no other trial would have is its result."""
+    try:
+        return trial.run()
+    except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
+        return TrialResult(trial, error=f"{type(error).__name__}: {error}")
+
+
+def run_trials(
+    batch: Sequence[Trial],
+    jobs: int | None = None,
+    done: Callable[[TrialResult], None] = lambda _: None,
+    on: Workers = None,
+) -> TrialReport:
+    """Runs trials in virtual time and returns their results.
+
+    Args:
+        batch: the trials.
+        jobs: how many processes; None for one per core. One trial, or one job, runs in this process.
+        done: called with every result as it comes.
+        on: what runs them instead: a Dask scheduler's address or an executor.
+    """
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    laws = list_imported_laws(trial.scenario for trial in batch)
+    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
+    results: dict[int, TrialResult] = {}
+    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+        if pool.is_local:
+            replies = ((n, trial.run()) for n, trial in enumerate(batch))
+        else:
+            if not is_core_cached():
+                next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
+            queue = [batch[n] for n in longest_first]
+            lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
+            replies = (
+                (longest_first[place], result)
+                for place, result in pool.each(_run_trial, queue, lost, len(queue))
+            )
+        for n, result in replies:
+            results[n] = result._replace(trial=batch[n])
+            done(results[n])
+    return TrialReport([results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def check(
+    source: str | Path | Scenario,
+    seeds: Iterable[int] = (),
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    jobs: int | None = None,
+    on: Workers = None,
+) -> TrialReport:
+    """Runs a scenario in virtual time, once per seed, and returns the results if all of [expect] held.
+
+    The command is `trilat test`.
+
+    >>> tn.check("free", jobs=1).held
+    True
+
+    Args:
+        source: the name of a shipped scenario, a path, or a scenario.
+        seeds: which seeds; none means the scenario's own.
+        set: overrides, as in `{"link.delay_ms": 400}`.
+        jobs: how many processes; None for one per core.
+        on: what runs them instead: a Dask scheduler's address, as in "tcp://10.0.0.5:8786", or an executor.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
+        UsageError: the cluster cannot be reached, or one of its workers is not fit.
+        AssertionError: something did not hold; it says what, by how much, and how to repeat it.
+    """
+    __tracebackhide__ = True  # pytest shows the reason, not this line
+    report = run_trials(trials(source, seeds, set), jobs, on=on)
+    if not report.held:
+        first = next(f"{one.trial}: {'; '.join(one.failures)}" for one in report.results if not one.held)
+        raise AssertionError(f"not as expected: {first}\n{report.summary()}")
+    return report
+
+
 def format_margin(margin: float | None) -> str:
     """Returns a margin in percent; "" where there is none."""
     return "" if margin is None else f"{100.0 * margin:+,.{0 if abs(margin) >= 0.1 else 1}f} %"
-
-
-def _rows(name: str, results: Sequence[TrialResult]) -> list[ExpectationRow]:
-    by_key: dict[str, list[ExpectationResult]] = {}
-    for result in results:
-        for outcome in result.outcomes:
-            by_key.setdefault(outcome.key, []).append(outcome)
-
-    def order(outcome: ExpectationResult) -> tuple[bool, float]:
-        return outcome.held, outcome.margin or 0.0  # the failed first, then by margin
-
-    rows = [
-        ExpectationRow(
-            name,
-            key,
-            min(outcomes, key=order),
-            sum(outcome.held for outcome in outcomes),
-            len(outcomes),
-            mean_interval([outcome.value for outcome in outcomes]),
-        )
-        for key, outcomes in by_key.items()
-    ]
-    if broken := [result.error for result in results if result.error]:
-        outcome = ExpectationResult("a result", False, broken[0], "")
-        rows.append(ExpectationRow(name, outcome.key, outcome, len(results) - len(broken), len(results)))
-    return rows
-
-
-def _failure_lines(results: Sequence[TrialResult]) -> list[str]:
-    failed = [result for result in results if not result.held]
-    lines = []
-    for result in failed[:MAX_FAILURES_SHOWN]:
-        trial = result.trial
-        lines.append(f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}")
-        lines += [f"  {line}" for line in _repeat_lines(result)]
-    if more := failed[MAX_FAILURES_SHOWN:]:
-        seeds = ", ".join(str(result.trial.scenario.seed) for result in more)
-        lines.append(f"  and {len(more)} more, seeds {seeds}")
-    return lines
 
 
 def _repeat_lines(result: TrialResult) -> list[str]:
@@ -201,7 +275,16 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
             hostname=_clean(host),
         )
         properties = Xml.SubElement(suite, "properties")
-        for key, value in _properties(results):
+        trial = results[0].trial
+        told = {
+            "driver": "live" if trial.live else "virtual",
+            "source": trial.source,
+            "overrides": " ".join(trial.overrides),
+            "duration_s": f"{trial.scenario.duration_s:g}",
+            "simulated_s": f"{sum(result.simulated_s for result in results):.6g}",
+            "random": str(trial.scenario.random).lower(),
+        }
+        for key, value in told.items():
             Xml.SubElement(properties, "property", name=key, value=_clean(value))
         for result in results:
             _add_case(suite, result)
@@ -219,18 +302,6 @@ def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
         "errors": str(errors),
         "time": f"{sum(result.wall_s for result in results):.3f}",
     }
-
-
-def _properties(results: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    trial = results[0].trial
-    return [
-        ("driver", "live" if trial.live else "virtual"),
-        ("source", trial.source),
-        ("overrides", " ".join(trial.overrides)),
-        ("duration_s", f"{trial.scenario.duration_s:g}"),
-        ("simulated_s", f"{sum(result.simulated_s for result in results):.6g}"),
-        ("random", str(trial.scenario.random).lower()),
-    ]
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:

@@ -115,10 +115,11 @@ def _run(scenario: Scenario) -> _Run:
     end_rad, before_rad = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
     largest = np.abs(e).max(axis=(0, 2))
     apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
-    efforts, saturated = zip(
-        *(_effort(record, scenario, site) for record, site in zip(records, scenario.names, strict=True)),
-        strict=True,
-    )
+    efforts, saturated = [], []
+    for record, site in zip(records, scenario.names, strict=True):
+        beyond_nm = record.tau - build_arm_rows(scenario, site).gravity_torque(record.q)
+        efforts.append(np.mean(beyond_nm**2))
+        saturated.append(np.mean(np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm))
     return _Run(
         end=classify_run_end(scenario, trace),
         fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
@@ -142,35 +143,8 @@ def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
     return at_ns / NS_PER_S, q, e
 
 
-def _effort(record: RecordBatch, scenario: Scenario, site: str) -> tuple[float, float]:
-    """Returns the mean square of tau - G(q), (N m)^2, and the share of torques at the clamp."""
-    gravity = build_arm_rows(scenario, site).gravity_torque(record.q)
-    clamped = np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm
-    return float(np.mean((record.tau - gravity) ** 2)), float(np.mean(clamped))
-
-
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-class CandidateTask(NamedTuple):
-    """One candidate to be run.
-
-    Attributes:
-        runs: of each seed the canonical texts of its scenario and of its twin.
-        name: what it is called.
-    """
-
-    runs: tuple[tuple[str, str | None], ...]
-    name: str
-
-    def __str__(self) -> str:
-        return self.name
-
-
-def measure_candidate_task(task: CandidateTask) -> CandidateScore:
-    """Runs one task, in whatever process."""
-    return average_scores([measure_candidate(*run) for run in task.runs])
 
 
 class TuningScenario(NamedTuple):
@@ -216,10 +190,30 @@ class TuningScenario(NamedTuple):
         return format_command("sim", self.source, *set_options(self.overrides))
 
 
+class CandidateTask(NamedTuple):
+    """One candidate to be run.
+
+    Attributes:
+        runs: of each seed the canonical texts of its scenario and of its twin.
+        name: what it is called.
+    """
+
+    runs: tuple[tuple[str, str | None], ...]
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
 def build_candidate_task(seeds: Sequence[TuningScenario]) -> CandidateTask:
     """Returns what has to be run to measure one candidate, given with every seed."""
     name = ", ".join(seeds[0].overrides) or seeds[0].source
     return CandidateTask(tuple(one.texts for one in seeds), name)
+
+
+def measure_candidate_task(task: CandidateTask) -> CandidateScore:
+    """Runs one task, in whatever process."""
+    return average_scores([measure_candidate(*run) for run in task.runs])
 
 
 def load_tuning_scenario(

@@ -56,11 +56,6 @@ def check_comparable(scenario: Scenario) -> None:
             path="dominance",
             source=scenario.name,
         )
-    _refuse_conflict(scenario)
-
-
-def _refuse_conflict(scenario: Scenario) -> None:
-    """Refuses operators that hold different poses at one time: no law can bring such arms together."""
     t_s = np.arange(0.0, scenario.duration_s, 1.0 / _LOOK_HZ)
     pose = compute_consensus_pose(scenario, t_s)
     for name, hand in _springs(scenario):

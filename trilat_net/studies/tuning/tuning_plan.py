@@ -23,15 +23,14 @@ from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import search_space
 from .candidate import (
     CandidateScore,
-    CandidateTask,
     TuningScenario,
     build_candidate_task,
     load_tuning_scenario,
     measure_candidate,
     measure_candidate_task,
 )
-from .final_posture import build_twin, check_comparable
-from .pareto_search import CandidateSearch, Objective, find_pareto_front
+from .final_posture import CLASS_MEANINGS, build_twin, check_comparable
+from .pareto_search import REFINEMENT_STEPS, CandidateSearch, Objective, find_pareto_front
 
 DEFAULT_BUDGET = 64
 """Candidates per law: four laws on `free` take some minutes on two cores."""
@@ -83,11 +82,6 @@ class TuningPlan(NamedTuple):
         controls = {"as printed": told, "as printed, told nothing": untold}
         return {name: base.with_controls(tables) for name, tables in controls.items()}
 
-    def task(self, space: search_space.SearchSpace, gains: search_space.GainValues) -> CandidateTask:
-        """Returns a candidate to be run, with every seed."""
-        bases = (self.base, *self.others)
-        return build_candidate_task([base.with_gains(space, self.knowledge, gains) for base in bases])
-
     def estimate_s(self, jobs: int | None = None) -> float:
         """Returns about how long the search will take, s: by a short run of the experiment."""
         scenario = self.base.scenario
@@ -109,10 +103,10 @@ class TuningPlan(NamedTuple):
             RunFailed: a candidate ended its workers, or the cluster is gone.
         """
         searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
-        printed = self.printed(self.base)
-        of_others = [self.printed(base) for base in self.others]
+        bases = (self.base, *self.others)
+        printed = list(map(self.printed, bases))
         measured: list[CandidateScore] = []
-        total, done = len(searches) * self.budget + len(printed), 0
+        total, done = len(searches) * self.budget + len(printed[0]), 0
 
         def show(more: int, _: int) -> None:
             progress(done + more, total)
@@ -123,19 +117,22 @@ class TuningPlan(NamedTuple):
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
                 tasks = [
-                    self.task(search.space, gains)
+                    build_candidate_task(
+                        [base.with_gains(search.space, self.knowledge, one) for base in bases]
+                    )
                     for search, batch in zip(searches, asked, strict=True)
-                    for gains in batch
+                    for one in batch
                 ]
                 if number == 0:
-                    named = [[found[name] for found in (printed, *of_others)] for name in printed]
-                    tasks += map(build_candidate_task, named)
+                    tasks += [build_candidate_task([of[name] for of in printed]) for name in printed[0]]
                 scores = iter(pool.map(measure_candidate_task, tasks, show))
                 done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores
-        paper = [PaperGainsResult(*one) for one in zip(printed, printed.values(), measured, strict=True)]
+        paper = [
+            PaperGainsResult(*one, score) for one, score in zip(printed[0].items(), measured, strict=True)
+        ]
         return TuningResult(self, searches, paper)
 
 
@@ -166,9 +163,62 @@ class TuningResult(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --tune --json`."""
-        from .tuning_report import tuning_to_json
+        asked, base = self.plan, self.plan.base
+        scenario, weights = base.scenario, search_space.weigh_joints(base.scenario)
+        return {
+            "scenario": {
+                "source": base.source,
+                "overrides": list(base.overrides),
+                "name": scenario.name,
+                "seed": scenario.seed,
+                "sites": len(scenario.names),
+                "duration_s": scenario.duration_s,
+                "tau_limit_nm": {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()},
+            },
+            "procedure": {
+                "candidates_per_law": asked.budget,
+                "seed": asked.seed,
+                "seeds": 1 + len(asked.others),
+                "latin_hypercube": (asked.budget + 1) // 2,
+                "refining_steps": list(REFINEMENT_STEPS),
+                "runs": asked.runs,
+                "twin": asked.twin,
+                "objective": asked.objective.value,
+                "objective_unit": asked.objective.unit,
+                "gravity_told": asked.knowledge.gravity,
+                "knowledge": asked.knowledge.text,
+                "box": asked.knowledge.box,
+                **({"joint_weights": weights} if weights else {}),
+                "outcomes": {outcome.value: text for outcome, text in CLASS_MEANINGS.items()},
+            },
+            "laws": {found.space.law: self._describe_law(found) for found in self.found},
+            "as_printed": [
+                {"name": one.name, **msgspec.to_builtins(one.score), "command": one.candidate.command}
+                for one in self.printed
+            ],
+        }
 
-        return tuning_to_json(self)
+    def _describe_law(self, found: CandidateSearch) -> dict[str, Any]:
+        tried = [
+            {"gains": gains, **msgspec.to_builtins(score)}
+            for gains, score in zip(found.tried, found.scores, strict=True)
+        ]
+        shared = self.shared(found)
+        return {
+            "told": found.space.told,
+            "searched": [knob._asdict() for knob in found.space.knobs],
+            "outcomes": {outcome.value: count for outcome, count in found.outcomes.items()},
+            "front": [
+                {
+                    "candidate": place,
+                    **tried[place],
+                    "on_the_front_of_all": place in shared,
+                    "command": self.candidate(found, place).command,
+                }
+                for place in found.front
+            ],
+            "candidates": tried,
+        }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per candidate."""

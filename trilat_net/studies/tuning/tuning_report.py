@@ -12,13 +12,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ...analysis.json_values import JsonObject
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.palette import SITE_COLOURS
@@ -27,7 +25,7 @@ from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
 from .candidate import CandidateScore
 from .final_posture import CLASS_MEANINGS, CandidateClass
-from .pareto_search import REFINEMENT_STEPS, CandidateSearch, Objective
+from .pareto_search import CandidateSearch, Objective
 from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, TuningPlan, TuningResult
 
@@ -65,26 +63,17 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
     """Returns a row per law: what became of its candidates, and the two ends of its front."""
     value = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
     heads = ("law", "tried", *(one.word for one in reversed(CandidateClass)), "front", "of all")
-    return TextTable(
-        (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}"),
-        [_law_row(tuned, found) for found in tuned.found],
-        align="lr",
-    )
-
-
-def _law_row(tuned: TuningResult, found: CandidateSearch) -> tuple[str, ...]:
-    counts, points, front = found.outcomes, found.points, found.front
-    ends = [points[place] or (None, None) for place in front[-1:] + front[:1]]
-    best, cheapest = ends or [(None, None)] * 2
-    numbers = (*best, *cheapest[::-1])
-    return (
-        found.space.law,
-        str(len(found.tried)),
-        *(str(counts[outcome]) for outcome in reversed(CandidateClass)),
-        str(len(front)),
-        str(len(tuned.shared(found))),
-        *map(_number, numbers),
-    )
+    rows = []
+    for found in tuned.found:
+        counts, points, front = found.outcomes, found.points, found.front
+        ends = [points[place] or (None, None) for place in front[-1:] + front[:1]]
+        best, cheapest = ends or [(None, None)] * 2
+        classes = (str(counts[outcome]) for outcome in reversed(CandidateClass))
+        places = str(len(front)), str(len(tuned.shared(found)))
+        numbers = map(_number, (*best, *cheapest[::-1]))
+        rows.append((found.space.law, str(len(found.tried)), *classes, *places, *numbers))
+    heads = (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}")
+    return TextTable(heads, rows, align="lr")
 
 
 def tabulate_search(plan: TuningPlan) -> TextTable:
@@ -201,67 +190,6 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def tuning_to_json(tuned: TuningResult) -> JsonObject:
-    """Returns all that there is to say, as plain values."""
-    asked = tuned.plan
-    scenario = asked.base.scenario
-    return {
-        "scenario": {
-            "source": asked.base.source,
-            "overrides": list(asked.base.overrides),
-            "name": scenario.name,
-            "seed": scenario.seed,
-            "sites": len(scenario.names),
-            "duration_s": scenario.duration_s,
-            "tau_limit_nm": {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()},
-        },
-        "procedure": {
-            "candidates_per_law": asked.budget,
-            "seed": asked.seed,
-            "seeds": 1 + len(asked.others),
-            "latin_hypercube": (asked.budget + 1) // 2,
-            "refining_steps": list(REFINEMENT_STEPS),
-            "runs": asked.runs,
-            "twin": asked.twin,
-            "objective": asked.objective.value,
-            "objective_unit": asked.objective.unit,
-            "gravity_told": asked.knowledge.gravity,
-            "knowledge": asked.knowledge.text,
-            "box": asked.knowledge.box,
-            **({"joint_weights": weights} if (weights := weigh_joints(scenario)) else {}),
-            "outcomes": {outcome.value: text for outcome, text in CLASS_MEANINGS.items()},
-        },
-        "laws": {found.space.law: _law(tuned, found) for found in tuned.found},
-        "as_printed": [
-            {"name": one.name, **msgspec.to_builtins(one.score), "command": one.candidate.command}
-            for one in tuned.printed
-        ],
-    }
-
-
-def _law(tuned: TuningResult, found: CandidateSearch) -> JsonObject:
-    shared = tuned.shared(found)
-    return {
-        "told": found.space.told,
-        "searched": [knob._asdict() for knob in found.space.knobs],
-        "outcomes": {outcome.value: found.outcomes[outcome] for outcome in CandidateClass},
-        "front": [
-            {
-                "candidate": place,
-                "gains": found.tried[place],
-                **msgspec.to_builtins(found.scores[place]),
-                "on_the_front_of_all": place in shared,
-                "command": tuned.candidate(found, place).command,
-            }
-            for place in found.front
-        ],
-        "candidates": [
-            {"gains": gains, **msgspec.to_builtins(score)}
-            for gains, score in zip(found.tried, found.scores, strict=True)
-        ],
-    }
-
-
 FRONT_WIDTH_IN = 3.5
 """One column of a page of two."""
 _HEIGHT_IN = 3.1
@@ -328,7 +256,7 @@ def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     """Writes a comparison into a folder that exists, and returns the paths."""
     data, text = folder / "front.json", folder / "front.md"
-    write_whole(data, json.dumps(tuning_to_json(tuned), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_whole(data, json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
     write_whole(text, build_tuning_page(tuned))
     figure = draw_front(tuned)
     pictures = [folder / "front.png", folder / "front.pdf"]
