@@ -158,7 +158,8 @@ def test_every_site_follows_unless_told_otherwise() -> None:
             unit_scenario(both, {"law": "tdpa"}, duration_s=10.0, link={**CONSTANT, "delay_ms": 50.0})
         )
         assert least_energy(run) >= 0.0
-        assert (np.abs(run["m"].qd[-1000:, 0]).max() < 0.3 * np.abs(run["m"].qd[:1000, 0]).max()) is follows
+        speeds = np.abs(run["m"].qd[-1000:, 0])
+        assert speeds.max() < 1e-6 if follows else speeds.min() > 0.05
 
 
 @pytest.mark.parametrize("clamped", [False, True])
