@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis import site_signals
-from ...analysis.certificate.stability_certificate import certify
 from ...analysis.site_signals import largest_magnitude, settling_time_of_all_s
 from ...analysis.timeline import recorded_end_s
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
+from ...theory.end_pose import certify_run
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 from ..palette import SITE_COLOURS
@@ -140,5 +140,5 @@ def _describe(log: Log, form: FigureSize) -> str:
     """Returns the run's title and how it ended."""
     last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
     when = "not settled" if last is None else f"settled at {last:.1f} s"
-    words = f"{log.scenario.title or log.scenario.name}: {certify(log).stability}, {when}"
+    words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
     return "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))
