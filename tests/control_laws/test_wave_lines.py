@@ -160,6 +160,19 @@ def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: fl
     assert np.abs(np.diff(tau[10000:])).max() < 0.03
 
 
+@pytest.mark.parametrize(("link", "reserve_J"), [(JITTER, 0.01), (JITTER, 0.0), (CONSTANT, 0.01)])
+def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
+    """Where delays vary and nothing damps: two ends, two joints, a reserve in H and one in W."""
+    control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}
+    sites = {"m": {"qd0_rad_s": [1e-6, 5e-7]}, "s": {}}
+    run = ticked(unit_scenario(sites, control, duration_s=20.0, link=link))
+    M = np.array([[5.0 / 6.0, 1.0 / 3.0], [1.0 / 3.0, 1.0 / 3.0]])
+    kinetic_J = sum(0.5 * np.einsum("ki,ij,kj->k", site.qd, M, site.qd) for site in run.values())
+    grows = link is JITTER and reserve_J > 0.0
+    assert kinetic_J.max() <= kinetic_J[0] + (8.0 * reserve_J if grows else 0.0)
+    assert (kinetic_J[-1] > 1e6 * kinetic_J[0]) == grows
+
+
 def test_play_out_makes_jitter_a_constant_delay() -> None:
     jitter = {**JITTER, "loss": 0.0, "playout_ms": 400.0}
     a, other = (
