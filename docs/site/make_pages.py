@@ -28,8 +28,8 @@ def main() -> None:
     shutil.rmtree(SITE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site"))
     for name in BESIDE:
-        shutil.copy(ROOT / name, PAGES / (name if name.endswith(".md") else f"{name}.md"))
-    write("index.md", make_first_page())
+        write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name))
+    write("index.md", read_beside_docs("README.md"))
     for page in PAGES.glob("*.md"):
         page.write_text(page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8")
     write("reference/commands.md", list_commands())
@@ -48,10 +48,10 @@ def write(name: str, text: str) -> None:
     path.write_text(text.rstrip() + "\n", encoding="utf-8")
 
 
-def make_first_page() -> str:
-    """Returns the README with its links and pictures as docs has them."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    return re.sub(r'(\]\(|src=")docs/', r"\1", readme)
+def read_beside_docs(name: str) -> str:
+    """Returns a page that stands beside docs with its links and pictures as docs has them."""
+    page = (ROOT / name).read_text(encoding="utf-8")
+    return re.sub(r'(\]\(|src=")docs/', r"\1", page)
 
 
 def list_commands() -> str:
