@@ -1,6 +1,7 @@
 """`trilat record --conclude`: the recorder judges its log, draws it, and says so with its exit code."""
 
 import json
+import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -45,7 +46,7 @@ def test_a_run_that_diverged_fails_though_its_log_is_sound(
 
     monkeypatch.setattr(recorder.record_process, "record_session", recorded)
     done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
-    assert "FAIL" not in done.out
+    assert re.findall("^FAIL .*$", done.out, re.MULTILINE) == ["FAIL stability: not stable: diverged"]
     assert (tmp_path / "runs" / "x-001" / "report.html").is_file()  # a folder of its own
     done.refuses("run.mcap", "diverged at t = ", code=1)
 

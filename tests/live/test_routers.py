@@ -121,7 +121,9 @@ def test_with_keys_every_member_stops_an_arm_and_the_operator_alone_enables_it(s
     session.begun()
     for whose in (RECORDER, "m"):
         code, text = order("stop s", whose)
-        assert (code, text.startswith("s: stop at tick")) == (0, True), text
+        trying, answer = text.splitlines()
+        assert (code, trying) == (0, "stopping every arm of session t ..."), text
+        assert answer.startswith("s: stop at tick")
         code, text = order("enable s", whose)
         assert code != 0
         assert f"these are the keys of {whose}, and this takes those of operator" in text
