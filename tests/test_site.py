@@ -38,7 +38,7 @@ class Page(HTMLParser):
 
 
 def test_every_picture_and_page_that_the_first_page_names_is_there() -> None:
-    text = MAKE.make_first_page()
+    text = MAKE.read_beside_docs("README.md")
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
     assert len(named) > 40
     places = [ROOT / "docs" / one for one in named if one not in MAKE.BESIDE]
