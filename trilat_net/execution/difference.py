@@ -59,7 +59,7 @@ def _pack(a: State | TickRecord) -> bytes:
         "d",
         [
             *(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat),
-            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand, *a.mem),
+            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand),
         ],
     ).tobytes()
 
@@ -73,6 +73,7 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
         and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
         and a.mode == b.mode.name.lower()
         and a.cmd == b.cmd
+        and array("d", a.mem).tobytes() == array("d", b.mem).tobytes()
     )
 
 
