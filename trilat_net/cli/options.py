@@ -208,6 +208,17 @@ MinCoverageOption = Annotated[
 ]
 MIN_COVERAGE = 0.999
 """As in `log.accounting`, which takes long to import."""
+ResultsOption = Annotated[
+    Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
+]
+OnOption = Annotated[
+    str | None,
+    value(
+        "--on",
+        "tcp://HOST:PORT",
+        "Run on the workers of this Dask scheduler instead of processes of this machine.",
+    ),
+]
 PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
 JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 
@@ -327,10 +338,30 @@ class LawFiles(NamedTuple):
         return log
 
 
+class RunOptions(NamedTuple):
+    """The options of a run that is live on this machine, and of its results."""
+
+    duration: DurationOption = None
+    folder: ResultsOption = None
+    seed: SeedOption = None
+    overrides: SetOption = None
+    force: ForceOption = False
+    png: PngOption = False
+    as_json: JsonOption = False
+
+    def load(self, source: str, longest_s: float | None = None) -> "Scenario":
+        """Returns the scenario of the run, which lasts so long unless told otherwise, s."""
+        lasts_s = longest_s if self.duration is None else self.duration
+        return load_chosen_scenario(source, self.overrides, lasts_s, self.seed)
+
+
+_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions)
+
+
 def spread(run: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a command with an option for every field of its parameters that are tuples of options."""
     given = inspect.signature(run).parameters
-    kinds = {n: p.annotation for n, p in given.items() if p.annotation in (MemberOptions, Reach, LawFiles)}
+    kinds = {n: p.annotation for n, p in given.items() if p.annotation in _TUPLES}
     parameters = [
         inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for name, outer in given.items()
@@ -346,16 +377,3 @@ def spread(run: Callable[..., Any]) -> Callable[..., Any]:
     vars(gather)["__signature__"] = inspect.Signature(parameters)
     gather.__annotations__ = {one.name: one.annotation for one in parameters}
     return gather
-
-
-ResultsOption = Annotated[
-    Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
-]
-OnOption = Annotated[
-    str | None,
-    value(
-        "--on",
-        "tcp://HOST:PORT",
-        "Run on the workers of this Dask scheduler instead of processes of this machine.",
-    ),
-]

@@ -25,35 +25,23 @@ if TYPE_CHECKING:
 
 def demo_command(
     scenario: options.ScenarioArgument = "paper",
-    duration: options.DurationOption = None,
-    folder: options.ResultsOption = None,
-    seed: options.SeedOption = None,
-    overrides: options.SetOption = None,
-    force: options.ForceOption = False,
-    png: options.PngOption = False,
-    as_json: options.JsonOption = False,
+    *,
+    run: options.RunOptions,
 ) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
-    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
-    run_and_report(chosen, folder, force=force, png=png, as_json=as_json)
+    run_and_report(run.load(scenario), run)
 
 
 def run_and_report(
-    chosen: "Scenario",
-    folder: Path | None,
-    attend: "SessionAttendant | None" = None,
-    *,
-    force: bool,
-    png: bool,
-    as_json: bool,
+    chosen: "Scenario", run: options.RunOptions, attend: "SessionAttendant | None" = None
 ) -> None:
     """Runs a scenario live, then verifies and reports; what `attend` yields may end it as planned."""
     from sites.demo_session import run_demo
 
     from ..files import make_results_folder
 
-    results = make_results_folder(folder, chosen.name, force=force)
-    with terminal.lines_aside(as_json):
+    results = make_results_folder(run.folder, chosen.name, force=run.force)
+    with terminal.lines_aside(run.as_json):
         terminal.print_text(chosen.title or chosen.name)
         members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
@@ -67,7 +55,7 @@ def run_and_report(
         raise typer.Exit(128 + outcome.interrupted)
     if not there:
         raise typer.Exit(outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=as_json, png=png)
+    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=run.as_json, png=run.png)
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)
 
@@ -91,13 +79,7 @@ def live_command(
         bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
     ] = False,
     browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
-    duration: options.DurationOption = None,
-    folder: options.ResultsOption = None,
-    seed: options.SeedOption = None,
-    overrides: options.SetOption = None,
-    force: options.ForceOption = False,
-    png: options.PngOption = False,
-    as_json: options.JsonOption = False,
+    run: options.RunOptions,
 ) -> None:
     """Runs a scenario live, with a page on which to watch it and take hold of the arms.
 
@@ -123,10 +105,7 @@ def live_command(
         raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
     if any(reach):
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
-    longest_s = LONGEST_S if duration is None else duration
-    chosen = options.load_chosen_scenario(scenario, overrides, longest_s, seed)
-    attend = partial(attend_with_page, page, clock)
-    run_and_report(chosen, folder, attend, force=force, png=png, as_json=as_json)
+    run_and_report(run.load(scenario, LONGEST_S), run, partial(attend_with_page, page, clock))
 
 
 def _check_count(value: int) -> int:
