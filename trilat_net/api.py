@@ -435,6 +435,7 @@ def bench(
     laws: Sequence[str] = (),
     links: Sequence[str] = (),
     seeds: int | None = None,
+    confirm: bool = False,
     out: str | Path | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -451,6 +452,7 @@ def bench(
         laws: some laws alone.
         links: other links, as in "rtt68-loss10" or "4g".
         seeds: how many; by default the study's.
+        confirm: what is not stable runs again for 100 s, which refutes or confirms it.
         out: folder; a suite in it goes on. By default runs/bench-STUDY.
         jobs: how many processes; None for one per core.
         on: what runs them instead: a Dask scheduler's address or an executor.
@@ -461,7 +463,8 @@ def bench(
     from .studies.bench import plan_bench, prepare_bench_folder, run_bench
 
     plan = plan_bench(study, tasks=tasks, laws=laws, links=links, seeds=seeds)
-    return run_bench(prepare_bench_folder(plan, None if out is None else Path(out)), jobs, on)
+    folder = prepare_bench_folder(plan, None if out is None else Path(out))
+    return run_bench(folder, jobs, on, confirm=confirm)
 
 
 def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:

@@ -44,12 +44,12 @@ def _print_cell(plan: "BenchPlan", name: str) -> None:
         terminal.print_line(f"{plan.cell(name).build(seed).command} -o {name.replace('/', '-')}-{seed}.mcap")
 
 
-def _run(folder: "BenchFolder", jobs: int | None, on: str | None) -> "BenchResults":
+def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool) -> "BenchResults":
     from ..studies.bench import run_bench
 
     try:
         with show_progress("running", terminal.print_note) as progress:
-            return run_bench(folder, jobs, on, progress)
+            return run_bench(folder, jobs, on, progress, confirm=confirm)
     except KeyboardInterrupt:
         terminal.print_note(f"what is done is kept in {folder.path}; the same command goes on")
         raise
@@ -74,6 +74,9 @@ def bench_command(
     tune: Annotated[
         bool, _option("--tune", help="Tune the laws again, and store their gains with the suite.")
     ] = False,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="Run what is not stable for 100 s: it is refuted or confirmed.")
+    ] = False,
     output: Annotated[
         Path | None,
         options.value("--out -o", "DIR", "Folder; continues a suite in it. Default: runs/bench-STUDY."),
@@ -82,7 +85,7 @@ def bench_command(
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs control laws on the same tasks over the same links: errors, effort, transparency, passivity.
+    """Runs control laws on the same tasks over the same links: stability, energy, errors, effort, stiffness.
 
     One procedure tuned the gains of every law. Finished runs are kept: the same command continues.
     """
@@ -105,9 +108,10 @@ def bench_command(
         terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
     folder = prepare_bench_folder(plan, output)
     terminal.print_note(f"{len(plan.cells)} cells, {plan.runs} runs, into {folder.path}")
-    results = _run(folder, jobs, on)
+    results = _run(folder, jobs, on, confirm=confirm)
     given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
     words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
+    words += ["--confirm"] if confirm else []
     paths = write_bench(results, folder.path, format_command("bench", "--study", chosen, *words))
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)

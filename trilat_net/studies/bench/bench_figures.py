@@ -25,7 +25,7 @@ FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
     "error": ("error, rad", "error_rad"),
     "effort": ("effort, N m", "effort_nm"),
-    "transparency": ("torque of the hands, N m", "hand_nm"),
+    "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
 """Per figure its label, and the number that it shows; "" for the share of stable runs."""
 _WIDTH_IN = 7.0
@@ -33,13 +33,14 @@ _ROW_IN, _HEAD_IN = 0.14, 0.65
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
-"""Where there is no number: the run diverged."""
+"""Where there is no number: no contact, no rest, or a run that diverged."""
 
 
 def draw_bench(results: BenchResults, name: str) -> Figure:
     """Returns a figure by its name in `FIGURES_OF_BENCH`."""
     label, quantity = FIGURES_OF_BENCH[name]
-    tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
+    ran = dict.fromkeys(cell.task for cell in results.plan.cells)
+    tasks = [task for task in ran if quantity != "stiffness_n_m" or task == "contact"]
     links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
     fields = {task: _collect(results, task, links, quantity) for task in tasks}
     known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
@@ -64,7 +65,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
 
 def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
     """Returns the laws that ran in a task."""
-    return [one for one in list_laws(results) if next(results.of(task, one[0]), None) is not None]
+    return [one for one in list_laws(results) if any(results.of(task, one[0]))]
 
 
 def _collect(results: BenchResults, task: str, links: list[str], quantity: str) -> Array:

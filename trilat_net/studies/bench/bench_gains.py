@@ -1,7 +1,8 @@
 """The gains of the suite: each law tuned by the one procedure at three delays, and kept in a file.
 
 Invariant: gains come from `trilat bench --tune` alone. Each entry has the fingerprint of what it was tuned
-for, the resolved scenario and the sources of the law: a stale one is named wherever it is used.
+for, the resolved scenario and the sources of the law: a stale one is named wherever it is used. A law of
+which no candidate keeps the margin has none, and no runs.
 """
 
 import hashlib
@@ -20,7 +21,7 @@ from ...files import write_whole
 from ...scenario.laws import LAWS
 from ..commands import format_toml_value
 from ..executor import Progress, Workers, ignore_progress
-from ..tuning.candidate import CandidateScore, TuningScenario, load_tuning_scenario
+from ..tuning.candidate import TuningScenario, load_tuning_scenario, measure_candidate
 from ..tuning.final_posture import CandidateClass
 from ..tuning.pareto_search import CandidateSearch
 from ..tuning.search_space import SEARCH_SPACES, ModelInformation
@@ -30,20 +31,22 @@ from .bench_tasks import BASES, TUNED_ROUND_TRIPS_MS, TUNING_TASK, Settings, bui
 GAINS_FILE = Path(str(resources.files("trilat_net.studies.bench") / "bench_gains.json"))
 KNOWLEDGE = ModelInformation()
 """All laws know gravity exactly."""
-TUNING_BUDGET = 32
-"""Candidates per law and delay."""
+TUNING_BUDGET = 16
+"""Candidates per gain of a law, at each delay."""
+TUNING_MARGIN = 1.5
+"""With the gains that are kept, the run is stable at the pose with so many times the delay, too."""
 
 
 class TunedGains(msgspec.Struct, frozen=True):
     """The gains of a law in a form of the tasks at a round trip.
 
     Attributes:
-        gains: by name: of the stable candidates at the pose that with the least error; without one, of those
-            that did not diverge.
-        outcome: its class.
+        gains: by name: of the stable candidates at the pose that have the margin those with the least error;
+            none if there is no such candidate.
         settled: how many of the candidates were stable and at the pose.
         tried: how many there were.
-        error_rad, effort_nm: of that candidate.
+        passed: how many of the stable ones with less error had not the margin.
+        error_rad, effort_nm: of that candidate; None without one.
         fingerprint: of scenario and law.
     """
 
@@ -51,9 +54,9 @@ class TunedGains(msgspec.Struct, frozen=True):
     law: str
     round_trip_ms: int
     gains: dict[str, float]
-    outcome: CandidateClass
     settled: int
     tried: int
+    passed: int
     error_rad: float | None
     effort_nm: float | None
     fingerprint: str
@@ -82,7 +85,9 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     source = inspect.getsource(control if kind is None else inspect.getmodule(kind) or kind)
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
     text = load_tuning_task(form, round_trip_ms).scenario.text
-    return hashlib.sha256("\0".join((text, source, ranges, str(TUNING_BUDGET))).encode()).hexdigest()[:16]
+    return hashlib.sha256(
+        "\0".join((text, source, ranges, f"{TUNING_BUDGET} {TUNING_MARGIN}")).encode()
+    ).hexdigest()[:16]
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
@@ -106,16 +111,19 @@ def choose_round_trip(mean_ms: float) -> int:
     return longer[0] if longer else TUNED_ROUND_TRIPS_MS[-1]
 
 
-def choose_candidate(search: CandidateSearch) -> int:
-    """Returns the place of the candidate whose gains are kept: the end of the front with the least error."""
-    if search.front:
-        return search.front[-1]
+def list_candidates(search: CandidateSearch) -> list[int]:
+    """Returns the places of the candidates that are stable at the pose, those with the least error first."""
+    settled = [n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED]
+    return sorted(settled, key=lambda n: search.scores[n].error_rad or 0.0)
 
-    def rank(place: int) -> tuple[bool, float]:
-        score: CandidateScore = search.scores[place]
-        return score.error_rad is None, score.error_rad or 0.0
 
-    return min(range(len(search.scores)), key=rank)
+def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, place: int) -> bool:
+    """Returns whether a candidate, as it is, is stable at the pose if delays are longer by the margin."""
+    base = load_tuning_task(form, round_trip_ms)
+    controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[place])
+    later = (*base.overrides, f"link.delay_ms={0.5 * TUNING_MARGIN * round_trip_ms:g}")
+    found = load_tuning_scenario(base.source, later).with_controls(controls)
+    return measure_candidate(*found.texts).outcome is CandidateClass.SETTLED
 
 
 def tune_laws(
@@ -132,32 +140,37 @@ def tune_laws(
         jobs: processes of this machine.
         on: what runs the candidates instead.
         progress: called with the tunings that are done, and their number.
-        budget: candidates per law and delay.
+        budget: candidates per gain of a law, at each delay.
     """
     found: list[TunedGains] = []
-    total = len(TUNED_ROUND_TRIPS_MS) * len(wanted)
+    total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, wanted.values()))
     for form, laws in wanted.items():
         for round_trip_ms in TUNED_ROUND_TRIPS_MS:
             settings = name_settings(build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}"))
-            tuned = plan_tuning(BASES[form], settings, laws=laws, budget=budget).run(jobs, on=on)
-            found += [_keep(form, round_trip_ms, search) for search in tuned.found]
-            progress(len(found) // max(1, len(laws)), total)
+            for size in sorted({len(SEARCH_SPACES[law].knobs) for law in laws}):
+                alike = [law for law in laws if len(SEARCH_SPACES[law].knobs) == size]
+                plan = plan_tuning(BASES[form], settings, laws=alike, budget=size * budget)
+                found += [_keep(form, round_trip_ms, one) for one in plan.run(jobs, on=on).found]
+                progress(len(found), total)
     return found
 
 
 def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    place, law = choose_candidate(search), search.space.law
-    score = search.scores[place]
+    law, candidates = search.space.law, list_candidates(search)
+    passed = 0
+    while passed < len(candidates) and not _has_margin(form, round_trip_ms, search, candidates[passed]):
+        passed += 1
+    place = candidates[passed] if passed < len(candidates) else None
     return TunedGains(
         form=form,
         law=law,
         round_trip_ms=round_trip_ms,
-        gains=search.tried[place],
-        outcome=score.outcome,
-        settled=search.outcomes[CandidateClass.SETTLED],
+        gains={} if place is None else search.tried[place],
+        settled=len(candidates),
         tried=len(search.tried),
-        error_rad=score.error_rad,
-        effort_nm=score.effort_nm,
+        passed=passed,
+        error_rad=None if place is None else search.scores[place].error_rad,
+        effort_nm=None if place is None else search.scores[place].effort_nm,
         fingerprint=fingerprint_tuning(form, law, round_trip_ms),
     )
 

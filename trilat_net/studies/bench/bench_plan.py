@@ -5,7 +5,7 @@ is refused before the first run.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from ...scenario.fields import suggest_nearest
 from ..tuning.candidate import TuningScenario, load_tuning_scenario
 from ..tuning.search_space import SEARCH_SPACES
 from .bench_gains import KNOWLEDGE, TunedGains, choose_round_trip, name_settings, read_gains
-from .bench_tasks import BASES, LINKS, STUDIES, TASKS, BenchStudy, build_settings
+from .bench_tasks import BASES, LINKS, NO_DOMINANCE, STUDIES, TASKS, BenchStudy, build_settings
 
 MAX_BENCH_SEEDS = 1000
 
@@ -59,10 +59,14 @@ class BenchPlan(NamedTuple):
     Attributes:
         study: its name.
         cells: in the order in which they run.
+        laws: all that were asked for, with their forms: those without cells have empty rows.
+        without: of the gains in question those of which there are none.
     """
 
     study: str
     cells: list[BenchCell]
+    laws: Sequence[tuple[str, str]]
+    without: Sequence[TunedGains] = ()
 
     @property
     def runs(self) -> int:
@@ -115,28 +119,38 @@ def plan_bench(
     chosen_laws = [_choose("law", name, known) for name in laws] or known
     chosen_links = [_choose("link", name, list(LINKS)) for name in links] or list(asked.links)
     count = asked.seeds if seeds is None else seeds
-    cells = _list_cells(asked, chosen_tasks, chosen_laws, chosen_links, count)
+    listed = list(_list_cells(asked, chosen_tasks, chosen_laws, chosen_links, count))
+    cells = [cell for cell in listed if cell.tuned.gains]
+    without = {str(cell.tuned): cell.tuned for cell in listed if not cell.tuned.gains}
     if not cells:
         names = ", ".join(chosen_tasks)
-        raise UsageError(
-            f"{', '.join(chosen_laws)} for two sites: {names} asks for two users; choose another task"
+        why = (
+            f"no candidate was stable for {', '.join(without)}" if without else f"{names} asks for two users"
         )
-    return BenchPlan(study, cells)
+        raise UsageError(f"{', '.join(chosen_laws)}: {why}, or for dominance; choose another task or link")
+    rows = [(law, form) for form, laws in asked.laws.items() for law in laws if law in chosen_laws]
+    return BenchPlan(study, cells, rows, list(without.values()))
+
+
+def explain_no_cell(law: str, form: str, task: str) -> str:
+    """Returns why a law does not run in a task, in the word of the tables; "no gains" if only they lack."""
+    if TASKS[task].users > 1 and form != "three":
+        return "-"
+    return "no dominance" if TASKS[task].users > 1 and law in NO_DOMINANCE else "no gains"
 
 
 def _list_cells(
     study: BenchStudy, tasks: Sequence[str], laws: Sequence[str], links: Sequence[str], seeds: int
-) -> list[BenchCell]:
-    gains, cells = read_gains(), []
+) -> Iterator[BenchCell]:
+    gains = read_gains()
     facts = {link: _describe_link(link) for link in links}
     for form, laws_of_form in study.laws.items():
         for law in (law for law in laws_of_form if law in laws):
-            for task in (task for task in tasks if form == "three" or TASKS[task].users == 1):
+            for task in (task for task in tasks if explain_no_cell(law, form, task) == "no gains"):
                 for link, (random, mean_ms) in facts.items():
                     tuned = _find_gains(gains, form, law, choose_round_trip(2.0 * mean_ms))
                     chosen = tuple(range(1, 1 + (seeds if random else 1)))
-                    cells.append(BenchCell(task, law, link, form, tuned, chosen))
-    return cells
+                    yield BenchCell(task, law, link, form, tuned, chosen)
 
 
 def _describe_link(link: str) -> tuple[bool, float]:

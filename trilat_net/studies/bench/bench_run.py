@@ -10,7 +10,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ...analysis.run_end import Stability
+import msgspec
+import numpy as np
+
+from ...analysis.run_end import EndBehaviour, Stability
 from ...core.fingerprint import compute_fingerprint
 from ...errors import UsageError
 from ...files import make_results_folder, write_whole
@@ -20,7 +23,7 @@ from ..commands import format_command
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..run_journal import RunJournal
-from .bench_cell import BenchRun, BenchRunTask, run_bench_task
+from .bench_cell import LONGEST_S, BenchRun, BenchRunTask, name_run, run_bench_task
 from .bench_plan import BenchCell, BenchPlan
 
 ORIGIN_NAME = "origin.json"
@@ -66,8 +69,10 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
     return BenchFolder(chosen, plan, origin)
 
 
-QUANTITIES_OF_RUNS = ("error_rad", "effort_nm", "hand_nm", "reflected", "force_peak_n")
-"""The numbers of a run that are averaged over its seeds."""
+QUANTITIES_OF_RUNS = ("error_rad", "effort_nm", "hand_nm", "force_peak_n", "stiffness_n_m", "settled_s")
+"""The numbers of a run that are averaged over its seeds; those of runs without contact are masked."""
+LEAST_SEEDS = 20
+"""Of fewer runs there is no interval."""
 
 
 class BenchPlace(NamedTuple):
@@ -86,16 +91,33 @@ class BenchPlace(NamedTuple):
         return sum(run.stability is stability for run in self.runs)
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share of stable runs."""
-        return wilson_interval(self.stable, len(self.runs))
+    def judgement(self) -> Stability:
+        """Stable if all of its runs are, not stable if one is."""
+        found = {run.stability for run in self.runs}
+        return next(one for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE) if one in found)
+
+    @property
+    def masked(self) -> bool:
+        """True if a run was to touch a wall, and did not."""
+        return any(run.masked for run in self.runs)
+
+    @property
+    def energy_j(self) -> float | None:
+        """The least energy of its runs, J; None if one diverged."""
+        values = [run.energy_j for run in self.runs if run.energy_j is not None]
+        return min(values) if len(values) == len(self.runs) else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95 % interval of the share of stable runs; None of too few."""
+        return wilson_interval(self.stable, len(self.runs)) if len(self.runs) >= LEAST_SEEDS else None
 
     def mean(self, quantity: str) -> float | MeanInterval | None:
-        """Returns a number's mean over the seeds, with its interval; of one run the number itself."""
+        """Returns a number's mean over the seeds, with its interval if they are enough."""
         values = [getattr(run, quantity) for run in self.runs]
-        if None in values:
+        if None in values or self.masked:
             return None
-        return values[0] if len(values) == 1 else mean_interval(values)
+        return mean_interval(values) if len(values) >= LEAST_SEEDS else float(np.mean(values))
 
 
 class BenchResults(Result):
@@ -109,7 +131,9 @@ class BenchResults(Result):
 
     def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
         self.plan = plan
-        self.places = [BenchPlace(cell, [runs[cell.key, seed] for seed in cell.seeds]) for cell in plan.cells]
+        self.places = [
+            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds]) for cell in plan.cells
+        ]
         self.runs = [run for place in self.places for run in place.runs]
 
     def blocks(self) -> Iterator[Any]:
@@ -140,8 +164,25 @@ class BenchResults(Result):
                 yield place
 
 
+def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
+    """Returns a run, with the judgement of the longer one if there is one."""
+    run = runs[cell.key, seed]
+    longer = runs.get((name_run(cell.key, LONGEST_S), seed))
+    if run.stability is Stability.NOT_STABLE and run.length_s >= LONGEST_S:
+        return msgspec.structs.replace(run, confirmed=True)
+    if run.stability is not Stability.NOT_STABLE or longer is None:
+        return run
+    confirmed, words = longer.stability is Stability.NOT_STABLE, f"of {LONGEST_S:g} s: {longer.text}"
+    return msgspec.structs.replace(run, stability=longer.stability, text=words, confirmed=confirmed)
+
+
 def run_bench(
-    folder: BenchFolder, jobs: int | None = None, on: Workers = None, progress: Progress = ignore_progress
+    folder: BenchFolder,
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Progress = ignore_progress,
+    *,
+    confirm: bool = False,
 ) -> BenchResults:
     """Runs what is left of a suite, and returns all of it.
 
@@ -150,22 +191,40 @@ def run_bench(
         jobs: in how many processes; None for one per core.
         on: what runs them instead: a Dask scheduler's address or an executor.
         progress: called with the runs that are done, and their number.
+        confirm: every run that is not stable, and did not diverge, is made again for 100 s.
 
     Raises:
         RunFailed: a run ended its workers, or the cluster is gone. What is done is kept.
     """
     plan = folder.plan
     with folder.journal() as journal:
-        tasks = [
-            BenchRunTask(cell, seed)
-            for cell in plan.cells
-            for seed in cell.seeds
-            if (cell.key, seed) not in journal.done
-        ]
-        if tasks:
-            hint = "; what is done is kept: the same command goes on"
-            with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
-                for number, (_, run) in enumerate(pool.each(run_bench_task, tasks, count=len(tasks)), 1):
-                    journal.add(run)
-                    progress(plan.runs - len(tasks) + number, plan.runs)
+        asked = [BenchRunTask(cell, seed) for cell in plan.cells for seed in cell.seeds]
+        _make_runs(asked, journal, jobs, on, progress)
+        if confirm:
+            found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]
+            again = [one._replace(to_s=LONGEST_S) for one, run in found if _is_doubtful(run)]
+            _make_runs(again, journal, jobs, on, progress)
         return BenchResults(plan, journal.done)
+
+
+def _is_doubtful(run: BenchRun) -> bool:
+    diverged = run.behaviour is EndBehaviour.DIVERGED
+    return run.stability is Stability.NOT_STABLE and not diverged and run.length_s < LONGEST_S
+
+
+def _make_runs(
+    asked: Sequence[BenchRunTask],
+    journal: RunJournal[BenchRun],
+    jobs: int | None,
+    on: Workers,
+    progress: Progress,
+) -> None:
+    """Makes the runs that the journal has not."""
+    tasks = [one for one in asked if (name_run(one.cell.key, one.to_s), one.seed) not in journal.done]
+    if not tasks:
+        return
+    hint = "; what is done is kept: the same command goes on"
+    with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
+        for number, (_, run) in enumerate(pool.each(run_bench_task, tasks, count=len(tasks)), 1):
+            journal.add(run)
+            progress(len(asked) - len(tasks) + number, len(asked))

@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...analysis.certificate.observed_energy import ObservedFinding
 from ...analysis.json_values import JsonObject
-from ...analysis.run_end import Stability
+from ...analysis.run_end import EndBehaviour, Stability
 from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
-from ..intervals import MeanInterval, wilson_interval
-from .bench_cell import BenchRun, declares_energies
-from .bench_plan import BenchCell
+from ..intervals import MeanInterval
+from .bench_cell import PASSIVE_J, BenchRun
+from .bench_plan import BenchCell, explain_no_cell
 from .bench_run import QUANTITIES_OF_RUNS, BenchPlace, BenchResults
 from .bench_tasks import STUDIES, TASKS
 
@@ -35,26 +34,28 @@ class BenchQuantity(NamedTuple):
     words: str
 
 
+_WORDS = {
+    "error_rad": "RMS distance of the slave from its users, rad",
+    "effort_nm": "effort, RMS of tau - G(q), N m",
+    "settled_s": "since when all arms stay where they end, s",
+    "hand_nm": "RMS torque of the hands, N m",
+    "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
+    "force_peak_n": "largest force of the wall, N",
+}
+_ALWAYS = ("error_rad", "effort_nm", "settled_s")
+
+
 def list_quantities(results: BenchResults) -> list[BenchQuantity]:
     """Returns what is shown of the tasks that ran."""
     tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
-    found = [
-        BenchQuantity(task, "error_rad", "RMS distance of the slave from its users, rad") for task in tasks
-    ]
-    found += [BenchQuantity(task, "effort_nm", "effort, RMS of tau - G(q), N m") for task in tasks]
-    for task in tasks:
-        if task in ("free", "disagree"):
-            found.append(BenchQuantity(task, "hand_nm", "transparency: RMS torque of the hands, N m"))
-    if "contact" in tasks:
-        words = "transparency: share of the wall's torque that the user feels at rest"
-        found.append(BenchQuantity("contact", "reflected", words))
-        found.append(BenchQuantity("contact", "force_peak_n", "largest force of the wall, N"))
-    return found
+    found = [BenchQuantity(task, key, _WORDS[key]) for key in _ALWAYS for task in tasks]
+    more = {"free": ["hand_nm"], "disagree": ["hand_nm"], "contact": ["stiffness_n_m", "force_peak_n"]}
+    return found + [BenchQuantity(task, key, _WORDS[key]) for task in tasks for key in more.get(task, [])]
 
 
 def list_laws(results: BenchResults) -> list[tuple[str, str]]:
-    """Returns the laws that ran, with their forms, in the order of the plan."""
-    return list(dict.fromkeys((cell.law, cell.form) for cell in results.plan.cells))
+    """Returns the laws that were asked for, with their forms, in the order of the plan."""
+    return list(results.plan.laws)
 
 
 def name_law(law: str, form: str) -> str:
@@ -63,23 +64,43 @@ def name_law(law: str, form: str) -> str:
 
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a row per law: of each task its stable runs of all, and the 95 % interval of that share."""
+    """Returns a row per law: of each task over how many links it is stable, open, and not stable."""
     tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
 
-    def cell(law: str, task: str) -> str:
-        places = list(results.of(task, law))
-        runs = sum(len(place.runs) for place in places)
-        if not runs:
-            return "-"
-        stable, unstable = (
-            sum(place.stable for place in places),
-            sum(place.count(Stability.NOT_STABLE) for place in places),
-        )
-        low, high = (100.0 * end for end in wilson_interval(stable, runs))
-        return f"{stable}/{runs} ({low:.0f}-{high:.0f} %), {unstable} not"
+    def cell(law: str, form: str, task: str) -> str:
+        found = [place.judgement for place in results.of(task, law)]
+        counts = " / ".join(str(found.count(one)) for one in _JUDGEMENTS)
+        return counts if found else explain_no_cell(law, form, task)
 
-    rows = [(name_law(*one), *(cell(one[0], task) for task in tasks)) for one in list_laws(results)]
-    return TextTable(("stable runs of all, not stable", *tasks), rows, align="lr")
+    rows = [(name_law(*one), *(cell(*one, task) for task in tasks)) for one in list_laws(results)]
+    return TextTable(("links: stable / open / not stable", *tasks), rows, align="lr")
+
+
+_JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
+
+
+def tabulate_properties(results: BenchResults, task: str) -> TextTable:
+    """Returns a row per law: over how many links each property holds of all runs, and the least energy."""
+    rows = []
+    for law, form in list_laws(results):
+        places = list(results.of(task, law))
+        if not places:
+            rows.append((name_law(law, form), explain_no_cell(law, form, task), *[""] * 5))
+            continue
+        energies = [place.energy_j for place in places]
+        least = min((one for one in energies if one is not None), default=None)
+        kept = (
+            sum(all(run.bounded for run in place.runs) for place in places),
+            sum(one is not None and one >= PASSIVE_J for one in energies),
+            sum(all(run.settled_s is not None for run in place.runs) for place in places),
+            sum(place.judgement is Stability.STABLE for place in places),
+        )
+        energy = "-" if least is None else f"{min(least, 0.0) if least > -1e-9 else least:.2g}"
+        shown = [f"{count}/{len(places)}" for count in kept]
+        masked = str(sum(place.masked for place in places))
+        rows.append((name_law(law, form), shown[0], shown[1], energy, shown[2], shown[3], masked))
+    heads = ("bounded", "passive", "least energy, J", "converged", "stable", "no contact")
+    return TextTable((task, *heads), rows, align="lr")
 
 
 def tabulate_quantity(results: BenchResults, asked: BenchQuantity) -> TextTable:
@@ -89,36 +110,28 @@ def tabulate_quantity(results: BenchResults, asked: BenchQuantity) -> TextTable:
         links = [link for link in links if link in _SHOWN_LINKS]
     rows = []
     for law, form in list_laws(results):
+        missing = explain_no_cell(law, form, asked.task)
         cells = []
         for link in links:
             place = next(results.of(asked.task, law, link), None)
-            cells.append("-" if place is None else _describe_place(place, asked.key))
-        if any(cell != "-" for cell in cells):
+            cells.append(missing if place is None else _describe_place(place, asked.key))
+        if missing != "-":
             rows.append((name_law(law, form), *cells))
     return TextTable((asked.task, *links), rows, align="lr")
 
 
 def _describe_place(place: BenchPlace, quantity: str) -> str:
-    value, unstable = place.mean(quantity), place.count(Stability.NOT_STABLE)
-    mark = UNSTABLE_MARK if unstable else OPEN_MARK if place.stable < len(place.runs) else ""
+    value, found = place.mean(quantity), place.judgement
+    mark = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}.get(found, "")
+    if place.masked:
+        return f"no contact{mark}"
+    if any(run.behaviour is EndBehaviour.DIVERGED for run in place.runs):
+        return f"diverged{mark}"
+    if value is None and quantity == "settled_s":
+        return f"not within {max(run.length_s for run in place.runs):g}{mark}"
     if value is None:
         return mark or "none"
     return (str(value) if isinstance(value, MeanInterval) else f"{value:.4g}") + mark
-
-
-def tabulate_energies(results: BenchResults) -> TextTable:
-    """Returns a row per law that declares energies: the runs in which none is below zero, of those seen."""
-    tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
-
-    def cell(law: str, task: str) -> str:
-        seen = [run for place in results.of(task, law) for run in place.runs if run.observed]
-        passive = sum(run.observed == ObservedFinding.PASSIVE for run in seen)
-        least = min((run.least_j for run in seen if run.least_j is not None), default=0.0)
-        return f"{passive}/{len(seen)}, least {least:.2g} J" if seen else "-"
-
-    laws = [one for one in list_laws(results) if declares_energies(one[0])]
-    rows = [(name_law(*one), *(cell(one[0], task) for task in tasks)) for one in laws]
-    return TextTable(("observed energy never below zero", *tasks), rows, align="lr")
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
@@ -148,31 +161,35 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     seeds = max(len(cell.seeds) for cell in plan.cells)
     yield f"{plan.study}: {STUDIES[plan.study].about}"
     yield f"{len(plan.cells)} cells, {len(results.runs)} runs: one per cell without randomness, else {seeds}"
+    unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
+    refuted = sum(run.confirmed is False for run in results.runs)
+    confirmed = sum(bool(run.confirmed) for run in unstable)
+    yield f"not stable: {len(unstable)} runs, {confirmed} confirmed by one of 100 s; {refuted} refuted by it"
     for task in dict.fromkeys(cell.task for cell in plan.cells):
         yield f"{task}: {TASKS[task].about}"
     for law, form in list_laws(results):
         if form == "two":
             yield f"{law} is for two sites: it runs in the tasks of one user, without the second"
-    unsettled = dict.fromkeys(str(cell.tuned) for cell in plan.cells if not cell.tuned.settled)
-    if unsettled:
-        names = ", ".join(unsettled)
-        yield f"no candidate was stable at the pose; the gains with the least error are used: {names}"
+    if plan.without:
+        names = ", ".join(map(str, plan.without))
+        yield f"no candidate was stable at the pose with the margin, so nothing runs: {names}"
 
 
 def tabulate_gains(results: BenchResults) -> TextTable:
     """Returns a row per law, form and delay: the gains in use."""
     used = {str(cell.tuned): cell.tuned for cell in results.plan.cells}
+    used |= {str(one): one for one in results.plan.without}
     rows = [
         (
             name_law(one.law, one.form),
             str(one.round_trip_ms),
-            ", ".join(f"{key} {value:g}" for key, value in one.gains.items()),
+            ", ".join(f"{key} {value:g}" for key, value in one.gains.items()) or "none",
             f"{one.settled}/{one.tried}",
-            one.outcome.word,
+            str(one.passed),
         )
         for one in used.values()
     ]
-    return TextTable(("law", "tuned at, ms", "gains", "stable", "taken"), rows, align="lrlrl")
+    return TextTable(("law", "tuned at, ms", "gains", "stable", "without margin"), rows, align="lrlrr")
 
 
 def build_bench_page(results: BenchResults, command: str) -> str:
@@ -182,12 +199,12 @@ def build_bench_page(results: BenchResults, command: str) -> str:
         f"    {command}",
         "\n".join(f"- {line}" for line in describe_bench(results)),
         tabulate_verdicts(results).markdown(),
-        f"{OPEN_MARK}: a run is open, {UNSTABLE_MARK}: one is not stable; +-: 95 % over seeds.",
+        f"{OPEN_MARK}: a run is open, {UNSTABLE_MARK}: one is not stable; +-: 95 % over seeds of one link.",
     ]
+    for task in dict.fromkeys(cell.task for cell in results.plan.cells):
+        parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
     for asked in list_quantities(results):
         parts += [f"## {asked.task}: {asked.words}", tabulate_quantity(results, asked).markdown()]
-    if any(run.observed for run in results.runs):
-        parts += ["## Energies", tabulate_energies(results).markdown()]
     if results.plan.study == "round-trips":
         parts += ["## Delay against loss", tabulate_round_trips(results).markdown()]
     parts += ["## Gains", tabulate_gains(results).markdown()]
@@ -215,7 +232,7 @@ def _place_columns(cell: BenchCell) -> dict[str, Any]:
 
 
 def _place_row(place: BenchPlace) -> dict[str, Any]:
-    low, high = place.interval
+    low, high = place.interval or (None, None)
     counts = {one.value.replace(" ", "_"): place.count(one) for one in Stability}
     row = {
         **_place_columns(place.cell),
@@ -227,8 +244,16 @@ def _place_row(place: BenchPlace) -> dict[str, Any]:
     for key in QUANTITIES_OF_RUNS:
         value = place.mean(key)
         row[key], row[f"{key}_half"] = value if isinstance(value, MeanInterval) else (value, None)
-    first = place.runs[0]
-    return {**row, "observed": first.observed, "least_j": first.least_j}
+    row |= {
+        "judgement": place.judgement.value,
+        "bounded": all(run.bounded for run in place.runs),
+        "energy_j": place.energy_j,
+        "length_s": max(run.length_s for run in place.runs),
+        "contact": not place.masked,
+        "confirmed": sum(run.confirmed is True for run in place.runs),
+        "refuted": sum(run.confirmed is False for run in place.runs),
+    }
+    return row
 
 
 def _encode_csv(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
@@ -240,15 +265,15 @@ def _encode_csv(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
 
 
 def compose_bench(results: BenchResults) -> Iterator[Block]:
-    """Yields verdicts, each quantity of each task, the energies that laws declare, and round trips."""
+    """Yields verdicts, properties, each quantity of each task, and round trips."""
     yield from (*describe_bench(results), "")
     yield tabulate_verdicts(results)
+    for task in dict.fromkeys(cell.task for cell in results.plan.cells):
+        yield tabulate_properties(results, task)
     for asked in list_quantities(results):
         if asked.key != "effort_nm":
             yield from ("", f"{asked.task}: {asked.words}")
             yield tabulate_quantity(results, asked)
-    if any(run.observed for run in results.runs):
-        yield tabulate_energies(results)
     if results.plan.study == "round-trips":
         yield tabulate_round_trips(results)
 
