@@ -224,6 +224,8 @@ def encode_places(results: BenchResults) -> str:
     return _encode_csv(list(rows[0]), rows)
 
 
+_GONE = ("reflected", "reflected_half", "observed", "least_j")
+"""Keys that had numbers once: no key is taken away (docs/json.md)."""
 _PLACE = ("task", "law", "link", "form")
 
 
@@ -244,6 +246,7 @@ def _place_row(place: BenchPlace) -> dict[str, Any]:
     for key in QUANTITIES_OF_RUNS:
         value = place.mean(key)
         row[key], row[f"{key}_half"] = value if isinstance(value, MeanInterval) else (value, None)
+    row |= dict.fromkeys(_GONE)
     row |= {
         "judgement": place.judgement.value,
         "bounded": all(run.bounded for run in place.runs),
@@ -283,7 +286,8 @@ def bench_to_json(results: BenchResults) -> JsonObject:
     return {
         "study": results.plan.study,
         "gains": [
-            msgspec.to_builtins(one) for one in {str(c.tuned): c.tuned for c in results.plan.cells}.values()
+            msgspec.to_builtins(one) | {"outcome": "settled"}
+            for one in {str(c.tuned): c.tuned for c in results.plan.cells}.values()
         ],
         "places": list(map(_place_row, results.places)),
     }
