@@ -34,7 +34,9 @@ KNOWLEDGE = ModelInformation()
 TUNING_BUDGET = 16
 """Candidates per gain of a law, at each delay."""
 TUNING_MARGIN = 1.5
-"""With the gains that are kept, the run is stable at the pose with so many times the delay, too."""
+"""With the gains that are kept, the run is stable at the pose with so many times the delay, too, and"""
+MARGIN_LENGTHS = 3.0
+"""so many times as long: what is slow is not taken for what lacks the margin."""
 
 
 class TunedGains(msgspec.Struct, frozen=True):
@@ -86,7 +88,7 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
     text = load_tuning_task(form, round_trip_ms).scenario.text
     return hashlib.sha256(
-        "\0".join((text, source, ranges, f"{TUNING_BUDGET} {TUNING_MARGIN}")).encode()
+        "\0".join((text, source, ranges, f"{TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}")).encode()
     ).hexdigest()[:16]
 
 
@@ -121,8 +123,12 @@ def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, place: i
     """Returns whether a candidate, as it is, is stable at the pose if delays are longer by the margin."""
     base = load_tuning_task(form, round_trip_ms)
     controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[place])
-    later = (*base.overrides, f"link.delay_ms={0.5 * TUNING_MARGIN * round_trip_ms:g}")
-    found = load_tuning_scenario(base.source, later).with_controls(controls)
+    longer = {
+        "link.delay_ms": 0.5 * TUNING_MARGIN * round_trip_ms,
+        "duration_s": MARGIN_LENGTHS * base.scenario.duration_s,
+    }
+    texts = (*base.overrides, *name_settings(longer))
+    found = load_tuning_scenario(base.source, texts).with_controls(controls)
     return measure_candidate(*found.texts).outcome is CandidateClass.SETTLED
 
 
