@@ -95,7 +95,7 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
             sum(all(run.settled_s is not None for run in place.runs) for place in places),
             sum(place.judgement is Stability.STABLE for place in places),
         )
-        energy = "-" if least is None else f"{min(least, 0.0) if least > -1e-9 else least:.2g}"
+        energy = "-" if least is None else f"{least if least < -1e-9 else 0.0:.2g}"
         shown = [f"{count}/{len(places)}" for count in kept]
         masked = str(sum(place.masked for place in places))
         rows.append((name_law(law, form), shown[0], shown[1], energy, shown[2], shown[3], masked))

@@ -158,7 +158,8 @@ class BenchStudy(NamedTuple):
 
 _ALL_LAWS = {"three": LAWS_OF_ANY, "two": LAWS_OF_TWO}
 _GRID = tuple(name for name in LINKS if name.startswith("rtt"))
-_COARSE = tuple(name for name in LINKS if not name.endswith(("-loss10", "-loss25")))
+_LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
+_COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
 STUDIES = {
     "full": BenchStudy("every law and task", tuple(TASKS), _ALL_LAWS, _COARSE, 20),
     "small": BenchStudy(
