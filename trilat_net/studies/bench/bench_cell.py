@@ -107,6 +107,12 @@ class BenchRun(msgspec.Struct, frozen=True):
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
+    def doubtful(self) -> bool:
+        """True if it is not stable, did not diverge, and is not as long as one that would confirm it."""
+        diverged = self.behaviour is EndBehaviour.DIVERGED
+        return self.stability is Stability.NOT_STABLE and not diverged and self.length_s < LONGEST_S
+
+    @property
     def masked(self) -> bool:
         """True if it was to touch a wall, and did not: its numbers are those of free motion."""
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
@@ -150,9 +156,8 @@ def run_bench_task(task: BenchRunTask) -> BenchRun:
         judged.stability,
         judged.end.behaviour,
         judged.text,
-        judged.scenario.duration_s,
-        task.to_s,
     )
+    made = msgspec.structs.replace(made, length_s=judged.scenario.duration_s, to_s=task.to_s)
     if judged.end.diverged_at_s is None:
         made = _measure(made, judged, TASKS[cell.task].duration_s)
         if cell.task == "contact" and not made.masked:
@@ -225,10 +230,8 @@ def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
 
 def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
     """Returns the torque of the operators ON an arm, without the friction of its joints, shape (K, n)."""
-    dampers = [one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment)]
-    torque: Array = -record.tau_x
-    for one in dampers:
-        torque = torque + np.array(one.damping_nm_s_rad) * record.qd
+    dampers = (one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment))
+    torque: Array = sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
     return torque
 
 
@@ -253,19 +256,13 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
 
 def _find_stiffness(task: BenchRunTask, far: _JudgedRun) -> float | None:
     """Returns by how much more the user has to push to get so much further, along the wall's normal, N/m."""
-    near = _run(_shorten_reach(task), far.scenario.duration_s, twins=0)
-    if near.end.diverged_at_s is not None:
-        return None
-    ends = [_find_push(one) for one in (near, far)]
+    built = task.cell.build(task.seed)
+    short = load_tuning_scenario(built.source, (*built.overrides, *name_settings(SHORTER_REACH)))
+    near = _run(short.scenario, far.scenario.duration_s, twins=0)
     if None in (_find_settled_s(near.records), _find_settled_s(far.records)):
         return None
-    (near_m, near_n), (far_m, far_n) = ends
+    (near_m, near_n), (far_m, far_n) = _find_push(near), _find_push(far)
     return float((far_n - near_n) / (far_m - near_m))
-
-
-def _shorten_reach(task: BenchRunTask) -> Scenario:
-    built = task.cell.build(task.seed)
-    return load_tuning_scenario(built.source, (*built.overrides, *name_settings(SHORTER_REACH))).scenario
 
 
 def _find_push(judged: _JudgedRun) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ...analysis.run_end import EndBehaviour, Stability
+from ...analysis.run_end import Stability
 from ...core.fingerprint import compute_fingerprint
 from ...errors import UsageError
 from ...files import make_results_folder, write_whole
@@ -199,32 +199,16 @@ def run_bench(
     plan = folder.plan
     with folder.journal() as journal:
         asked = [BenchRunTask(cell, seed) for cell in plan.cells for seed in cell.seeds]
-        _make_runs(asked, journal, jobs, on, progress)
-        if confirm:
-            found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]
-            again = [one._replace(to_s=LONGEST_S) for one, run in found if _is_doubtful(run)]
-            _make_runs(again, journal, jobs, on, progress)
+        for again in (False, True)[: 1 + confirm]:
+            if again:
+                found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]
+                asked = [one._replace(to_s=LONGEST_S) for one, run in found if run.doubtful]
+            keys = [(name_run(one.cell.key, one.to_s), one.seed) for one in asked]
+            tasks = [one for key, one in zip(keys, asked, strict=True) if key not in journal.done]
+            if tasks:
+                hint = "; what is done is kept: the same command goes on"
+                with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
+                    for number, (_, run) in enumerate(pool.each(run_bench_task, tasks, count=len(tasks)), 1):
+                        journal.add(run)
+                        progress(len(asked) - len(tasks) + number, len(asked))
         return BenchResults(plan, journal.done)
-
-
-def _is_doubtful(run: BenchRun) -> bool:
-    diverged = run.behaviour is EndBehaviour.DIVERGED
-    return run.stability is Stability.NOT_STABLE and not diverged and run.length_s < LONGEST_S
-
-
-def _make_runs(
-    asked: Sequence[BenchRunTask],
-    journal: RunJournal[BenchRun],
-    jobs: int | None,
-    on: Workers,
-    progress: Progress,
-) -> None:
-    """Makes the runs that the journal has not."""
-    tasks = [one for one in asked if (name_run(one.cell.key, one.to_s), one.seed) not in journal.done]
-    if not tasks:
-        return
-    hint = "; what is done is kept: the same command goes on"
-    with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
-        for number, (_, run) in enumerate(pool.each(run_bench_task, tasks, count=len(tasks)), 1):
-            journal.add(run)
-            progress(len(asked) - len(tasks) + number, len(asked))
