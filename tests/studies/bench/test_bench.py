@@ -38,7 +38,6 @@ from trilat_net.studies.bench.bench_run import BenchPlace
 from trilat_net.studies.bench.bench_tables import build_bench_page, encode_places, encode_runs
 from trilat_net.studies.bench.bench_tasks import (
     LINKS,
-    NO_DOMINANCE,
     SHORTER_REACH,
     STUDIES,
     TASKS,
@@ -214,9 +213,9 @@ def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyP
         plan_bench("round-trips", laws=["pd_d"], tasks=["free"], links=["rtt8"])
 
 
-def test_a_law_without_shares_is_not_asked_for_dominance() -> None:
-    tasks = {cell.task for cell in plan_bench("full", laws=list(NO_DOMINANCE), links=["rtt68"]).cells}
-    assert tasks == {name for name, task in TASKS.items() if task.users == 1}
+def test_a_law_whose_shares_stay_hands_nothing_over() -> None:
+    tasks = {cell.task for cell in plan_bench("full", laws=["wave"], links=["rtt68"]).cells}
+    assert tasks == TASKS.keys() - {"handover"}
 
 
 @pytest.mark.parametrize("base", ["_bench_three", "_bench_two"])

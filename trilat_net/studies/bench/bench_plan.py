@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 from ...errors import UsageError
 from ...scenario.fields import suggest_nearest
+from ...scenario.laws import LAWS
 from ..tuning.candidate import TuningScenario, load_tuning_scenario
 from ..tuning.search_space import SEARCH_SPACES
 from .bench_gains import KNOWLEDGE, TunedGains, choose_round_trip, name_settings, read_gains
-from .bench_tasks import BASES, LINKS, NO_DOMINANCE, STUDIES, TASKS, BenchStudy, build_settings
+from .bench_tasks import BASES, LINKS, STUDIES, TASKS, BenchStudy, build_settings
 
 MAX_BENCH_SEEDS = 1000
 
@@ -127,7 +128,7 @@ def plan_bench(
         why = (
             f"no candidate was stable for {', '.join(without)}" if without else f"{names} asks for two users"
         )
-        raise UsageError(f"{', '.join(chosen_laws)}: {why}, or for dominance; choose another task or link")
+        raise UsageError(f"{', '.join(chosen_laws)}: {why}, or hands over; choose another task or link")
     rows = [(law, form) for form, laws in asked.laws.items() for law in laws if law in chosen_laws]
     return BenchPlan(study, cells, rows, list(without.values()))
 
@@ -136,7 +137,8 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
     """Returns why a law does not run in a task, in the word of the tables; "no gains" if only they lack."""
     if TASKS[task].users > 1 and form != "three":
         return "-"
-    return "no dominance" if TASKS[task].users > 1 and law in NO_DOMINANCE else "no gains"
+    fixed = "timeline" in TASKS[task].settings and getattr(LAWS[law], "fixed_shares", False)
+    return "no handover" if fixed else "no gains"
 
 
 def _list_cells(

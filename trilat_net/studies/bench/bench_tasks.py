@@ -131,8 +131,6 @@ LAWS_OF_ANY = (
     "tdpa",
     "tanks",
 )
-NO_DOMINANCE = ("wave",)
-"""Laws in which shares have no effect: the tasks that ask for dominance are not theirs."""
 TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
 """The delays at which every law is tuned."""
 TUNING_TASK = "contact"
