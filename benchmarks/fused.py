@@ -46,7 +46,7 @@ def run() -> list[str]:
 
 def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
     """Times laws that are plugged in: one that uses all that a law may see, an example, and the built-in."""
-    built_in = [name for name, kind in LAWS.items() if getattr(kind, "core_class", None) is not None]
+    built_in = [name for name, kind in LAWS.items() if hasattr(kind.kind, "torque")]
     lines = ["laws that are plugged in, by their names, in one run:"]
     for law in ("tests.plugged_laws:CompiledLine", "examples.reaction_law:Reaction", *built_in):
         scenario = load_scenario("free", {"duration_s": real_s, "scheme": "digital", "control.law": law})

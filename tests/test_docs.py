@@ -15,14 +15,15 @@ from sites import change_server, external_arm, law_watchdog, retransmit_buffer, 
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
-from trilat_net.analysis.metrics import impedance, motion_metrics, static_windows
+from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference, twins
+from trilat_net.laws import catalogue
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import laws, operators, resolve
+from trilat_net.scenario import operators, resolve
 from trilat_net.studies import dask_cluster, executor
-from trilat_net.studies.bench import bench_gains, bench_tasks
+from trilat_net.studies.bench import bench_cell, bench_gains, bench_run, bench_tasks
 from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
 from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
 from trilat_net.theory import (
@@ -45,7 +46,9 @@ EVIDENCE = re.compile(
     re.MULTILINE,
 )
 
-MOST_RANDOM_ERROR = math.sqrt((impedance.MIN_COHERENCE**-2 - 1.0) / (2.0 * impedance.MIN_SEGMENTS))
+MOST_RANDOM_ERROR = math.sqrt(
+    (measured_impedance.MIN_COHERENCE**-2 - 1.0) / (2.0 * measured_impedance.MIN_SEGMENTS)
+)
 STATED: list[tuple[str, str, float, float]] = [
     ("bench.md", "16 candidates per gain", 16, bench_gains.TUNING_BUDGET),
     ("bench.md", "with 1.5 times the delay", 1.5, bench_gains.TUNING_MARGIN),
@@ -98,7 +101,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("metrics.md", "and 2 % of the largest", 2, 100 * static_windows.MIN_LOAD_SHARE),
     ("metrics.md", "Hann windows of 4 s", 4, impedance.SEGMENT_S),
     ("metrics.md", "0.5 to 20 Hz", 20, impedance.HIGHEST_HZ),
-    ("metrics.md", "coherence of 0.9", 0.9, impedance.MIN_COHERENCE),
+    ("metrics.md", "coherence of 0.9", 0.9, measured_impedance.MIN_COHERENCE),
     ("ports.md", "over 0.1-10 Hz", 10, port_transparency.TRANSPARENCY_BAND_HZ[1]),
     ("recording.md", "of the last 60 s", 60, retransmit_buffer.KEPT_S),
     ("recording.md", "records up to 120 000", 120_000, retransmit_buffer.RECORDS_KEPT),
@@ -159,7 +162,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),
     ("maps/README.md", "took at most 60 s", 60, live_confirmation.MAX_SESSION_S),
-    ("metrics.md", "at least 4 independent stretches", 4, impedance.MIN_SEGMENTS),
+    ("metrics.md", "at least 4 independent stretches", 4, measured_impedance.MIN_SEGMENTS),
     ("metrics.md", "at most 17.2 %", 17.2, math.ceil(1e3 * MOST_RANDOM_ERROR) / 10),
     ("metrics.md", "the same of the last 5 s", 5, motion_metrics.LONG_END_S),
     ("network.md", "Each window of 1 s", 1, timing.WINDOW_NS / 1e9),
@@ -228,7 +231,7 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
 def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> None:
     text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
     kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
-    assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
+    assert [kind for kind in (*kinds, *catalogue.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
 
 
 def test_every_test_that_the_security_page_names_is_there() -> None:

@@ -32,7 +32,7 @@ def test_the_layer_alone_diverges() -> None:
     )
     gains["acceleration_rad_s2"] = 100.0
     layer = {"K": [100.0, 100.0], "Kd": [2.0, 2.0], "d": none, "gravity": 1.0, "guarded": False}
-    law = {"law": "trilat_net.core.laws.tanks:Tanks", **gains, **layer}
+    law = {"law": "trilat_net.laws.tanks:Tanks", **gains, **layer}
     scenario = unit_scenario({"m": {"hands": [H50]}, "s": {}}, law, duration_s=11.5)
     run = ticked(scenario, every=10)
     assert least_energy(run) < -1.0  # what it would have taken from a tank

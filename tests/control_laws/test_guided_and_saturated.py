@@ -9,9 +9,9 @@ import pytest
 from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
 from trilat_net.core.hyperbolic import tanh
 from trilat_net.errors import ScenarioError
+from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
-from trilat_net.scenario.plugged_laws import complementary_shares
 from trilat_net.theory.textbook_arm import PlacedArm
 
 SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}

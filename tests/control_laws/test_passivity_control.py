@@ -23,7 +23,7 @@ def run(delay_ms: float, *, clamped: bool, duration_s: float = 30.0, every: int 
 def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any:
     """Without controllers, which is no choice of a scenario; hands as they are sampled."""
     law = {
-        "law": "trilat_net.core.laws.tdpa:Tdpa",
+        "law": "trilat_net.laws.tdpa:Tdpa",
         **PUBLISHED,
         "gravity": 1.0,
         "controlled": False,

@@ -53,7 +53,7 @@ def test_its_runs_are_the_same_bits_by_whatever_driver(law: str, monkeypatch: py
     columns = chosen.layout(chosen.names[0]).columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all((getattr(site, name)[-1] == row[columns[name]]).all() for name in names)
-    kind = getattr(chosen.sites[chosen.names[0]].control, "core_class", None)
+    kind = chosen.sites[chosen.names[0]].control.kind
     if kind is not None:
         monkeypatch.setattr(kind, "is_compiled", False)
         plain = trajectories(chosen)

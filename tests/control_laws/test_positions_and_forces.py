@@ -13,9 +13,9 @@ from tests.virtual_runs import trajectories
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.virtual import write_virtual_log
+from trilat_net.laws.six_channel import complementary_shares, complementary_weights
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
-from trilat_net.scenario.plugged_laws import complementary_shares, complementary_weights
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.linear_analysis import analyse_linear_loop
 

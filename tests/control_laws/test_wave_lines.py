@@ -11,9 +11,9 @@ from tests.energy_runs import CONSTANT, JITTER, pair, ticked
 from tests.unit_arm import CLAMP, hand, unit_scenario
 from tests.virtual_runs import trajectories
 from trilat_net.errors import ScenarioError
+from trilat_net.laws.wave import Wave
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
-from trilat_net.scenario.energy_laws import WaveVariables
 
 b, h = 10.0, 1e-3
 c = math.sqrt(2.0 * b)
@@ -27,7 +27,7 @@ def comparing(reception: str) -> dict[str, Any]:
     """The class itself, as `hold` is no choice of a scenario."""
     none = [0.0, 0.0]
     gains = {"b": [b, b], "K": none, "B": none, "lines": {}, "beta": 1.0, "gravity": 1.0, "reserve_J": 1e-2}
-    return {"law": "trilat_net.core.laws.wave:Wave", **gains, "reception": reception}
+    return {"law": "trilat_net.laws.wave:Wave", **gains, "reception": reception}
 
 
 def received(
@@ -49,7 +49,7 @@ def stored(run: dict[str, Any]) -> tuple[Any, Any]:
     v_m, v_s = (m.tau[:, 0] + b * m.qd[:, 0]) / c, u_s + c / b * force_s
     waves = np.cumsum(0.5 * h * (u_m**2 - v_s**2 + u_s**2 - v_m**2))
     given = np.append(0.0, np.cumsum(-m.tau[:-1, 0] * np.diff(m.q[:, 0])))
-    reserve = WaveVariables().reserve_J
+    reserve = Wave.reserve_J
     taken = np.cumsum(h * force_s * (c * v_s - force_s) / b)
     return waves, given + reserve - m.to_all.H[:, 0] - taken
 

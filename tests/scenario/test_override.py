@@ -72,7 +72,7 @@ def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
     ("overrides", "facts"),
     [
         (["control.Kdd=5"], ["control.Kdd", "did you mean 'Kd'"]),
-        (["control.K=5"], ["control.K", "belongs to law p_d", "adaptive", "control.law"]),
+        (["control.K=5"], ["control.K", "belongs to law", "p_d", "adaptive", "control.law"]),
         (["link.half_width_ms=5"], ["link.half_width_ms", "belongs to model uniform", "link.model"]),
         (["link.preset=4h"], ["4h", "did you mean '4g'"]),
         (["control.law=pd"], ["pd", "did you mean 'p_d'"]),

@@ -10,7 +10,7 @@ import sympy as sp
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
 from trilat_net.core.dominance import find_balancing_weights
-from trilat_net.scenario.law_conditions import (
+from trilat_net.laws.conditions import (
     COMMON_MOTION_SHARE,
     LawSituation,
     StabilityCondition,

@@ -16,8 +16,8 @@ from tests.control_laws.test_positions_and_forces import PAIR, TABLE, VARIANTS, 
 from tests.transmission import balance, transmitted
 from tests.unit_arm import CLAMP, hand, unit_scenario
 from trilat_net.errors import ScenarioError
+from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.plugged_laws import complementary_shares
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import find_equilibrium

@@ -12,9 +12,9 @@ from tests.theory.networks import Network, Wire
 from tests.theory.test_port_absolute import criterion
 from trilat_net.core.control import project_estimate
 from trilat_net.core.dominance import find_balancing_weights
+from trilat_net.laws.conditions import COMMON_MOTION_SHARE
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import lacks_detailed_balance
-from trilat_net.scenario.law_conditions import COMMON_MOTION_SHARE
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.frequency_search import build_frequency_grid
 from trilat_net.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights

@@ -24,8 +24,6 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
-from ..scenario.energy_laws import EnergyLaw
-from ..scenario.plugged_laws import UnknownLengths
 from .arm_rows import build_arm_rows
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelope, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
@@ -349,7 +347,7 @@ def _find_coasting_joints(
         for spec in specs
         if not any(one.actor.start_s <= end_s < one.actor.end_s for one in (*spec.hands, *spec.environment))
     ]
-    brakeless = [law for law in alone if isinstance(law, EnergyLaw) and not any(getattr(law, "d", ()))]
+    brakeless = [law for law in alone if law.books_energy and not any(getattr(law, "d", ()))]
     free = len(brakeless) == len(specs) or not all(any(getattr(law, "K", (1.0,))) for law in alone)
     own = np.flatnonzero(np.isin(owners, group)).tolist() if free else []
     return [
@@ -439,7 +437,7 @@ def _find_disagreement(
     """Yields what is said of sites that do not agree, do not come closer, and are not held apart."""
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        places = any(isinstance(scenario.sites[name].control, UnknownLengths) for name in names)
+        places = any(scenario.sites[name].control.compares_places for name in names)
         if len(group) < 2 or places or any(scenario.arms[name].shares_pose for name in names):
             continue  # e says if they agree
         q = np.array([columns[n][:, 2] for n in group])

@@ -411,8 +411,8 @@ def set_dominance_command(
 def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
     from sites.running_session import RunningSession
 
+    from ..fields import check_finite
     from ..net.requests import ChangeRequest
-    from ..scenario.fields import check_finite
 
     session, connection = context.obj
     check_finite(order, "")  # a message holds no others

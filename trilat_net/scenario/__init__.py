@@ -7,8 +7,6 @@ path of the key and the nearest valid name.
 from .arms import Arm as Arm
 from .delay_models import Link as Link
 from .expect import Expect as Expect
-from .laws import Adaptive as Adaptive
-from .laws import ProportionalDamped as ProportionalDamped
 from .operators import Pulse as Pulse
 from .override import apply_overrides as apply_overrides
 from .run_changes import find_owner as find_owner

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from msgspec import Meta
 
+from .. import fields
 from ..core.chain import (
     ChainJoint,
     apply,
@@ -29,7 +30,6 @@ from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, Vector
 from ..errors import ScenarioError
-from . import fields
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
 Three = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]

@@ -13,8 +13,8 @@ from msgspec import Meta
 
 from ..core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd
 from ..core.vectors import Points
+from ..fields import Frozen, KeyProblem
 from .delay_traces import parse_trace
-from .fields import Frozen, KeyProblem
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
 """The longest delay."""

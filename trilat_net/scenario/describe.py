@@ -13,21 +13,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ..core.delay import DelayKind
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from ..core.philox import link_key
+from ..core.vectors import Array
+from ..laws.conditions import LawSituation, StabilityCondition
 from .arms import TASK_AXES, read_arm
-from .imported_law import PluggedLaw
-from .law_conditions import LawSituation, StabilityCondition, find_link_delays
-from .laws import (
-    Adaptive,
-    AdaptiveBox,
-    AdaptiveRobust,
-    ControlLaw,
-    ForceReflecting,
-    LeeSpong,
-    ProportionalDamped,
-    ProportionalDerivativeDamped,
-)
+from .delay_models import LinkBase
 from .sample_uses import count_silences, draw_uses
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
@@ -45,19 +37,27 @@ IRREVERSIBLE_SHARES = (
 def lacks_detailed_balance(scenario: Scenario) -> bool:
     """True if all sites exchange positions and know gravity, and no D > 0 makes D (I - alpha) symmetric."""
     laws = [spec.control for spec in scenario.sites.values()]
-    return all(map(_exchanges_positions, laws)) and find_balancing_weights(scenario.alpha) is None
+    return all(law.exchanges_positions() for law in laws) and find_balancing_weights(scenario.alpha) is None
 
 
-def _exchanges_positions(law: ControlLaw) -> bool:
-    if isinstance(law, Adaptive | AdaptiveBox):
-        return not any(law.Gamma)
-    return isinstance(law, ProportionalDamped | ProportionalDerivativeDamped) and law.gravity == 1.0
+def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
+    """Returns the delay of every link as in `LawSituation.delay_s`."""
+    names = list(rates_hz)
+    delay_s = np.zeros((len(names), len(names)))
+    for name, link in links.items():
+        peer, _, site = name.partition("->")
+        model, rate_hz = link.core(), rates_hz[site]
+        constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
+        delay_us = max(round(model.location), model.playout_us)
+        ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
+        delay_s[names.index(site), names.index(peer)] = ticks / rate_hz if constant else np.nan
+    return delay_s
 
 
 def _list_situations(scenario: Scenario) -> list[LawSituation]:
     """Returns what the condition of each site's law may be made of."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    every = (scenario.names, scenario.controls, scenario.alpha, find_link_delays(scenario.links, rates_hz))
+    every = (scenario.names, scenario.controls, scenario.alpha, _find_link_delays(scenario.links, rates_hz))
     ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
     hold_s = 0.0 if scenario.scheme != "digital" else ticks_s.pop() if len(ticks_s) == 1 else math.nan
     return [
@@ -76,8 +76,8 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
     for name, law, situation in zip(
         scenario.names, scenario.controls, _list_situations(scenario), strict=True
     ):
-        if isinstance(law, PluggedLaw | LeeSpong | AdaptiveRobust) and (found := law.condition(situation)):
-            owners.setdefault((str(law.__struct_config__.tag), found), []).append(name)
+        if found := law.condition(situation):
+            owners.setdefault((law.tag, found), []).append(name)
     words = {True: "holds", False: "does not hold", None: "is not decided here"}
     return [
         f"condition of {tag} at {', '.join(where)} {words[one.holds]}: {one.text}"
@@ -92,8 +92,8 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
     for name, law, situation in zip(
         scenario.names, scenario.controls, _list_situations(scenario), strict=True
     ):
-        why = law.explain_idle_shares(situation) if isinstance(law, PluggedLaw | ForceReflecting) else ""
-        if not why and name in ramped and getattr(law, "fixed_shares", False):
+        why = law.explain_idle_shares(situation)
+        if not why and name in ramped and law.fixed_shares:
             why = "lines stay as they are at the start, whatever the timeline says"
         if why:
             owners.setdefault(why, []).append(name)

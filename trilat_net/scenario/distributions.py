@@ -15,7 +15,7 @@ from msgspec import Meta
 from ..core.chain import MAX_JOINTS
 from ..core.philox import link_key
 from ..errors import ScenarioError
-from .fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
+from ..fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
 
 _MOST_ENTRIES = 64
 """Longer lists are recorded tables, in which nothing is drawn."""

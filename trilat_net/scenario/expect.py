@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from ..errors import ScenarioError
-from .fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys, field_names, suggest_nearest
+from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys, field_names, suggest_nearest
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]

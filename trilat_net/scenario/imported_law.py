@@ -1,4 +1,4 @@
-"""Laws that are plugged into the core as one class, and those imported from a user's module.
+"""Laws that are imported from a user's module.
 
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
@@ -9,29 +9,22 @@ the package that contains it. `import_law_class` is the one door to code from ou
 import ast
 import hashlib
 import importlib
-import inspect
-import re
 import sys
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 from msgspec import Meta, field
-from msgspec.structs import asdict
 
-from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
-from ..core.vectors import Array
 from ..errors import LawWithheld, ScenarioError
+from ..fields import suggest_nearest
 from ..files import find_page, open_regular
-from .fields import Frozen, suggest_nearest
-from .law_conditions import LawSituation, StabilityCondition
-from .linear_form import LinearForm, LinearSituation
-from .sent_vectors import SentVectorSpecs, convert_sends, parse_classes
+from ..laws.interface import LawSettings, check_law_class_at, make_law
+from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 
 LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
@@ -53,66 +46,7 @@ _executed: dict["LawSource", Any] = {}
 """Modules of the files that were executed."""
 
 
-class PluggedLaw(Frozen, frozen=True):
-    """A law that is plugged into the core as one class, see docs/own-controller.md; its keys are settings.
-
-    A built-in one names its class.
-    """
-
-    core_class: ClassVar[Any] = None
-    linear_note: ClassVar[str] = ""
-    """What its small motions leave out."""
-    fixed_shares: ClassVar[bool] = False
-    """True: it takes the dominance factors of the start alone."""
-
-    def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains for the core: none."""
-        return Gains(Law.OWN)
-
-    def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns the law of known gravity, or the adaptive one, whose small motions are this law's.
-
-        With those of `linear_form`, if it has any; None: there is none.
-        """
-        return None
-
-    def linear_form(self, at: LinearSituation) -> LinearForm | None:  # noqa: ARG002
-        """Returns its small motions beyond those of `linear_gains`."""
-        return None
-
-    def explain_no_linear_form(self) -> str:
-        """Returns why it cannot be linearised, if `linear_gains` has nothing."""
-        return ""
-
-    def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns what the stability of the law at a site rests on; None if that is not known here."""
-        return None
-
-    def at_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
-        """Returns the law with what it takes of the dominance factors at the start, alpha, shape (N, N)."""
-        return self
-
-    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns why the dominance factors of a site have no effect; "": they have one."""
-        return ""
-
-    @property
-    def sends(self) -> SentVectorSpecs:
-        """What the law sends to its peers."""
-        return convert_sends(getattr(self.core_class, "sends", {}), self.core_class.__name__, "control")
-
-    def maker(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns the factory of the law, for a site of an experiment of so many sites."""
-
-        def make(context: LawContext) -> UserLaw:
-            name = str(self.__struct_config__.tag)
-            _check_class(self.core_class, name, context, sites, scheme)
-            return _make_law(self.core_class, name, context, asdict(self))
-
-        return make
-
-
-class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
+class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     """A user's law.
 
     Attributes:
@@ -133,7 +67,7 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
             kind = import_law_class(self.code, self.source_sha256, f"{path}.law")
-            _check_class(kind, self.code, context, sites, scheme)  # before anything of it is called
+            check_law_class_at(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
                 raise ScenarioError(
@@ -141,7 +75,7 @@ class ImportedLaw(PluggedLaw, frozen=True, tag_field="law", tag="own"):
                     f"of that class, and law = {self.code!r} to take what is there",
                     path=f"sites.{context.site}.control.sends",
                 )
-            return _make_law(kind, self.code, context, self.settings)
+            return make_law(kind, self.code, context, self.settings)
 
         return make
 
@@ -167,64 +101,6 @@ def read_law_source(code: str, path: str, file: Path | None = None) -> LawSource
     except OSError as error:
         raise ScenarioError(f"{place} cannot be read: {error.strerror}", path=path) from None
     return LawSource(place, content, hashlib.sha256(content).hexdigest())
-
-
-def _check_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
-    """Refuses a class that is no law, before anything of it runs; a log can name any class.
-
-    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
-    `needs_theta = True`.
-    """
-    path = f"sites.{context.site}.control.law"
-    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(kind, "remembers")
-    methods = ("torque", "memory", "recall") if keeps else ("torque",)
-    missing = [name for name in methods if not callable(getattr(kind, name, None))]
-    if missing:
-        raise ScenarioError(
-            f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}", path=path
-        )
-    if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
-        raise ScenarioError(
-            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its class has "
-            f"remembers = ({written[0]!r},), else remembers = (); see {find_page('own-controller.md')}",
-            path=path,
-        )
-    stated = getattr(kind, "sites", None)
-    ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
-    if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(n, int) for n in ends)):
-        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
-    least, most = ends
-    if not least <= sites <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
-    if scheme not in (schemes := getattr(kind, "schemes", None) or (scheme,)):
-        wanted = " or ".join(map(repr, schemes))
-        raise ScenarioError(f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path)
-    if getattr(kind, "needs_theta", False) and not context.theta:
-        raise ScenarioError(
-            f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "
-            "and leave known out, or choose a law that learns them",
-            path=path,
-        )
-
-
-def _find_written(kind: Any) -> list[str]:
-    """Returns what a class writes of itself after `__init__`, unless by calls, as of append."""
-    methods = [one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)]
-    sources = [textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"]
-    nodes = (node for text in sources for node in ast.walk(ast.parse(text)))
-    written = [ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)]
-    return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
-
-
-def _make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
-    try:
-        law: UserLaw = kind(context, **settings)
-    except (Exception, SystemExit) as error:  # the user's code
-        given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-        raise ScenarioError(f"{code} {problem}", path=f"sites.{context.site}.control") from None
-    return law
 
 
 def _find_file(code: str, path: str) -> Path:

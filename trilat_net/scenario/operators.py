@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from .. import fields
 from ..core.chain import MAX_JOINTS
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.live_hand import HandRules
 from ..errors import ScenarioError
-from . import fields
 from .distributions import Draws
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import ScenarioError
+from ..fields import TomlTable, check_keys, field_names, suggest_nearest
 from .delay_models import DELAY_MODELS
-from .fields import TomlTable, check_keys, field_names, suggest_nearest
 from .imported_law import ImportedLaw, name_law_classes
 from .laws import LAWS
 from .resolve import PRESETS, TRACE_KEYS

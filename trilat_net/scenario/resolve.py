@@ -18,13 +18,7 @@ import numpy as np
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
 from ..errors import ScenarioError
-from ..files import open_regular
-from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
-from .delay_models import DELAY_MODELS
-from .delay_traces import read_trace
-from .distributions import Draws
-from .expect import Expect, check_window_keys, number_window_joints
-from .fields import (
+from ..fields import (
     Frozen,
     TomlTable,
     VectorCounts,
@@ -39,11 +33,17 @@ from .fields import (
     reword_problem,
     suggest_nearest,
 )
+from ..files import open_regular
+from ..laws.sent_vectors import read_sends
+from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
+from .delay_models import DELAY_MODELS
+from .delay_traces import read_trace
+from .distributions import Draws
+from .expect import Expect, check_window_keys, number_window_joints
 from .imported_law import LAW_PATH_PATTERN, read_law_source
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
-from .sent_vectors import read_sends
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")

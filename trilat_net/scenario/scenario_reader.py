@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import tomli_w
 
 from ..errors import ScenarioError
+from ..fields import suggest_nearest
 from ..files import open_regular
-from .fields import suggest_nearest
 from .imported_law import name_law_classes
 from .law_consent import allow_own_laws
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries

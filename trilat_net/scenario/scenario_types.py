@@ -25,16 +25,15 @@ from ..core.ticks import DominanceRamp
 from ..core.two_link_arm import ArmLinks
 from ..core.vectors import Array
 from ..errors import ScenarioError
+from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
+from ..laws.sent_vectors import SentVectorSpecs, build_channel
 from .arms import Arm, ArmModel, Task, build_arm
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
-from .fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
-from .imported_law import PluggedLaw
-from .laws import ControlLaw
+from .laws import ChosenLaw
 from .operators import Environment, Operator, find_live_hand
 from .resting_arm import add_credible_box, find_rest_gains
-from .sent_vectors import SentVectorSpecs, build_channel
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
@@ -139,7 +138,7 @@ class SiteSpec(Frozen, frozen=True):
     q0_rad: Joints
     qd0_rad_s: Joints
     arm: Arm
-    control: ControlLaw
+    control: ChosenLaw
     limits: Limits
     on_stale: OnStale = OnStale()
     task: Task = Task()
@@ -296,12 +295,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return np.array([[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names])
 
     @cached_property
-    def controls(self) -> tuple[ControlLaw, ...]:
+    def controls(self) -> tuple[ChosenLaw, ...]:
         """The law of every site, with what it takes of the dominance factors at the start."""
         laws = [spec.control for spec in self.sites.values()]
-        return tuple(
-            law.at_shares(self.names, self.alpha) if isinstance(law, PluggedLaw) else law for law in laws
-        )
+        return tuple(law.at_shares(self.names, self.alpha) for law in laws)
 
     @property
     def beta(self) -> Array | None:
@@ -406,7 +403,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             ),
             on_stale=spec.on_stale.rule,
             external=spec.plant == "external",
-            own=control.maker(len(self.sites), self.scheme) if isinstance(control, PluggedLaw) else None,
+            own=control.maker(len(self.sites), self.scheme),
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
@@ -426,8 +423,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     def _rest_gains(self, site: str) -> site_setup.RestGains:
         spec, arm = self.sites[site], self.arms[site]
         control = spec.control
-        gains = control.linear_gains(arm.theta) if isinstance(control, PluggedLaw) else None
-        gains = gains or control.gains(arm.theta)
+        gains = control.linear_gains(arm.theta) or control.gains(arm.theta)
         own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
         limit, known = spec.limits.tau_limit_nm, spec.arm.known
         return find_rest_gains(arm, spec.q0_rad, own, limit, spec.rate_hz, known=known)

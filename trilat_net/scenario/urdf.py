@@ -22,7 +22,7 @@ import numpy as np
 from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
 from ..core.sincos import sincos
 from ..errors import ScenarioError
-from .fields import MAX_QUANTITY, suggest_nearest
+from ..fields import MAX_QUANTITY, suggest_nearest
 
 MAX_CHARACTERS = 1_000_000
 MOST_DIGITS = 100

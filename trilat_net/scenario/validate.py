@@ -18,18 +18,16 @@ import numpy as np
 from ..core.dominance import is_irreducible
 from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
 from ..errors import ScenarioError
+from ..fields import TomlTable, reword_problem
 from ..files import find_page
+from ..laws.sent_vectors import check_sends
 from . import operators
 from .arms import TASK_AXES
 from .delay_models import ConstantDelay, LinkBase, TraceDelay
 from .distributions import dotted_key
-from .energy_laws import EnergyLaw
 from .expect import find_expect_problem
-from .fields import TomlTable, reword_problem
-from .imported_law import ImportedLaw, PluggedLaw
-from .laws import AdaptiveBox, ForceReflecting, KnownGravityLaw
+from .imported_law import ImportedLaw
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
-from .sent_vectors import check_sends
 
 RANK_TOLERANCE = 1e-6
 """A singular value below this share of the largest is of a direction without motion."""
@@ -110,27 +108,20 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     """
     path, law = f"sites.{name}", site.control
     _check_plant(path, site)
-    if isinstance(law, AdaptiveBox):
-        law.check(f"{path}.control")
-    if isinstance(law, ForceReflecting) and sites != FORCE_REFLECTION_SITES:
+    law.check(f"{path}.control", sites)
+    if law.plugged and site.task.space != "joints":
         raise ScenarioError(
-            f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more of "
-            "them the contact that a site feels is ambiguous; choose p_d, pd_d or adaptive, or two sites",
-            path=f"{path}.control.law",
-        )
-    if isinstance(law, PluggedLaw) and law.core_class is not None and site.task.space != "joints":
-        raise ScenarioError(
-            f"{law.__struct_config__.tag} compares joint by joint, and the space of this task is "
+            f"{law.tag} compares joint by joint, and the space of this task is "
             f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f there",
             path=f"{path}.control.law",
         )
     if (
-        isinstance(law, KnownGravityLaw | EnergyLaw)
-        and not site.arm.known
-        and law.gravity * site.arm.g_m_s2 > 0.0
+        not site.arm.known
+        and not getattr(law.kind, "needs_theta", False)
+        and getattr(law, "gravity", 0.0) * site.arm.g_m_s2 > 0.0
     ):
         raise ScenarioError(
-            f"{law.__struct_config__.tag} takes gravity from the arm's masses, which are unknown "
+            f"{law.tag} takes gravity from the arm's masses, which are unknown "
             "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in a "
             "horizontal plane, or choose adaptive, which learns it",
             path=f"{path}.control.gravity",
@@ -279,9 +270,9 @@ def _check_energy_laws(scenario: Scenario) -> None:
     """Refuses sites of which only some keep account of energy, and what else such a law has against them."""
     laws = {name: site.control for name, site in scenario.sites.items()}
     for name, law in laws.items():
-        if not isinstance(law, EnergyLaw):
+        if not law.books_energy:
             continue
-        tag = law.__struct_config__.tag
+        tag = law.tag
         for other, theirs in laws.items():
             if type(theirs) is not type(law):
                 problem = (
@@ -289,7 +280,7 @@ def _check_energy_laws(scenario: Scenario) -> None:
                 )
                 raise ScenarioError(problem, path=f"sites.{other}.control.law")
         rates_hz = {one: site.rate_hz for one, site in scenario.sites.items()}
-        if scenario.scheme not in getattr(law.core_class, "schemes", (scenario.scheme,)):
+        if scenario.scheme not in law.kind.schemes:
             problem = (
                 f"is {scenario.scheme!r}, and {tag} books the torque of a tick as held: choose 'digital'"
             )

@@ -23,10 +23,10 @@ from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..files import find_page
+from ..laws.linear_form import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
-from ..scenario.imported_law import ImportedLaw, PluggedLaw
-from ..scenario.linear_form import LinearForm, LinearSituation
+from ..scenario.imported_law import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
@@ -87,7 +87,7 @@ class OperatingConditions(NamedTuple):
         for n, law in enumerate(self.laws):
             M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
             situation = LinearSituation(n, self.names, self.laws, self.alpha, M)
-            forms.append(law.linear_form(situation) if isinstance(law, PluggedLaw) else None)
+            forms.append(law.linear_form(situation))
         return forms
 
     @property
@@ -141,7 +141,7 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
     for code in filter(None, dict.fromkeys(codes)):
         owners = ", ".join(name for name, one in zip(scenario.names, codes, strict=True) if one == code)
         notes.append(f"{code} of {owners} is differentiated numerically, its memory too: central differences")
-    notes += [law.linear_note for law in laws if isinstance(law, PluggedLaw) and law.linear_note]
+    notes += [law.linear_note for law in laws if law.linear_note]
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
     pairs = conditions.pairs
     if conditions.has_forms:
@@ -190,11 +190,11 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
     found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
         law, theta = spec.control, scenario.arms[name].theta
-        gains = law.linear_gains(theta) if isinstance(law, PluggedLaw) else law.gains(theta)
+        gains = law.linear_gains(theta)
         if own_laws and isinstance(law, ImportedLaw):
             gains = law.gains(theta)
         if gains is None:
-            why = law.explain_no_linear_form() if isinstance(law, PluggedLaw) else ""
+            why = law.explain_no_linear_form()
             if isinstance(law, ImportedLaw):
                 why = f"{law.code} is known by its code alone, which trilat linear runs, and this does not"
             others = f"adaptive, adaptive_box, p_d, pd_d, p_f and others have one, see {find_page('laws.md')}"

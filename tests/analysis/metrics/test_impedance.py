@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from trilat_net.analysis.metrics.impedance import FrequencyResponse, estimate_responses
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.measured_impedance import FrequencyResponse, estimate_responses
 
 from .written import simulated
 

@@ -24,7 +24,6 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario, SiteSpec
-from ...scenario.laws import LAWS, Adaptive, AdaptiveBox
 from ..aligned import AlignedRecords, Bools, DelayedPeer
 from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
@@ -114,9 +113,9 @@ def explain_missing_functional(spec: SiteSpec) -> str:
     """Returns the reason why a site has no functional; "" if it has one."""
     if not spec.arm.known:
         return "nobody knows the arm's theta, and V is made of it"
-    if not isinstance(spec.control, Adaptive | AdaptiveBox):
-        name = next(name for name, kind in LAWS.items() if isinstance(spec.control, kind))
-        return f"law {name}, for which there is no such V"
+    law = spec.control
+    if not law.has_functional:
+        return f"law {law.tag}, for which there is no such V"
     if spec.task.space == "pose":
         return "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
     return ""

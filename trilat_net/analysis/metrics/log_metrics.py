@@ -29,7 +29,7 @@ from ..site_signals import follows_in_task_space
 from ..torque_sources import attribute_torque, list_walls
 from . import motion_metrics as motion
 from . import static_windows
-from .impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
+from .measured_impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
 from .metric_catalogue import (
     ENERGY,
     LOOP,

@@ -18,7 +18,6 @@ import msgspec
 
 from ...core import control
 from ...files import write_whole
-from ...scenario.laws import LAWS
 from ..commands import format_toml_value
 from ..executor import Progress, Workers, ignore_progress
 from ..tuning.candidate import TuningScenario, load_tuning_scenario, measure_candidate
@@ -83,8 +82,9 @@ def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """Returns the fingerprint of what a law is tuned for: the scenario, the law's sources and its ranges."""
     space = SEARCH_SPACES[law]
-    kind = getattr(LAWS.get(law), "core_class", None)
-    source = inspect.getsource(control if kind is None else inspect.getmodule(kind) or kind)
+    assert space.kind is not None
+    sources = [module for module in (control, inspect.getmodule(space.kind)) if module is not None]
+    source = "".join(map(inspect.getsource, sources))
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
     text = load_tuning_task(form, round_trip_ms).scenario.text
     return hashlib.sha256(

@@ -10,8 +10,8 @@ from functools import cache
 from typing import NamedTuple
 
 from ...errors import UsageError
-from ...scenario.fields import suggest_nearest
-from ...scenario.laws import LAWS
+from ...fields import suggest_nearest
+from ...scenario.laws import BUILT_IN
 from ..tuning.candidate import TuningScenario, load_tuning_scenario
 from ..tuning.search_space import SEARCH_SPACES
 from .bench_gains import KNOWLEDGE, TunedGains, choose_round_trip, name_settings, read_gains
@@ -137,7 +137,7 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
     """Returns why a law does not run in a task, in the word of the tables; "no gains" if only they lack."""
     if TASKS[task].users > 1 and form != "three":
         return "-"
-    fixed = "timeline" in TASKS[task].settings and getattr(LAWS[law], "fixed_shares", False)
+    fixed = "timeline" in TASKS[task].settings and BUILT_IN[law].Settings.fixed_shares
     return "no handover" if fixed else "no gains"
 
 

@@ -7,7 +7,8 @@ every run of the suite is a command of `trilat sim`.
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ...scenario.plugged_laws import complementary_shares
+from ...laws.six_channel import complementary_shares
+from ...scenario.laws import BUILT_IN
 from ...scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
 
 Settings = Mapping[str, Any]
@@ -113,24 +114,10 @@ _MEAN_MS = {"geo": 300.0}
 SHORTER_REACH: Settings = {"sites.m1.hands": [_hand(_LESS_OUT)]}
 """What makes of `contact` the same with a shorter reach: of both the stiffness at the hand is found."""
 
-LAWS_OF_TWO = ("p_f", "smith")
-LAWS_OF_ANY = (
-    "adaptive",
-    "adaptive_box",
-    "adaptive_robust",
-    "p_d",
-    "pd_d",
-    "lee_spong",
-    "saturated_pd",
-    "sync",
-    "four_channel",
-    "six_channel",
-    "authority",
-    "impedance",
-    "wave",
-    "tdpa",
-    "tanks",
-)
+_ROLES = ("master", "master", "slave")
+_TUNED_LAWS = {name: law for name, law in BUILT_IN.items() if law.tune}
+LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
+LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
 TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
 """The delays at which every law is tuned."""
 TUNING_TASK = "contact"

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ...core.vectors import Array
 from ...errors import UsageError
+from ...fields import is_number
 from ...scenario import Scenario
-from ...scenario.fields import is_number
 from .sweep_cell import CellClass
 
 _UNITS = {

@@ -18,12 +18,13 @@ import numpy as np
 
 from ...core.vectors import Array
 from ...errors import ScenarioError
+from ...fields import is_number
+from ...laws.adaptive import Adaptive
+from ...laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
+from ...laws.p_d import PD
 from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import ConstantDelay, LinkBase, NoDelay
-from ...scenario.fields import is_number
-from ...scenario.law_conditions import COMMON_MOTION_SHARE, find_least_reversible
-from ...scenario.laws import Adaptive, ProportionalDamped
 from ...theory import GrowthColumn, compute_growth_column
 from ..commands import format_command, set_options
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
@@ -93,8 +94,8 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
 
 def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     """Returns K and d of P+d with known gravity, if they are alike at all joints, which the arm couples."""
-    law = spec.control
-    if not isinstance(law, ProportionalDamped) or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
+    law: Any = spec.control
+    if law.kind is not PD or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
         return None
     return law.K[0], law.d[0]
 
@@ -152,8 +153,9 @@ def _sampled(scenario: Scenario) -> StabilityCriterion | None:
         return None
     excess = []
     for spec in scenario.sites.values():
-        law, h_s = spec.control, 1.0 / spec.rate_hz
-        if not isinstance(law, Adaptive) or max(delays_s) > h_s:
+        law: Any = spec.control
+        h_s = 1.0 / spec.rate_hz
+        if law.kind is not Adaptive or max(delays_s) > h_s:
             return None
         excess.append(min(law.Kp) - max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s)
     source = "a rule for arms of about 1 m and no delay: the estimate of gravity against the lag of a tick"

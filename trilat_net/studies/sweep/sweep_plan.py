@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import ScenarioError, UsageError
+from ...fields import is_number, suggest_nearest
 from ...scenario import Scenario, apply_overrides
-from ...scenario.fields import is_number, suggest_nearest
 from ...scenario.imported_law import name_law_classes
 from ...scenario.law_consent import allow_own_laws
 from ...scenario.laws import LAWS, identify_law

@@ -17,10 +17,10 @@ from ...analysis.run_end import Stability
 from ...errors import LawFailed, LogError, ScenarioError
 from ...execution import virtual
 from ...execution.verify import verify
+from ...fields import field_names, is_distribution
 from ...log.log_reader import open_log
 from ...net.clock import SystemClock
 from ...scenario import Expect, Scenario, load_scenario
-from ...scenario.fields import field_names, is_distribution
 from ...scenario.scenario_reader import read_experiment, reseed_scenario
 from ..commands import format_command, format_toml_value, set_options
 from .measure_run import RunMetrics, measure_log, measure_virtual_run

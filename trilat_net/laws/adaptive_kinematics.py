@@ -14,14 +14,19 @@ box, which lets that term fall no less. Adaptive Jacobian after C. C. Cheah, C. 
 J. Robotics Research 25 (2006).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from ..compiled_law import compiled
-from ..jit import leaf
-from ..sincos import sincos
-from ..two_link_arm import regressor
-from ..user_law import LawContext, LawInput
+import numpy as np
+
+from ..core.compiled_law import compiled
+from ..core.jit import leaf
+from ..core.sincos import sincos
+from ..core.two_link_arm import regressor
+from ..core.user_law import LawContext, LawInput
+from ..fields import NotNegative, NotNegativeParameters, Parameters, Positive, PositiveJoints
+from .conditions import LawSituation, StabilityCondition
+from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 
 LEAST_SINE = 0.1
 """A stretched elbow: where abs(sin q2) is below this, J_hat is inverted as if it were this."""
@@ -68,30 +73,51 @@ def _turn(
 
 
 @compiled
-class AdaptiveJacobian:
-    """The law of a site with a planar arm; Lambda and Kd are per coordinate x and y, Kp per joint."""
+class AdaptiveKinematics(ControlLaw):
+    """The paper's law between the places of end effectors, of planar arms whose lengths nobody knows.
 
-    sends: ClassVar[Any] = {"x": {"unit": "m", "length": 2}, "xd": {"unit": "m/s", "length": 2}}
-    remembers: ClassVar[tuple[str, ...]] = ("theta_hat", "Yr", "lengths_m", "rate_m_s")
+    The place and velocity of the end effector are measured, and compared in the frame of the bases; masses
+    and lengths are learnt. C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots
+    with unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
 
-    def __init__(
-        self,
-        facts: LawContext,
-        Lambda: Sequence[float],
-        Kp: Sequence[float],
-        Kd: Sequence[float],
-        Gamma: Sequence[float],
-        theta_hat0: Sequence[float],
-        length_gain_m_n: float,
-        lengths0_m: Sequence[float],
-        least_m: float,
-        most_m: float,
-    ) -> None:
+    Attributes:
+        Lambda: per coordinate x and y, 1/s.
+        Kp: per joint, N m s/rad.
+        Kd: per coordinate, N s/m.
+        Gamma: adaptation gain per parameter.
+        theta_hat0: first estimate of theta, Eq. (24).
+        length_gain_m_n: adaptation gain of the lengths, m/N.
+        lengths0_m: first estimate of the two lengths.
+        least_m: lower bound of both.
+        most_m: upper bound.
+    """
+
+    Lambda: PositiveJoints = (1.0,)
+    Kp: PositiveJoints = (1.0,)
+    Kd: PositiveJoints = (3.0,)
+    Gamma: NotNegativeParameters = (1.0,)
+    theta_hat0: Parameters = (0.0,)
+    length_gain_m_n: NotNegative = 0.01
+    lengths0_m: PositiveJoints = (1.0,)
+    least_m: Positive = 0.2
+    most_m: Positive = 3.0
+
+    compares_places: ClassVar = True
+    sends: ClassVar[dict[str, Any]] = {"x": {"unit": "m", "length": 2}, "xd": {"unit": "m/s", "length": 2}}
+    remembers: ClassVar = ("theta_hat", "Yr", "lengths_m", "rate_m_s")
+    tune: ClassVar = {
+        "Lambda": CONVERGENCE,
+        "Kp": DAMPING,
+        "Kd": (*ERROR_DAMPING[:2], "N s/m"),
+        "Gamma": ADAPTATION,
+    }
+    told: ClassVar = "gravity, as its first estimate, and no length"
+
+    def begin(self, facts: LawContext) -> None:
+        """Makes both estimates and their rates."""
         if not any(facts.lengths_m):
             raise ValueError("it has the regressor of the planar arm of two links, and this is a chain")
-        self.Lambda, self.Kp, self.Kd, self.Gamma = Lambda, Kp, Kd, Gamma
-        self.length_gain, self.least_m, self.most_m = length_gain_m_n, least_m, most_m
-        self.theta_hat, self.lengths_m = list(theta_hat0), list(lengths0_m)
+        self.theta_hat, self.lengths_m = list(self.theta_hat0), list(self.lengths0_m)
         self.Yr, self.rate_m_s = [0.0] * len(self.theta_hat), [0.0, 0.0]
         self.measured = list(facts.lengths_m)  # what an instrument at the end effector goes by
         self.g_m_s2 = facts.g_m_s2
@@ -113,7 +139,7 @@ class AdaptiveJacobian:
         f0, f1 = self.Kd[0] * ed0, self.Kd[1] * ed1
         pull = (c0 * f1 - s0 * f0, c01 * f1 - s01 * f0)
         for i in range(2):
-            rate = self.length_gain * pull[i] * (qd[0] + i * qd[1])  # Y_k' Kd ed
+            rate = self.length_gain_m_n * pull[i] * (qd[0] + i * qd[1])  # Y_k' Kd ed
             if now.k > 0:
                 length = self.lengths_m[i] + 0.5 * now.h_s * (self.rate_m_s[i] + rate)
                 self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
@@ -136,3 +162,18 @@ class AdaptiveJacobian:
             now.theta_hat[p] = self.theta_hat[p]
             now.tau[0] += first[p] * self.theta_hat[p]
             now.tau[1] += second[p] * self.theta_hat[p]
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns the premises: constant delays, elbows that stay bent, lengths within their bounds."""
+        if np.isnan(situation.longest_s):
+            return StabilityCondition(None, "proved for constant delays, and a delay here varies")
+        return StabilityCondition(
+            None,
+            f"for every constant delay, while abs(sin q2) > {LEAST_SINE:g} and the lengths are within "
+            f"{self.least_m:g} and {self.most_m:g} m (sufficient); the run shows if elbows stay bent",
+        )
+
+    @classmethod
+    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+        """Returns tuned gains with the first estimate; lengths are learnt from those that the law assumes."""
+        return {**gains, "theta_hat0": at.estimate}

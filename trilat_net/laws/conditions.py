@@ -4,16 +4,16 @@ Invariant: a law states its condition once, as a method of its type; `trilat sce
 `trilat linear` print what it returns. It says if the condition is only sufficient, and who proved it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.delay import DelayKind
 from ..core.dominance import find_balancing_weights
 from ..core.vectors import Array
-from .delay_models import LinkBase
 
+PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
+"""What every law that keeps account of energy asks for."""
 COMMON_MOTION_SHARE = 0.21723362821
 """-min sin x / x: the share of K T that the common motion of all sites asks for, at its worst mass."""
 
@@ -71,20 +71,6 @@ class StabilityCondition(NamedTuple):
 
     holds: bool | None
     text: str
-
-
-def find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link as in `LawSituation.delay_s`."""
-    names = list(rates_hz)
-    delay_s = np.zeros((len(names), len(names)))
-    for name, link in links.items():
-        peer, _, site = name.partition("->")
-        model, rate_hz = link.core(), rates_hz[site]
-        constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
-        delay_us = max(round(model.location), model.playout_us)
-        ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
-        delay_s[names.index(site), names.index(peer)] = ticks / rate_hz if constant else np.nan
-    return delay_s
 
 
 def find_least_reversible(alpha: Array) -> float | None:

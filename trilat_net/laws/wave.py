@@ -16,13 +16,22 @@ b h qd^2 / 4 more than their work, which H lends until the arm slows down.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from itertools import combinations, permutations
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
+from msgspec.structs import replace
 
-from ..compiled_law import compiled
-from ..law_energy import LawEnergies, LawRecords, sum_work
-from ..user_law import LawContext, LawInput
+from ..core.compiled_law import compiled
+from ..core.dominance import find_balancing_weights
+from ..core.law_energy import LawEnergies, LawRecords, sum_work
+from ..core.site_setup import Gains, Law
+from ..core.user_law import LawContext, LawInput
+from ..core.vectors import Array
+from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
+from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
+from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
+from .linear_form import LinearForm, LinearSituation
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
 """How waves are played, by number. `hold` repeats the last wave; it is not passive, and for comparison."""
@@ -75,10 +84,10 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
     `missed` counts the samples between the one in use and the one before it; -1: no new one came.
     """
     received, sent, at, h = now.received[j], now.sent[j], j * now.joints + i, now.h_s
-    if now.k == 0 and law.reception == _REPLAY:
+    if now.k == 0 and law.playing == _REPLAY:
         sent.W[i] = law.reserve
     fresh = own = played = 0.0
-    if missed < 0.0 and law.reception == _REPLAY:
+    if missed < 0.0 and law.playing == _REPLAY:
         played = conceal_wave(law, at, sent.W[i], h)
     elif missed >= 0.0:
         fresh = law.wave[at] = received.u[i]
@@ -91,12 +100,12 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
         law.held_s[at] = 0.0
         law.U_seen[at], law.E_seen[at] = received.U[i], received.E[i]
         played = fresh
-    if law.reception == _REPLAY and missed >= 0.0:
+    if law.playing == _REPLAY and missed >= 0.0:
         played = replay_wave(law, at, fresh, sent.W[i], h)
-    elif law.reception == _SCALED:
+    elif law.playing == _SCALED:
         most = math.sqrt(2.0 * max(sent.W[i] + own, 0.0) / h)
         played = max(-most, min(most, math.sqrt(law.rate[j]) * law.wave[at]))
-    elif law.reception == _HOLD:
+    elif law.playing == _HOLD:
         played = law.wave[at]
     sent.W[i] += own - 0.5 * played * played * h
     now.to_all.H[i] += 0.5 * played * played * h
@@ -107,7 +116,7 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
     """Moves what an end with a spring follows by a wave v, and answers it; returns the torque ON the arm."""
     at, h = j * now.joints + i, now.h_s
-    b, stretch = law.b[at], law.q_sd[at] - now.q[i]
+    b, stretch = law.impedance[at], law.q_sd[at] - now.q[i]
     c = math.sqrt(2.0 * b)
     qd_sd = (c * v - law.K[i] * stretch + law.B[i] * now.qd[i]) / (b + law.B[i])
     force: float = law.K[i] * stretch + law.B[i] * (qd_sd - now.qd[i])
@@ -125,7 +134,7 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
         at = j * now.joints + i
         if now.k == 0:
             law.q_sd[at] = now.peers[j].q[i]
-        if law.b[at] > 0.0:
+        if law.impedance[at] > 0.0:
             stretch = law.q_sd[at] - now.q[i]
             spring += 0.5 * law.K[i] * stretch * stretch
     if now.k == 0:
@@ -161,21 +170,37 @@ def find_line(lines: Mapping[str, Any], site: str, peer: str) -> Any:
 
 
 @compiled
-class Wave:
-    """One end of a line to each peer, or of several.
+class Wave(EnergyLaw):
+    """Wave variables: a line of impedance b between every two sites, whose waves carry its energy.
 
-    Args:
-        facts: of its site.
-        b: impedance of the lines per joint, N m s/rad.
+    At an end without a spring of its own F = b qd - c v and u = c qd - v, c = sqrt(2 b), v being the wave
+    that comes and u the one that goes; an end with K and B follows by them, and with B = b reflects nothing.
+    Sites share as b_ij / sum b_ik. After Anderson and Spong (1989), Niemeyer and Slotine (1991).
+
+    Attributes:
+        b: impedance per joint, N m s/rad.
         K: spring of an end that moves its arm by one, per joint, N m/rad; 0: none.
-        B: damper of such an end, N m s/rad; b matches it to the line.
-        lines: impedances of single lines, of all joints or per joint, as in {"m1-s": 18.0}.
-        beta: the torque is divided by it.
-        reception: one of `RECEPTIONS`.
-        gravity: share of gravity that it knows.
-        reserve_J: energy per joint with which it begins.
+        B: damper of such an end, per joint, N m s/rad; b matches it to the line.
+        lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0: no line; b
+            of those not named. "shares": those by which sites share as their dominance factors at the start
+            say, b on the average, where these are reversible; else b.
+        beta: the site's torque is divided by it, dimensionless: who feels whom.
+        reception: how waves are played if samples are late or lost. "replay": the last one is held, and what
+            was missed is made up for, as far as known energy allows; "zero": it is dropped, and positions
+            drift; "scaled": the last wave goes on, times sqrt(1 - T'), for delays that vary continuously.
+        reserve_J: energy per joint with which an end begins, and again for what it plays of each line; waves
+            are cut where it has less than half of it.
     """
 
+    b: PositiveJoints = (10.0,)
+    K: NotNegativeJoints = (0.0,)
+    B: NotNegativeJoints = (10.0,)
+    lines: dict[str, NotNegative] | Literal["shares"] = "shares"
+    beta: Positive = 1.0
+    reception: Literal["replay", "zero", "scaled"] = "replay"
+    reserve_J: NotNegative = 1e-2
+
+    fixed_shares: ClassVar = True
     sends: ClassVar[Any] = {
         "u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True},
         "U": {"unit": "sqrt(W) s", "length": "joints", "per_peer": True},
@@ -183,36 +208,25 @@ class Wave:
         "W": {"unit": "J", "length": "joints", "per_peer": True},  # known and not played: for logs
         "H": {"unit": "J", "length": "joints"},  # what this end has, for logs too
     }
-    remembers = (
+    remembers: ClassVar = (
         *("q_sd", "wave", "U_seen", "E_seen", "owed_U", "owed_s", "held_s", "stamp", "rate"),
         *("played", "carried", "damped"),
     )
-    schemes = ("digital",)
+    tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
-    def __init__(
-        self,
-        facts: LawContext,
-        b: Sequence[float],
-        K: Sequence[float],
-        B: Sequence[float],
-        lines: Mapping[str, Any],
-        beta: float,
-        reception: str,
-        gravity: float,
-        reserve_J: float,
-    ) -> None:
+    def begin(self, facts: LawContext) -> None:
+        """Makes the lines of this end."""
         n, peers = facts.joints, len(facts.peers)
-        self.K, self.B, self.beta, self.gravity = list(K), list(B), float(beta), float(gravity)
-        self.b: list[float] = []
+        self.impedance: list[float] = []
         for peer in facts.peers:
-            line = find_line(lines, facts.site, peer)
-            self.b += b if line is None else (np.zeros(n) + line).tolist()
-        self.reception = RECEPTIONS.index(reception)
+            line = find_line({} if self.lines == "shares" else self.lines, facts.site, peer)
+            self.impedance += self.b if line is None else (np.zeros(n) + line).tolist()
+        self.playing = RECEPTIONS.index(self.reception)
         self.q_sd, self.wave = [0.0] * (n * peers), [0.0] * (n * peers)
         self.U_seen, self.E_seen = [0.0] * (n * peers), [0.0] * (n * peers)
         self.owed_U, self.owed_s, self.held_s = ([0.0] * (n * peers) for _ in range(3))
         self.stamp, self.rate = [-1.0] * peers, [1.0] * peers
-        self.reserve, self.tau_limit = float(reserve_J), (np.zeros(n) + facts.tau_limit_nm).tolist()
+        self.reserve, self.tau_limit = float(self.reserve_J), (np.zeros(n) + facts.tau_limit_nm).tolist()
         self.played, self.carried, self.ahead = [0.0] * (n * peers), [0.0] * n, [0.0] * n
         self.spring, self.damped = [0.0] * n, [0.0] * n
 
@@ -223,7 +237,7 @@ class Wave:
             close_wave_period(self, now, i)
             if self.K[i] == 0.0:
                 for j in range(len(now.peers)):
-                    c, at = math.sqrt(2.0 * self.b[j * n + i]), j * n + i
+                    c, at = math.sqrt(2.0 * self.impedance[j * n + i]), j * n + i
                     now.sent[j].u[i] = c * (now.q[i] - now.q_before[i]) / now.h_s - self.played[at]
                 send_waves(self, now, i, 0.0)
             self.carried[i] = self.gravity * now.gravity[i]
@@ -237,7 +251,7 @@ class Wave:
             if self.stamp[j] >= 0.0:
                 self.rate[j] += (missed + 1.0 - self.rate[j]) / STAMP_FILTER_TICKS
             for i in range(n):
-                b, at = self.b[j * n + i], j * n + i
+                b, at = self.impedance[j * n + i], j * n + i
                 if b == 0.0:
                     continue
                 self.played[at] = take_wave(self, now, j, i, missed)
@@ -259,3 +273,90 @@ class Wave:
         port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
         taken = seen.memory["damped"].sum(axis=1)
         return LawEnergies(gave, took, port, seen.to_all["H"], taken, observed, self.beta, self.gravity)
+
+    def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
+        """Returns a line that joins no two sites, or rates that differ: a wave lasts for a tick."""
+        for line in () if self.lines == "shares" else self.lines:
+            if sorted(line.split("-", 1)) not in [sorted(two) for two in permutations(rates_hz, 2)]:
+                names = ", ".join(rates_hz)
+                return KeyProblem(
+                    f"control.lines.{line}", f"joins no two sites: name them as in m1-s, of {names}"
+                )
+        if len({*rates_hz.values()}) > 1:
+            return KeyProblem("rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick")
+        return None
+
+    def at_shares(self, names: Sequence[str], alpha: Array) -> Any:
+        """Returns the law with its lines as numbers: b_ij = D_i alpha_ij, D_i alpha_ij = D_j alpha_ji."""
+        if self.lines != "shares":
+            return self
+        lines: dict[str, Any] = {}
+        pairs = list(combinations(range(len(names)), 2))
+        D = find_balancing_weights(alpha)
+        if D is not None and np.array_equal(alpha > 0.0, alpha.T > 0.0):
+            mean = sum(float(D[i] * alpha[i, j]) for i, j in pairs) / len(pairs)
+            for i, j in pairs:
+                part = float(f"{D[i] * alpha[i, j] / mean:.12g}")
+                lines[f"{names[i]}-{names[j]}"] = tuple(part * b for b in self.b)
+        return replace(cast(Any, self), lines=lines)
+
+    def explain_idle_shares(self, at: LawSituation) -> str:
+        """Returns what lines do in place of the shares, if these are not theirs."""
+        here = at.names[at.site]
+        lines = np.array([self.find_impedances(here, peer)[0] * (peer != here) for peer in at.names])
+        if np.allclose(lines, at.alpha[at.site] * lines.sum(), atol=1e-6 * lines.sum()):
+            return ""
+        own = self.lines or find_balancing_weights(at.alpha) is not None
+        return f"lines share as b_ij / sum b_ik{'' if own else ', as the shares of sites are not reversible'}"
+
+    def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
+        """Returns the impedance of a line at each joint, N m s/rad; as `at_shares` left it."""
+        line = find_line({} if self.lines == "shares" else self.lines, site, peer)
+        return self.b if line is None else tuple(np.broadcast_to(line, len(self.b)).tolist())
+
+    def linear_gains(self, theta: Array) -> Gains | None:
+        """Returns its gravity."""
+        return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
+
+    def linear_form(self, at: LinearSituation) -> LinearForm | None:
+        """Returns lines as the delays that they are, in continuous time, if no wave is late or lost."""
+        if any(self.K) and not all(self.K):
+            return None
+        here = at.names[at.site]
+        form = LinearForm(len(at.inertia), [f"q_sd_{at.names[j]}" for j in at.peers] if any(self.K) else [])
+        K, B = np.array(self.K), np.array(self.B)
+        for j in at.peers:
+            b = np.array(self.find_impedances(here, at.names[j]))
+            if not b.all():
+                continue
+            c, to, came, led = np.sqrt(2.0 * b), ("to", j), ("from", j), f"q_sd_{at.names[j]}"
+            if not any(self.K):
+                form.add("tau", "qd", -b / self.beta)
+                form.add("tau", came, c / self.beta)
+                form.add(to, "qd", c)
+                form.add(to, came, -1.0)
+                continue
+            rate = {came: c / (b + B), led: -K / (b + B), "q": K / (b + B), "qd": B / (b + B)}
+            for column, own in ((came, 0.0), (led, K), ("q", -K), ("qd", -B)):
+                force = own + B * rate[column]
+                form.add(led, column, rate[column])
+                form.add("tau", column, force / self.beta)
+                form.add(to, column, -c / b * force)
+            form.add(to, came, 1.0)
+        return form
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Returns that the lines are passive, and how sites share."""
+        here = situation.names[situation.site]
+        peers = [name for name in situation.names if name != here]
+        weights = [self.find_impedances(here, peer)[0] for peer in peers]
+        shares = ", ".join(
+            f"{peer} {line / (sum(weights) or 1.0):.4g}" for peer, line in zip(peers, weights, strict=True)
+        )
+        text = f"lines are passive whatever delays, jitter and loss are, where {PASSIVE_OUTSIDE}"
+        return StabilityCondition(True, f"{text}; the shares of {here} are b_ij / sum b_ik, {shares}")
+
+    @classmethod
+    def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
+        """All ends are matched to their lines, masters too, so that no wave is reflected for ever."""
+        return {**gains, "B": gains["b"], "gravity": at.gravity}

@@ -8,14 +8,16 @@ peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a c
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ..compiled_law import compiled
-from ..law_energy import LawEnergies, LawRecords, sum_work
-from ..user_law import LawContext, LawInput
+from ..core.compiled_law import compiled
+from ..core.law_energy import LawEnergies, LawRecords, sum_work
+from ..core.user_law import LawContext, LawInput
+from ..fields import NotNegative, NotNegativeJoints, Positive
+from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
+from .interface import DAMPING, STIFFNESS, EnergyLaw
 
 SWEEPS = 3
 """How often joints and couplings settle what each leaves of its torque, as these move one another."""
@@ -39,7 +41,7 @@ def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     """Brings what the leader's end knows of the coupling by which peer j follows up to the present."""
     at, sent = j * now.joints + i, now.sent[j]
-    observed = sent.W_led[i] if now.k > 0 else law.reserve
+    observed = sent.W_led[i] if now.k > 0 else law.reserve_J
     observed += now.received[j].E_followed[i] - law.E_known[at]
     law.E_known[at] = now.received[j].E_followed[i]
     if law.by_step:  # of the period before, which is over
@@ -85,7 +87,7 @@ def lead(law: Any, now: LawInput, j: int, i: int) -> None:
         own, step = half * law.inverse[i * n + i] / law.beta, AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
         for one in range(n):
             step += half * law.inverse[i * n + one] * law.change[one]
-    away = half * law.acceleration - sign * step - own * sign * law.F_now[at]  # without a torque here
+    away = half * law.acceleration_rad_s2 - sign * step - own * sign * law.F_now[at]  # without a torque here
     if most * (away + own * most) > spare:
         if own > 0.0:
             most = max(math.sqrt(away * away + 4.0 * own * spare) - away, 0.0) / (2.0 * own)
@@ -107,7 +109,7 @@ def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, pric
     `price` is what the period is expected to cost beyond the work of that velocity.
     """
     at, h, peer = j * now.joints + i, now.h_s, now.peers[j]
-    known = now.received[j].E_led[i] + 0.5 * law.reserve - law.E_moved[at] + law.E_yielded[at]
+    known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
     if law.by_step:  # half of the reserve is for what steps cost more than planned
         known = max(known - price, 0.0)
     law.v_led[at] = peer.qd[i]
@@ -143,7 +145,7 @@ def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) ->
 def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
     """Returns the velocity of the goal by peer j, less where that costs more than is known."""
     at, work = j * now.joints + i, now.peers[j].alpha * force * now.h_s
-    known = now.received[j].E_led[i] + 0.5 * law.reserve - law.E_moved[at] + law.E_yielded[at]
+    known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
     known, velocity = max(known, 0.0), float(law.v_led[at])
     return known / work if law.controlled and work * velocity > known else velocity
 
@@ -164,7 +166,7 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
     else:
         now.sent[j].E_followed[i] -= energy
     law.E_yielded[at] += force * (velocity - law.v_led[at]) * h - drift
-    now.sent[j].W_followed[i] = now.received[j].E_led[i] + law.reserve - law.E_moved[at] + law.E_yielded[at]
+    now.sent[j].W_followed[i] = now.received[j].E_led[i] + law.reserve_J - law.E_moved[at] + law.E_yielded[at]
 
 
 @compiled
@@ -238,22 +240,32 @@ def follow(law: Any, now: LawInput, i: int) -> None:
 
 
 @compiled
-class Tdpa:
-    """A leader's end, a follower's, or both, of a coupling with each peer.
+class Tdpa(EnergyLaw):
+    """Time-domain passivity control with delay: each end watches the energy of its coupling, and damps.
 
-    Args:
-        facts: of its site.
-        K: spring by which it follows, per joint, N m/rad; 0: it follows nobody.
-        B: damper by which it follows, N m s/rad.
-        acceleration_rad_s2: by which an arm may begin to accelerate within a period for reasons that are not
-            the law's, as far as a leader's controller is to cover it.
+    Every site follows by K and B towards the integral of its peers' velocities, mixed by dominance, and the
+    peers feel that torque; K = 0 and B = 0 make a site lead only. After Ryu, Artigas and Preusche (2010); of
+    several sites after Panzirsch and others (2012).
+
+    Attributes:
+        K: spring by which the site follows, per joint, N m/rad; 0: it follows nobody.
+        B: damper by which it follows, per joint, N m s/rad.
+        acceleration_rad_s2: by which torques that are not the law's change a joint's acceleration from tick
+            to tick, as far as leaders' controllers cover it beforehand; half of the reserve covers it too.
         drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
-        reserve_J: energy that an end begins with, per joint and peer.
-        energy: "step": torque times the step in q; "velocity": times velocity and period.
-        gravity: share of gravity that it knows.
-        beta: the torque is divided by it.
-        controlled: false: it watches only, for comparison.
+        reserve_J: energy per joint and peer with which an end begins.
+        energy: "step": what the arm gets, torque times the step in q; "velocity": torque times velocity times
+            period, as it is published.
+        beta: the site's torque is divided by it, dimensionless: who feels whom.
     """
+
+    K: NotNegativeJoints = (100.0,)
+    B: NotNegativeJoints = (10.0,)
+    acceleration_rad_s2: NotNegative = 0.0
+    drift_rad_s: NotNegative = 0.5
+    reserve_J: NotNegative = 1e-3
+    energy: Literal["step", "velocity"] = "step"
+    beta: Positive = 1.0
 
     sends: ClassVar[Any] = {
         "F": {"unit": "N m", "length": "joints", "per_peer": True},
@@ -262,33 +274,22 @@ class Tdpa:
         "W_led": {"unit": "J", "length": "joints", "per_peer": True},  # observed here, for logs
         "W_followed": {"unit": "J", "length": "joints", "per_peer": True},
     }
-    remembers = (
+    remembers: ClassVar = (
         *("goal", "F_led", "E_known", "E_moved", "E_yielded", "lent"),
         *("carried", "spring", "force", "paid", "E_settled"),
     )
-    schemes = ("digital",)
-    needs_model = True
+    needs_model: ClassVar = True
+    tune: ClassVar = {"K": STIFFNESS, "B": DAMPING}
+    told: ClassVar = "gravity, and inertia for two ticks"
+    controlled = True
+    """False: it watches only, for comparison."""
 
-    def __init__(
-        self,
-        facts: LawContext,
-        K: Sequence[float],
-        B: Sequence[float],
-        acceleration_rad_s2: float,
-        drift_rad_s: float,
-        reserve_J: float,
-        energy: str,
-        gravity: float,
-        beta: float = 1.0,
-        controlled: bool = True,
-    ) -> None:
+    def begin(self, facts: LawContext) -> None:
+        """Makes the books of both ends of each coupling."""
         n, peers = facts.joints, len(facts.peers)
-        self.K, self.B = list(K), list(B)
-        self.acceleration, self.drift_rad_s = float(acceleration_rad_s2), float(drift_rad_s)
-        self.reserve, self.gravity = float(reserve_J), float(gravity)
-        self.by_step, self.controlled = energy == "step", controlled
-        self.floor = 0.5 * self.reserve if self.by_step else 0.0
-        self.beta, self.tau_limit = float(beta), (np.zeros(n) + facts.tau_limit_nm).tolist()
+        self.by_step, self.controlled = self.energy == "step", bool(self.controlled)
+        self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
+        self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
         self.goal, self.ahead, self.low, self.high = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n
         self.change = [0.0] * n
         self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
@@ -340,7 +341,7 @@ class Tdpa:
             followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
             gave.append(np.hstack([sent["E_led"], followed]))
             settled = seen.memory["E_settled"][:, j * n : (j + 1) * n]
-            took.append(np.hstack([settled - self.reserve, came["E_followed"] - sent["W_led"]]))
+            took.append(np.hstack([settled - self.reserve_J, came["E_followed"] - sent["W_led"]]))
             observed.append(np.hstack([sent["W_led"], sent["W_followed"]]))
         port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
         return LawEnergies(
@@ -349,3 +350,22 @@ class Tdpa:
             weight=self.beta,
             gravity=self.gravity,
         )
+
+    def explain_no_linear_form(self) -> str:
+        """Returns why it cannot be linearised."""
+        return "its controllers act by the energy observed, which is of second order in the motion"
+
+    def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
+        """Returns that a site without K and B follows nobody."""
+        return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
+        """Returns that the couplings are passive, as far as motion can be foretold."""
+        text = f"couplings are passive for any delays, jitter, loss and shares, where {PASSIVE_OUTSIDE}, "
+        if self.energy == "velocity":
+            return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
+        beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2" if self.acceleration_rad_s2 else ""
+        paid = (
+            f"while half of reserve_J pays for what other torques change accelerations by in a tick{beyond}"
+        )
+        return StabilityCondition(True, f"{text}{paid}")

@@ -18,7 +18,7 @@ from ..core.chain import MAX_JOINTS
 from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..core.site_setup import Layout
 from ..errors import ScenarioError
-from .fields import Frozen, reword_problem
+from ..fields import Frozen, reword_problem
 
 
 class SentVectorSpec(Frozen, frozen=True):

@@ -13,9 +13,9 @@ from typing import Annotated, Any, NamedTuple, TypeGuard, get_type_hints
 import msgspec
 from msgspec import Meta
 
-from ..core.chain import LINK_PARAMETERS, MAX_JOINTS
-from ..core.two_link_arm import JOINTS, PARAMETERS
-from ..errors import ScenarioError
+from .core.chain import LINK_PARAMETERS, MAX_JOINTS
+from .core.two_link_arm import JOINTS, PARAMETERS
+from .errors import ScenarioError
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
