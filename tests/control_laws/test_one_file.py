@@ -1,0 +1,78 @@
+"""A control law is one file: whoever knows laws knows one that was put beside the others."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from trilat_net.laws.interface import name_of_class
+from trilat_net.scenario.laws import BUILT_IN
+
+LAW = '''
+from typing import ClassVar
+
+from trilat_net import compiled
+from trilat_net.fields import PositiveJoints
+from trilat_net.laws.conditions import StabilityCondition
+from trilat_net.laws.interface import STIFFNESS, ControlLaw
+
+
+@compiled
+class SoftSpring(ControlLaw):
+    """tau = G - K e."""
+
+    K: PositiveJoints = (7.0,)
+    tune: ClassVar = {"K": STIFFNESS}
+
+    def torque(self, now):
+        for i in range(now.joints):
+            now.tau[i] = now.gravity[i] - self.K[i] * (now.q[i] - now.q_des[i])
+
+    def condition(self, situation):
+        return StabilityCondition(None, f"K = {self.K[0]:g} at {situation.names[situation.site]}")
+'''
+LOOK = """
+import json, sys
+import trilat_net.laws
+trilat_net.laws.__path__.append(sys.argv[1])
+import trilat_net as tn
+from trilat_net.core.control import limit_torque
+from trilat_net.studies.bench.bench_tasks import LAWS_OF_ANY, LAWS_OF_TWO
+from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+changes = {"control.law": "soft_spring", "control.K": 9.0, "duration_s": 0.2}
+log = tn.simulate("free", changes)
+verdict = tn.verify(log)
+tuned = tn.tune("free", laws=["soft_spring"], budget=2, jobs=1)
+print(json.dumps({
+    "control": log.scenario.sites["s"].control.K,
+    "check": tn.describe_scenario(log.scenario),
+    "identical": verdict.identical == verdict.records,
+    "knobs": [knob.name for knob in SEARCH_SPACES["soft_spring"].knobs],
+    "tuned": [found.space.law for found in tuned.found],
+    "suite": "soft_spring" in LAWS_OF_ANY,
+    "two": "soft_spring" in LAWS_OF_TWO,
+}))
+"""
+
+
+def test_a_file_beside_the_others_is_a_law_everywhere(tmp_path: Path) -> None:
+    (tmp_path / "soft_spring.py").write_text(LAW)
+    command = [sys.executable, "-c", LOOK, str(tmp_path)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert out.returncode == 0, out.stderr
+    found = json.loads(out.stdout.splitlines()[-1])
+    assert found["control"] == [9.0, 9.0]
+    assert any("condition of soft_spring" in line and "K = 9 at s" in line for line in found["check"])
+    assert found["identical"]
+    assert (found["knobs"], found["tuned"]) == (["K"], ["soft_spring"])
+    assert (found["suite"], found["two"]) == (True, False)
+
+
+@pytest.mark.parametrize("name", list(BUILT_IN))
+def test_file_class_and_name_are_one(name: str) -> None:
+    law = BUILT_IN[name]
+    assert law.__module__ == f"trilat_net.laws.{name}"
+    assert law.__name__ == name_of_class(name)
+    assert law.tune  # no law is left out of tuning
