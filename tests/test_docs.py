@@ -18,10 +18,9 @@ from trilat_net.analysis.certificate import stability_certificate as certificate
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference, twins
-from trilat_net.laws import catalogue
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import operators, resolve
+from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_cell, bench_gains, bench_run, bench_tasks
 from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
@@ -231,7 +230,7 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
 def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> None:
     text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
     kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
-    assert [kind for kind in (*kinds, *catalogue.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
+    assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
 
 
 def test_every_test_that_the_security_page_names_is_there() -> None:
