@@ -122,7 +122,7 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
     [
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
-        ("", ["no law ''", "tuned are adaptive, known, adaptive_box, adaptive_kinematics, adaptive_robust, authority"]),
+        ("", ["no law ''", "tuned are adaptive, known, adaptive_box, adaptive_kinematics, adaptive_robust"]),
         ("tests.laws:Adaptive", ["tests.laws:Adaptive has no search ranges", "tune = {"]),
         ("own", ["no law 'own'"]),
     ],
