@@ -694,8 +694,10 @@ def main() -> None:
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         if asked.find_truths:
             lines = TRUTHS.read_text().splitlines()
-            lines[1 + seeds.start : 1 + seeds.stop] = pool.map(write_truth, seeds, chunksize=8)
-            TRUTHS.write_text("\n".join([*lines, ""]))
+            for n, row in enumerate(pool.map(write_truth, seeds, chunksize=8), 1 + seeds.start):
+                lines[n : n + 1] = [row]
+                if n % 100 == 0 or n == seeds.stop:
+                    TRUTHS.write_text("\n".join([*lines, ""]))
             return
         judged = list(pool.map(judge_experiment, seeds, chunksize=8))
     print("| experiments | runs | unstable | near an edge | false ok | false alarms | open |")

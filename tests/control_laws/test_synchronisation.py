@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 
 from tests.unit_arm import last_rows, unit_scenario
-from trilat_net.scenario import Scenario
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
 
 PENDULUM = {
@@ -64,3 +65,9 @@ def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
 @pytest.mark.parametrize(("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)])
 def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> None:
     assert ends("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)
+
+
+@pytest.mark.parametrize("law", ["sync", "adaptive_kinematics"])
+def test_a_law_of_the_planar_arm_refuses_a_chain(law: str) -> None:
+    with pytest.raises(ScenarioError, match=f"control.law: {law} has the regressor of the planar arm"):
+        load_scenario("six_joints", [f"control={{law = '{law}'}}"])

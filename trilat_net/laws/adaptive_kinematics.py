@@ -102,6 +102,7 @@ class AdaptiveKinematics(ControlLaw):
     least_m: Positive = 0.2
     most_m: Positive = 3.0
 
+    planar: ClassVar = True
     compares_places: ClassVar = True
     sends: ClassVar[dict[str, Any]] = {"x": {"unit": "m", "length": 2}, "xd": {"unit": "m/s", "length": 2}}
     remembers: ClassVar = ("theta_hat", "Yr", "lengths_m", "rate_m_s")
@@ -115,8 +116,6 @@ class AdaptiveKinematics(ControlLaw):
 
     def begin(self, facts: LawContext) -> None:
         """Makes both estimates and their rates."""
-        if not any(facts.lengths_m):
-            raise ValueError("it has the regressor of the planar arm of two links, and this is a chain")
         self.theta_hat, self.lengths_m = list(self.theta_hat0), list(self.lengths0_m)
         self.Yr, self.rate_m_s = [0.0] * len(self.theta_hat), [0.0, 0.0]
         self.measured = list(facts.lengths_m)  # what an instrument at the end effector goes by

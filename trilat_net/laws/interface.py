@@ -65,6 +65,8 @@ class LawSettings(Frozen, frozen=True):
     """True: it takes the dominance factors of the start alone."""
     has_functional: ClassVar[bool] = False
     """True: the paper's functional V belongs to it."""
+    planar: ClassVar[bool] = False
+    """True: it has the regressor of the planar arm, and is for no chain."""
     compares_places: ClassVar[bool] = False
     """True: it compares where end effectors are, whatever the joints do."""
 

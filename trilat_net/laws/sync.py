@@ -43,14 +43,13 @@ class Sync(ControlLaw):
     Gamma: NotNegativeParameters = (1.0,)
     theta_hat0: Parameters = (0.0,)
 
+    planar: ClassVar = True
     remembers: ClassVar = ("theta_hat", "Yr")
     tune: ClassVar = {"Lambda": CONVERGENCE, "Kp": DAMPING, "Gamma": ADAPTATION}
     told: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
         """Makes the estimate and its rate."""
-        if not any(facts.lengths_m):
-            raise ValueError("it has the regressor of the planar arm of two links, and this is a chain")
         self.theta_hat = list(self.theta_hat0)
         self.Yr = [0.0] * len(self.theta_hat)
         self.g_m_s2 = facts.g_m_s2

@@ -230,6 +230,12 @@ def _check_joint_space(scenario: Scenario) -> None:
             )
     for name, model in scenario.arms.items():
         site = scenario.sites[name]
+        if model.chain is not None and site.control.planar:
+            raise ScenarioError(
+                f"{site.control.tag} has the regressor of the planar arm of two links, and this arm is a "
+                "chain: choose adaptive",
+                path=f"sites.{name}.control.law",
+            )
         if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
         gains = site.control.gains(model.theta)
