@@ -24,7 +24,7 @@ import numpy as np
 
 import trilat_net
 from trilat_net.analysis.certificate.energy_terms import explain_missing_functional
-from trilat_net.analysis.certificate.evidence import Evidence
+from trilat_net.analysis.certificate.premises import Evidence
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
     StabilityFinding,

@@ -1,30 +1,36 @@
 """Overview of MCAP files: layout, channels, gaps and message rates; of a trilat-net log also its health.
 
+That is: of its session, its loops, links and clocks, in numbers that need no re-execution.
+
 Invariant: the inventory decodes no message, so any MCAP file has one, also where its log cannot be opened;
-the overview then holds the reason. Gaps are counted only on channels with consecutive numbers.
+the overview then holds the reason. Gaps are counted only on channels with consecutive numbers. Keys end in
+their unit; a quantity that the log does not determine is None, never NaN.
 """
 
 from array import array
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import open_regular
 from ..log.log_layout import SESSION
-from ..log.log_reader import open_log
+from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
+from ..log.site_log import SiteLog
 from ..net import topics
 from ..net.message_numbers import ticks_per_stats
 from ..results import Result
-from .health import describe_link_health, describe_session, describe_site_health, percentiles
 from .json_values import JsonObject
+from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns, summarise_clock
 
-_NOTHING = (array("Q"), array("Q"), array("Q"))
 MOST_LISTED_GAPS = 1000
 """Gaps of a channel that are named."""
 
@@ -48,7 +54,9 @@ class FileInventory:
         self.files: list[JsonObject] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._about: dict[str, ChannelInfo] = {}
-        self._came: dict[str, tuple[array[int], array[int], array[int]]] = {}  # log time, sequence, size
+        self._came: defaultdict[str, tuple[array[int], ...]] = defaultdict(  # log time, sequence, size
+            lambda: (array("Q"), array("Q"), array("Q"))
+        )
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
@@ -61,10 +69,7 @@ class FileInventory:
 
     def _read(self, path: Path, walk: McapReader) -> None:
         for topic, payload, log_ns, _, sequence in walk.messages():
-            try:
-                times, sequences, sizes = self._came[topic]
-            except KeyError:
-                times, sequences, sizes = self._came[topic] = (array("Q"), array("Q"), array("Q"))
+            times, sequences, sizes = self._came[topic]
             times.append(log_ns)
             sequences.append(sequence)
             sizes.append(len(payload))
@@ -77,10 +82,7 @@ class FileInventory:
                 "library": walk.library,
                 "finished": walk.complete,
                 "cut_off_at_byte": None if walk.torn is None else walk.torn.offset,
-                "damaged": [
-                    {key: getattr(part, key) for key in ("offset", "length", "problem")}
-                    for part in walk.damaged
-                ],
+                "damaged": [part._asdict() for part in walk.damaged],
                 "chunks": walk.chunks.total(),
                 "compression": {name or "none": count for name, count in walk.chunks.items()},
                 "packed_bytes": walk.packed_bytes,
@@ -102,7 +104,7 @@ class FileInventory:
         self, topic: str, session: str, rates_hz: Mapping[str, int], absences: Absences
     ) -> JsonObject:
         about = self._about.get(topic, ChannelInfo(topic, "", "", "", {}))
-        log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came.get(topic, _NOTHING))
+        log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came[topic])
         first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
         span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
         return {
@@ -194,3 +196,103 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
             facts["problem"] = str(error)
     facts["channels"] = inventory.channels(name, rates_hz, absences)
     return facts
+
+
+_PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")
+_LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
+
+
+def describe_session(log: Log) -> JsonObject:
+    """Returns the facts of a log's session."""
+    session, scenario = log.session, log.scenario
+    epoch_ns = _number(session.get("epoch_unix_ns", ""))
+    seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
+    began_utc = None
+    if log.driver == "live" and epoch_ns is not None:
+        began_at = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
+        began_utc = began_at.strftime("%Y-%m-%d %H:%M:%S")
+    return {
+        "session": session["session"],
+        "driver": log.driver,
+        "complete": log.complete,
+        "began_utc": began_utc,
+        "epoch_unix_ns": epoch_ns,
+        "recorded_s": max(seconds, default=0.0),
+        "ended": {event.member: event.ticks for event in log.events if event.kind == "end"},
+        "scenario": {
+            "name": scenario.name,
+            "title": scenario.title,
+            "sha256": log.scenario_sha256,
+            "as_named": log.scenario_sha256 == session.get("scenario_sha256"),
+            "duration_s": scenario.duration_s,
+            "seed": scenario.seed,
+            "sites": list(log.sites),
+        },
+        **{key: session.get(key) for key in _PROVENANCE},
+        "versions": {key[8:]: value for key, value in session.items() if key.startswith("version_")},
+        "accounts": log.accounts,
+    }
+
+
+def describe_site_health(log: Log, site: str) -> JsonObject:
+    """Returns the facts of a site's records and of its loop."""
+    part, spec, timed = log[site], log.scenario.sites[site], log.driver == "live"
+    return {
+        "role": spec.role,
+        "rate_hz": spec.rate_hz,
+        "records": len(part),
+        "made_ticks": made_ticks(log, site),
+        "expected_ticks": log.scenario.ticks(site),
+        "missing": log.missing(site),
+        "late_us": percentiles(part.late_us) if timed else None,
+        "busy_us": percentiles(part.busy_us) if timed else None,
+        "overruns": count_overruns(part) if timed else None,
+    }
+
+
+def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
+    """Returns the facts of a directed link, peer -> site."""
+    clock = summarise_clock(log, peer, site)
+    stats = log.link_stats(site)[-1:]
+    counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
+    one_way_us = np.zeros(0, dtype=np.int64)  # none is measured in virtual time
+    version = _number(log.session.get("schema_version", "")) or 0
+    if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
+        came = log[site].arrivals[1]
+        one_way_us = came[came[:, 0] == log[site].peers.index(peer), 2]
+    return {
+        "stated": log.scenario.links[f"{peer}->{site}"].describe(),
+        "age_ms": percentiles(sample_ages_ns(log, peer, site), unit=1e6),
+        "one_way_ms": percentiles(one_way_us, unit=1e3),
+        "clock_offset_us": None if clock is None else clock.offset_us,
+        "clock_bound_us": None if clock is None else clock.bound_us,
+        **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
+    }
+
+
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
+
+
+def percentiles(
+    values: ArrayLike, shares: Mapping[str, float] = PERCENTILES, unit: float = 1.0
+) -> dict[str, float] | None:
+    """Returns percentiles by name, in multiples of a unit; None of no values."""
+    array = np.asarray(values)
+    if not array.size:
+        return None
+    found = (np.percentile(array, list(shares.values())) / unit).tolist()
+    return dict(zip(shares, found, strict=True))
+
+
+def made_ticks(log: Log, site: str) -> int | None:
+    """Returns the number of ticks that a site made, by its own event; None without one."""
+    return next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
+
+
+def count_overruns(part: SiteLog) -> int:
+    """Returns how many ticks began later than a whole period."""
+    return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
+
+
+def _number(text: str) -> int | None:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None

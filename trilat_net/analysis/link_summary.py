@@ -1,7 +1,8 @@
-"""Statistics of every directed link: stated and effective delay, loss, bursts and sample counts.
+"""Statistics of every directed link: stated and effective delay, loss, bursts, sample counts and clocks.
 
 Invariant: a quantity that the log does not determine is None. docs/definitions.md defines each: the effective
-delay is the age of the sample in use at a tick (age of information, Kaul, Yates and Gruteser 2012).
+delay is the age of the sample in use at a tick (age of information, Kaul, Yates and Gruteser 2012). Clock
+estimates are those in force while the session ran, without later improvement.
 """
 
 from typing import NamedTuple
@@ -42,6 +43,49 @@ class AgeHistogram(NamedTuple):
     first_ms: float
     width_ms: float
     ticks: list[int]
+
+
+class ClockSummary(NamedTuple):
+    """The clock of a link's sender against the receiver's: `clock.*` of docs/definitions.md.
+
+    `drift` and `rtt_min_us` are None without an estimate; `faults` says that a clock has stepped.
+    """
+
+    offset_us: int
+    offset_first_us: int
+    drift_ppm: float | None
+    drift_bound_ppm: float | None
+    bound_us: int
+    bound_p50_us: float
+    bound_max_us: int
+    rtt_min_us: int | None
+    faults: int
+
+    @property
+    def shared(self) -> bool:
+        """True if both ends read one and the same clock."""
+        return self.bound_max_us == 0 and self.offset_us == 0
+
+
+def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
+    """Returns the estimates of a peer's clock at a site; None if nothing was measured, as in virtual time."""
+    stats = [stats for stats in log.link_stats(site) if peer in stats.offset_us]
+    if not stats:
+        return None
+    bounds = [each.bound_us.get(peer, 0) for each in stats]
+    trips = [trip for each in stats if (trip := each.rtt_us.get(peer, -1)) >= 0]
+    drifts = [e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)]
+    return ClockSummary(
+        offset_us=stats[-1].offset_us[peer],
+        offset_first_us=stats[0].offset_us[peer],
+        drift_ppm=drifts[-1].drift_ppb / 1e3 if drifts else None,
+        drift_bound_ppm=drifts[-1].drift_bound_ppb / 1e3 if drifts else None,
+        bound_us=bounds[-1],
+        bound_p50_us=float(np.median(bounds)),
+        bound_max_us=max(bounds),
+        rtt_min_us=min(trips, default=None),
+        faults=stats[-1].clock_faults.get(peer, 0),
+    )
 
 
 class SampleCounts(NamedTuple):

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 
 from ..log.log_reader import Log
 from ..scenario.expect import END_WINDOW_S
-from . import health
+from . import file_overview
 from .json_values import JsonObject, finite_or_none
-from .link_summary import LinkSummary, ValueStatistics, summarise_links
+from .link_summary import LinkSummary, ValueStatistics, summarise_clock, summarise_links
 from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_of_all_s, settling_time_s
 from .timeline import find_mode_intervals, list_changes
 
@@ -55,8 +55,8 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
     part, spec = log[name], log.scenario.sites[name]
     end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
     moved = operator_displacement(log, twin, name)[2] if twin is not None else part.q[:0]
-    made, expected = health.made_ticks(log, name), log.scenario.ticks(name)
-    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, health.PERCENTILES
+    made, expected = file_overview.made_ticks(log, name), log.scenario.ticks(name)
+    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, file_overview.PERCENTILES
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
     return {
         "role": spec.role,
@@ -73,16 +73,16 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
         "settle_s": settling_time_s(part),
         "peak_tau_nm": _largest(part.tau),
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
-        "late_us": health.percentiles(part.late_us, late) or dict.fromkeys(late),
-        "busy_us": health.percentiles(part.busy_us, busy) or dict.fromkeys(busy),
-        "overruns": health.count_overruns(part),
+        "late_us": file_overview.percentiles(part.late_us, late) or dict.fromkeys(late),
+        "busy_us": file_overview.percentiles(part.busy_us, busy) or dict.fromkeys(busy),
+        "overruns": file_overview.count_overruns(part),
         "hands_moved_max_rad": np.abs(moved).max(axis=0).tolist() if len(moved) else None,
         "hands_moved_end_rad": moved[-1].tolist() if len(moved) else None,
     }
 
 
 def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
-    counts, clock = use.counts, health.summarise_clock(log, use.peer, use.site)
+    counts, clock = use.counts, summarise_clock(log, use.peer, use.site)
     return {
         "delay_ms": finite_or_none(use.stated[0].link.moments().mean_ms),
         "stated": [

@@ -7,8 +7,14 @@ Invariant: a link with one constant delay and no loss gets no line.
 
 from collections.abc import Iterator, Sequence
 
-from ..analysis.health import ClockSummary, summarise_clock
-from ..analysis.link_summary import LinkSummary, SampleCounts, ValueStatistics, summarise_links
+from ..analysis.link_summary import (
+    ClockSummary,
+    LinkSummary,
+    SampleCounts,
+    ValueStatistics,
+    summarise_clock,
+    summarise_links,
+)
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..execution.log_checks import LogCheckReport
 from ..execution.rerun import LinkEffect, LogAndRerun, Rerun

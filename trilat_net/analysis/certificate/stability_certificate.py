@@ -32,12 +32,13 @@ from .energy_balance import (
     compute_site_energies,
     find_dominance_matrices,
 )
-from .evidence import Evidence, collect_evidence
 from .observed_energy import ObservedEnergy, observe_energies
 from .premises import (
+    Evidence,
     Premise,
     check_run_premises,
     check_scenario_premises,
+    collect_evidence,
     describe_closed_groups,
     find_unjudged_spans,
     rise_above_minimum,

@@ -22,8 +22,8 @@ from ...scenario.arms import TASK_AXES
 from ..aligned import align_records
 from ..arm_rows import build_arm_rows
 from ..dominance_history import trace_dominance
+from ..file_overview import describe_site_health
 from ..following import JointFollowing, follow_rows
-from ..health import describe_site_health
 from ..link_summary import LinkSummary, summarise_links
 from ..site_signals import follows_in_task_space
 from ..torque_sources import attribute_torque, list_walls
