@@ -121,5 +121,5 @@ def test_a_report_asks_for_the_coverage_that_it_is_told(
     file = tmp_path / "run.mcap"
     file.write_bytes(MADE["sparse"]())
     found = conclude(open_log(file), tmp_path, min_coverage=0.5)
-    assert {line.label: line.passed for line in found.lines}["records"]
+    assert {line.check: line.passed for line in found.findings}["records"]
     assert not any("less than 99.9 %" in note for note in found.notes)

@@ -194,7 +194,7 @@ def test_sparse_logs_fail_and_say_how_much_was_judged() -> None:
     assert not verdict.passed
     assert verdict.coverage.judged["m1"] < 25
     assert verdict.coverage.share < 0.2
-    text = run_log_checks(log, virtual=False).lines[0].text
+    text = run_log_checks(log, virtual=False).findings[0].text
     assert "m1" in text
     assert "less than 99.9 %" in text
 
@@ -249,29 +249,29 @@ def test_an_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> 
     (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")  # no more the file that the rerun names
     alone = run_log_checks(open_log(made), virtual=True)
     assert not alone.passed
-    assert "not beside it" in "".join(line.text for line in alone.lines)
+    assert "not beside it" in "".join(line.text for line in alone.findings)
 
 
 def test_samples_lost_on_the_way_excuse_plain_virtual_time_and_nothing_before_them() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
     log = opened(delivered({}, lost))
     report = run_log_checks(log, virtual=True)
-    assert report.passed, report.lines
+    assert report.passed, report.findings
     assert "20 lost on the way, the first: sample 40 of s was due at tick 60 of m2 and never came" in (
-        report.lines[-1].label
+        report.findings[-1].check
     )
-    assert "the first that differs" in report.lines[-1].text
+    assert "the first that differs" in report.findings[-1].text
 
     def record(r: dict) -> dict:
         return {**r, "tau": [r["tau"][0], r["tau"][1] + 1e-12]} if r["tick"] == 30 else r
 
     changed = run_log_checks(opened(edited(delivered({}, lost), record=record)), virtual=True)
-    assert not changed.lines[-1].passed
+    assert not changed.findings[-1].passed
 
 
 def test_a_gap_does_not_fail_virtual_time_fed_with_what_can_have_arrived() -> None:
-    lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).lines
-    fed = next(line for line in lines if "fed" in line.label)
+    lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).findings
+    fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
 
 

@@ -63,9 +63,9 @@ def test_what_was_executed_is_verified_and_what_stands_is_not(replace: list[str]
     assert after.executed_sites == tuple(sorted(replace))
     assert verdict.agreed, str(verdict.first)
     assert verdict.identical == verdict.records == TICKS * len(replace)
-    lines = run_log_checks(after, virtual=True).lines
+    lines = run_log_checks(after, virtual=True).findings
     others = [name for name in SITES if name not in replace]
-    assert [line.label for line in lines if not line.passed] == ["records"] * bool(others), lines
+    assert [line.check for line in lines if not line.passed] == ["records"] * bool(others), lines
     assert all(name in lines[2].text for name in others)
     assert ("did not react" in lines[-1].text) == bool(others)
 

@@ -49,8 +49,7 @@ def log_check_command(
             terminal.print_note("this is no log of trilat-net: only its structure was checked")
         for path in files:
             terminal.warn_if_unfinished(path)
-    if not found.passed:
-        raise typer.Exit(1)
+    raise typer.Exit(found.exit_code)
 
 
 def log_sign_command(

@@ -214,12 +214,10 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(parts: list[Path], *, png: bool) -> None:
-    from ..execution.log_checks import choose_exit_code
-
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
-    if (code := choose_exit_code(conclusion.lines)) == LawWithheld.exit_code:
+    if conclusion.exit_code == LawWithheld.exit_code:
         raise LawWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
-    if code:
+    if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
     if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
         raise RunFailed(f"{parts[0]}: {ended.text}")

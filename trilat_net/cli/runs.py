@@ -84,7 +84,7 @@ def verify_command(
     differs, was changed, or is missing. 2: no log. 4: a site's law is code from outside that may not run
     without --law; all else agrees.
     """
-    from ..execution.log_checks import choose_exit_code, run_log_checks
+    from ..execution.log_checks import run_log_checks
 
     log = laws.open(*files)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
@@ -92,7 +92,7 @@ def verify_command(
             log, virtual=virtual, progress=progress, min_coverage=min_coverage, resume_every=resume_every
         )
     terminal.print_result(result, as_json=as_json)
-    raise typer.Exit(choose_exit_code(result.lines))
+    raise typer.Exit(result.exit_code)
 
 
 def certify_command(
@@ -263,7 +263,6 @@ def report_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Writes the page and the summary of a log, with --png its figures as well."""
-    from ..execution.log_checks import choose_exit_code
     from ..files import make_results_folder
     from ..reporting.conclude import conclude
 
@@ -272,7 +271,7 @@ def report_command(
     with terminal.progress_bar("drawing") as progress:
         conclusion = conclude(log, results, progress, min_coverage=min_coverage, png=png)
     terminal.print_result(conclusion, as_json=as_json)
-    raise typer.Exit(choose_exit_code(conclusion.lines))
+    raise typer.Exit(conclusion.exit_code)
 
 
 def rerun_command(

@@ -8,35 +8,30 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import LawWithheld, ScenarioError
+from ..errors import ScenarioError
 from ..log.accounting import MIN_COVERAGE
-from ..log.findings import Finding
+from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
-from ..results import Result
 from ..scenario.imported_law import LawConsents, allowed_laws
 from ..scenario.law_consent import find_user_laws
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
-
-
-def choose_exit_code(lines: Sequence[Finding]) -> int:
-    """Returns the exit code of checks: 1 if one failed, else that of `LawWithheld` if one was not judged."""
-    failed = any(line.judged and not line.passed for line in lines)
-    return 1 if failed else 0 if all(line.passed for line in lines) else LawWithheld.exit_code
-
 
 MAX_GAPS_NAMED = 60
 """Gaps that a line names."""
 
 
 @dataclass(frozen=True, repr=False)
-class LogCheckReport(Result):
-    """The result of executing a log again, and a line for that and for every other check."""
+class LogCheckReport(CheckReport):
+    """The result of executing a log again, and a finding for that and for every other check.
+
+    It passed if the log is as it was made, enough of it was judged, and every execution agreed with it.
+    """
 
     log: Log
     result: VerifyResult
-    lines: list[Finding]
+    findings: list[Finding]
 
     @property
     def records(self) -> int:
@@ -47,15 +42,6 @@ class LogCheckReport(Result):
     def identical(self) -> int:
         """How many of them agree in every computed field."""
         return self.result.identical
-
-    @property
-    def passed(self) -> bool:
-        """True if the log is as it was made, enough of it was judged, and every execution agreed with it."""
-        return all(line.passed for line in self.lines)
-
-    def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per check."""
-        return [line.line() for line in self.lines]
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat verify --json`: every gap, the first difference."""
@@ -110,7 +96,7 @@ def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawCon
     allowed_laws.update(allowed)
     log = open_log(*sources)
     try:
-        return run_log_checks(log, virtual=True, min_coverage=min_coverage).lines
+        return run_log_checks(log, virtual=True, min_coverage=min_coverage).findings
     except ScenarioError as error:
         return [Finding("executed again", f"cannot be: {error}", False)]
 

@@ -6,6 +6,9 @@ Invariant: a finding with a problem has not passed; problems beyond `MAX_LISTED_
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from ..errors import LawWithheld
+from ..results import Result
+
 MAX_LISTED_PROBLEMS = 1000
 """Problems that a finding keeps; more are counted."""
 
@@ -43,11 +46,6 @@ class Finding:
     places: list[ProblemPlace] = field(default_factory=list)
     wrong: int = 0
 
-    @property
-    def label(self) -> str:
-        """Its name, as in a line of `trilat verify`."""
-        return self.check
-
     def add(self, file: str, offset: int | None, text: str) -> None:
         """Adds a problem."""
         self.passed = False
@@ -66,7 +64,7 @@ class Finding:
 
     def line(self) -> dict[str, Any]:
         """Returns it as a line, ready for JSON."""
-        return {"label": self.label, "text": self.text, "passed": self.passed, "judged": self.judged}
+        return {"label": self.check, "text": self.text, "passed": self.passed, "judged": self.judged}
 
 
 class Findings(dict[str, Finding]):
@@ -75,3 +73,24 @@ class Findings(dict[str, Finding]):
     def __missing__(self, check: str) -> Finding:
         self[check] = finding = Finding(check)
         return finding
+
+
+class CheckReport(Result):
+    """A result that rests on checks: `findings` has one of each."""
+
+    findings: list[Finding]
+
+    @property
+    def passed(self) -> bool:
+        """True if every check passed."""
+        return all(finding.passed for finding in self.findings)
+
+    @property
+    def exit_code(self) -> int:
+        """1 if a check failed, else that of `LawWithheld` if one was not judged, else 0."""
+        failed = any(finding.judged and not finding.passed for finding in self.findings)
+        return 1 if failed else 0 if self.passed else LawWithheld.exit_code
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per check."""
+        return [finding.line() for finding in self.findings]

@@ -20,11 +20,10 @@ from ..files import open_regular
 from ..net import messages, topics
 from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
-from ..results import Result
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
 from .accounting import LAST, Account, parse_counts
-from .findings import Finding, Findings
+from .findings import CheckReport, Finding, Findings
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -43,7 +42,7 @@ _ACCOUNTS_SINCE = 3
 
 
 @dataclass(frozen=True, repr=False)
-class LogCheckResult(Result):
+class LogCheckResult(CheckReport):
     """Result of a check of files.
 
     Attributes:
@@ -55,11 +54,6 @@ class LogCheckResult(Result):
     files: list[str]
     findings: list[Finding]
     ours: bool
-
-    @property
-    def passed(self) -> bool:
-        """True if every check passed."""
-        return all(finding.passed for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat log check --json`."""

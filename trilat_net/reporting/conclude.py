@@ -13,14 +13,13 @@ import numpy as np
 
 from ..analysis.site_signals import shared_unit
 from ..errors import LawFailed, LawWithheld, RunFailed, ScenarioError
-from ..execution.log_checks import check_log_files, choose_exit_code
+from ..execution.log_checks import check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.accounting import MIN_COVERAGE
-from ..log.findings import Finding
+from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
-from ..results import Result
 from ..scenario.imported_law import allowed_laws
 from ..theory.end_pose import certify_run
 from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
@@ -30,7 +29,7 @@ from .text_table import TextTable
 
 
 @dataclass(frozen=True, repr=False)
-class Conclusion(Result):
+class Conclusion(CheckReport):
     """A finished run: its judgement, checks, a row per site, lines on links, changes, modes and clocks.
 
     `paths` are the log's files, and those that were written.
@@ -39,18 +38,13 @@ class Conclusion(Result):
     verdict: CertificateLine
     table: TextTable
     notes: list[str]
-    lines: list[Finding]
+    findings: list[Finding]
     paths: list[Path]
-
-    @property
-    def passed(self) -> bool:
-        """True if every check passed."""
-        return all(line.passed for line in self.lines)
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
         yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
-        for line in self.lines:
+        for line in self.findings:
             bad = "[red]FAIL[/red]" if line.judged else "[yellow]open[/yellow]"
             mark = "[green]ok[/green]  " if line.passed else bad
             yield MarkedText(mark, f"{line.check}: {line.text}")
@@ -67,7 +61,7 @@ class Conclusion(Result):
     def headline(self) -> str:
         """Returns whether every check passed, and where the page is."""
         words = {0: "passed", LawWithheld.exit_code: "not all was judged"}
-        return f"{words.get(choose_exit_code(self.lines), 'FAILED')}; {self.page}"
+        return f"{words.get(self.exit_code, 'FAILED')}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
@@ -75,7 +69,7 @@ class Conclusion(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat report --json`."""
-        checks = [line.line() for line in self.lines]
+        checks = [finding.line() for finding in self.findings]
         paths = [str(path) for path in self.paths]
         found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
         return {**found, "checks": checks, "paths": paths}

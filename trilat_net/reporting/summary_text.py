@@ -179,7 +179,7 @@ def _first(lines: list[str]) -> list[str]:
 
 def compose_verification(found: LogCheckReport) -> Iterator[Block]:
     """Yields a line per check, and of a log that passed those of its run."""
-    for line in found.lines:
+    for line in found.findings:
         yield MarkedText("", f"{line.check}: {line.text}", failed=not line.passed)
     if found.passed:
         yield from format_run_lines(found.log)
