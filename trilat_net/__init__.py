@@ -54,8 +54,8 @@ if _TYPE_CHECKING:
     from .scenario.describe import describe_scenario as describe_scenario
     from .scenario.law_skeleton import new_law as new_law
     from .scenario.measured_traces import import_trace as import_trace
-    from .studies.trials.trial import trials as trials
-    from .studies.trials.trial_report import check as check
+    from .studies.trials import check as check
+    from .studies.trials import trials as trials
 
     __version__: str
 
@@ -77,8 +77,7 @@ _NAMES = {
     "trilat_net.scenario.describe": "describe_scenario",
     "trilat_net.scenario.law_skeleton": "new_law",
     "trilat_net.scenario.measured_traces": "import_trace",
-    "trilat_net.studies.trials.trial": "trials",
-    "trilat_net.studies.trials.trial_report": "check",
+    "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -44,7 +44,7 @@ def _open(log: AnyLog) -> Log:
 
 def _texts(overrides: Overrides, duration_s: float | None) -> list[str]:
     """Returns overrides as the command line takes them."""
-    from .studies.trials.trial import list_assignments
+    from .studies.trials import list_assignments
 
     listed = overrides if isinstance(overrides, list | tuple) else [overrides]
     texts = list_assignments(overrides) if isinstance(overrides, Mapping) else listed

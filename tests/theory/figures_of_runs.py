@@ -9,7 +9,7 @@ import pytest
 
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, window_quantities
-from trilat_net.studies.trials.measure_run import RunMetrics, measure_virtual_run
+from trilat_net.studies.measure_run import RunMetrics, measure_virtual_run
 
 Overrides = dict[str, Any]
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from sites.demo_session import SessionResult
 
     from ..scenario import Scenario
-    from ..studies.trials.trial import Trial, TrialResult
-    from ..studies.trials.trial_report import TrialReport
+    from ..studies.trials import Trial, TrialReport, TrialResult
     from ..studies.tuning import TuningPlan
 
 
@@ -55,7 +54,7 @@ def test_command(
     from ..files import write_whole
     from ..net.clock import SystemClock
     from ..studies.executor import check_workers
-    from ..studies.trials.trial_report import encode_junit_xml
+    from ..studies.trials import encode_junit_xml
 
     if live and on is not None:
         raise UsageError("--on runs in virtual time: leave it out, or --live")
@@ -94,7 +93,7 @@ def parse_seeds(text: str | None) -> list[int]:
 def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: bool) -> "list[Trial]":
     """Returns all trials; without sources, of every shipped scenario that expects something."""
     from ..scenario import list_shipped, load_scenario
-    from ..studies.trials.trial import trials
+    from ..studies.trials import trials
 
     chosen = sources or [name for name in list_shipped() if load_scenario(name).expect.asks]
     return [
@@ -106,7 +105,7 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
     """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
     from rich.progress import Progress
 
-    from ..studies.trials.trial_report import run_trials
+    from ..studies.trials import run_trials
 
     to_do = Counter(trial.source for trial in batch)
     with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:
@@ -124,8 +123,7 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":
     from ..net.clock import SystemClock
-    from ..studies.trials.trial import evaluate_live_log
-    from ..studies.trials.trial_report import TrialReport
+    from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
     start_ns = clock.monotonic_ns()

@@ -13,6 +13,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.studies.measure_run import measure_virtual_run
 from trilat_net.studies.sweep.sweep_cell import (
     CellClass,
     CellResult,
@@ -20,7 +21,6 @@ from trilat_net.studies.sweep.sweep_cell import (
     classify_end,
     is_conclusive,
 )
-from trilat_net.studies.trials.measure_run import measure_virtual_run
 from trilat_net.theory.end_pose import certify_run
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {

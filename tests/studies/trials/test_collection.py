@@ -14,19 +14,19 @@ from trilat_net.core.two_link_arm import end_effector_jacobian
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import ExpectWindow, window_quantities
+from trilat_net.studies.measure_run import (
+    RunMetrics,
+    SiteStats,
+    WindowStats,
+    measure_log,
+    measure_virtual_run,
+)
 from trilat_net.studies.record_batches import (
     BATCH_RECORDS,
     RecordBatch,
     join_batches,
     run_compiled_in_batches,
     run_in_batches,
-)
-from trilat_net.studies.trials.measure_run import (
-    RunMetrics,
-    SiteStats,
-    WindowStats,
-    measure_log,
-    measure_virtual_run,
 )
 
 RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}

@@ -7,7 +7,7 @@ import pytest
 import trilat_net
 from tests.log_editing import edited, recorded, without
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.trials.trial import Trial, evaluate_live_log
+from trilat_net.studies.trials import Trial, evaluate_live_log
 
 LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
 

@@ -5,9 +5,9 @@ import xml.etree.ElementTree as Xml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.studies.trials.trial import ExpectationResult
-from trilat_net.studies.trials.trial_report import (
+from trilat_net.studies.trials import (
     MAX_FAILURES_SHOWN,
+    ExpectationResult,
     TrialReport,
     encode_junit_xml,
     format_margin,

@@ -13,8 +13,7 @@ import trilat_net
 import trilat_net.studies.trials
 from tests.conftest import OTHER_LAYOUTS
 from trilat_net.scenario import list_shipped, load_scenario
-from trilat_net.studies.trials.trial import TrialResult
-from trilat_net.studies.trials.trial_report import run_trials
+from trilat_net.studies.trials import TrialResult, run_trials
 
 from .results import TOO_MUCH, quick
 

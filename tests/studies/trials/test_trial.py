@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import trilat_net
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
-from trilat_net.studies.trials.trial import list_assignments
+from trilat_net.studies.trials import list_assignments
 
 from .results import TOO_MUCH, quick
 

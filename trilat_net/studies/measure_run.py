@@ -13,16 +13,16 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ...analysis.arm_rows import build_arm_rows
-from ...analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
-from ...analysis.torque_sources import list_walls, wall_force
-from ...core.ticks import BUCKETS_PER_S, NS_PER_S
-from ...core.vectors import Array
-from ...execution.virtual_comparison import find_absent_samples
-from ...log.log_reader import Log
-from ...scenario import Expect, Scenario
-from ...scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
-from ..record_batches import RecordBatch, join_batches, run_in_batches
+from ..analysis.arm_rows import build_arm_rows
+from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
+from ..analysis.torque_sources import list_walls, wall_force
+from ..core.ticks import BUCKETS_PER_S, NS_PER_S
+from ..core.vectors import Array
+from ..execution.virtual_comparison import find_absent_samples
+from ..log.log_reader import Log
+from ..scenario import Expect, Scenario
+from ..scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
+from .record_batches import RecordBatch, join_batches, run_in_batches
 
 
 class Range(NamedTuple):
