@@ -267,6 +267,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     about: str = ""
     assumed: tuple[str, ...] = ()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Takes the text along: a default that is left out of it is known by its identity alone."""
+        return (*super().__reduce__(), {"text": self.text})
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the sites, in order."""

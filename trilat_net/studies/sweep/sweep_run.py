@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,6 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.law_consent import list_imported_laws
 from ...scenario.laws import identify_law
-from ...scenario.scenario_reader import ExperimentText
 from .. import executor
 from ..commands import format_command
 from ..run_journal import RunJournal
@@ -215,14 +213,8 @@ def run_cell(task: CellTask) -> CellRun:
     if plan.judge == "twins":
         outcome = msgspec.structs.replace(outcome, exponent_per_s=sweep_cell.measure_exponent(scenario))
     laws = ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
-    text = sweep_cell.diff_lines(scenario.text, _base_text(plan.written, plan.overrides))
+    text = sweep_cell.diff_lines(scenario.text, plan.base.text)
     return CellRun(cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome)
-
-
-@lru_cache(maxsize=4)
-def _base_text(written: ExperimentText, overrides: tuple[str, ...]) -> str:
-    """Returns the text of a plan's base; one that came from another process writes its defaults out."""
-    return written.load(overrides).text
 
 
 def estimate_sweep(
