@@ -22,7 +22,7 @@ from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site
 from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
-from trilat_net.studies.bench import bench_cell, bench_gains, bench_run, bench_tasks
+from trilat_net.studies.bench import bench_plan, bench_results, bench_run, bench_tasks
 from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
 from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
 from trilat_net.theory import (
@@ -49,15 +49,15 @@ MOST_RANDOM_ERROR = math.sqrt(
     (measured_impedance.MIN_COHERENCE**-2 - 1.0) / (2.0 * measured_impedance.MIN_SEGMENTS)
 )
 STATED: list[tuple[str, str, float, float]] = [
-    ("bench.md", "16 candidates per gain", 16, bench_gains.TUNING_BUDGET),
-    ("bench.md", "with 1.5 times the delay", 1.5, bench_gains.TUNING_MARGIN),
-    ("bench.md", "faster than 5 rad/s", 5, bench_cell.BOUND_RAD_S),
-    ("bench.md", "is at least -1 mJ", -1, 1e3 * bench_cell.PASSIVE_J),
-    ("bench.md", "less than 2 s before the end", 2, bench_cell.REST_S),
-    ("bench.md", "at most 100 s", 100, bench_cell.LONGEST_S),
+    ("bench.md", "16 candidates per gain", 16, bench_plan.TUNING_BUDGET),
+    ("bench.md", "with 1.5 times the delay", 1.5, bench_plan.TUNING_MARGIN),
+    ("bench.md", "faster than 5 rad/s", 5, bench_run.BOUND_RAD_S),
+    ("bench.md", "is at least -1 mJ", -1, 1e3 * bench_results.PASSIVE_J),
+    ("bench.md", "less than 2 s before the end", 2, bench_run.REST_S),
+    ("bench.md", "at most 100 s", 100, bench_results.LONGEST_S),
     ("bench.md", "40 round trips", 40, bench_tasks.ROUND_TRIPS),
-    ("bench.md", "less than 1 N", 1, bench_cell.LEAST_CONTACT_N),
-    ("bench.md", "none of fewer than 20 seeds", 20, bench_run.LEAST_SEEDS),
+    ("bench.md", "less than 1 N", 1, bench_results.LEAST_CONTACT_N),
+    ("bench.md", "none of fewer than 20 seeds", 20, bench_results.LEAST_SEEDS),
     ("bench.md", "round trips of 68, 272 and 1088 ms", 1088, bench_tasks.TUNED_ROUND_TRIPS_MS[-1]),
     ("certificate.md", "end of each of 16 windows", 16, twins.WINDOWS),
     ("certificate.md", "a difference above 1e-4 is made small again", 1e-4, twins.LARGEST),

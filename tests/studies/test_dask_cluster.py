@@ -19,6 +19,7 @@ from trilat_net.studies import dask_cluster
 from trilat_net.studies.dask_cluster import WorkerRequirements, describe_worker, find_unfit
 from trilat_net.studies.executor import open_worker_pool
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
+from trilat_net.studies.sweep.sweep_run import RESULTS_FILE
 
 from .sweep.quick import SHORT
 from .sweep.quick import asked as plan
@@ -86,8 +87,8 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
     )
     assert killed.wait(10) == -signal.SIGKILL
     assert alive_at[0] < count
-    assert (shared.speed.runs, shared.speed.jobs) == (count, 2)
-    assert shared.folder.results.read_bytes() == alone.folder.results.read_bytes()
+    assert (shared.runs, shared.jobs) == (count, 2)
+    assert (shared.folder.path / RESULTS_FILE).read_bytes() == (alone.folder.path / RESULTS_FILE).read_bytes()
 
 
 def workers_of(cluster: Cluster) -> int:

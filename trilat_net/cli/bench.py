@@ -24,7 +24,7 @@ _option = partial(typer.Option, rich_help_panel="Gains")
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
     """Tunes laws of a study at all delays, and writes their gains into the file of the suite."""
-    from ..studies.bench.bench_gains import GAINS_FILE, tune_laws, write_gains
+    from ..studies.bench.bench_plan import GAINS_FILE, tune_laws, write_gains
     from ..studies.bench.bench_tasks import STUDIES
 
     asked = STUDIES[study].laws
@@ -91,7 +91,7 @@ def bench_command(
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
     from ..studies.bench.bench_figures import write_bench
-    from ..studies.bench.bench_gains import find_stale
+    from ..studies.bench.bench_plan import find_stale
     from ..studies.commands import format_command
     from ..studies.executor import check_workers
 

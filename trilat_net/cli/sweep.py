@@ -5,7 +5,7 @@ interrupted prints the command that resumes it.
 """
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,11 +22,9 @@ from .studies import parse_seeds, run_apart
 if TYPE_CHECKING:
     from ..scenario import Scenario
     from ..studies.sweep import FinishedSweep
-    from ..studies.sweep.live_confirmation import LiveSession
     from ..studies.sweep.margin_search import SearchRange
     from ..studies.sweep.sweep_plan import SweepPlan
-    from ..studies.sweep.sweep_results import SweepResults
-    from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder
+    from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder, SweepResults
 
 
 _option = partial(typer.Option, rich_help_panel="Maps and edges")
@@ -91,12 +89,21 @@ def _search_margins(
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
     """Runs `count` cells on each side of the edges of a sweep live, and compares verdicts."""
-    from ..studies.sweep.live_confirmation import choose_cells_near_edges, confirm_cell
-    from ..studies.sweep.map_page import tabulate_confirmations
+    from ..studies.sweep.live_confirmation import (
+        choose_cells_near_edges,
+        confirm_cell,
+        tabulate_confirmations,
+    )
 
     keys = [one.key for one in results.plan.axes]
     rows = choose_cells_near_edges(results.rows, keys, count)
-    found = [confirm_cell(row, partial(_run_live, results.plan.base.name)) for row in rows]
+    name = f"confirm-{results.plan.base.name}"
+
+    def run(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
+        outcome = run_apart(scenario, cell, f"{name}-{cell}")
+        return outcome.log, outcome.problems
+
+    found = [confirm_cell(row, run) for row in rows]
     terminal.out.print()
     terminal.print_table(tabulate_confirmations(found, keys))
     same = sum(one.same for one in found)
@@ -105,92 +112,78 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
         raise typer.Exit(1)
 
 
-def _run_live(name: str, scenario: "Scenario", cell: str) -> "LiveSession":
-    from ..studies.sweep.live_confirmation import LiveSession
-
-    outcome = run_apart(scenario, cell, f"confirm-{name}-{cell}")
-    return LiveSession(outcome.log, outcome.problems)
-
-
 _LINES = 10
 """Lines of progress, where no terminal shows a bar."""
 
 
-def _start_sweep(
-    asked: "SweepPlan", output: Path | None, jobs: int | None, on: str | None, *, yes: bool
+def _run_sweep(
+    asked: "SweepPlan | None", path: Path | None, jobs: int | None, on: str | None, *, yes: bool
 ) -> "FinishedSweep":
-    """Runs a sweep, or continues it if its folder holds it."""
-    from ..studies.sweep.sweep_run import PLAN_FILE, prepare_sweep_folder
+    """Runs a sweep, or what is left of the one in a folder, and prints its summary.
 
-    if output is not None and (output / PLAN_FILE).exists():
-        return _resume_sweep(prepare_sweep_folder(asked, output), jobs, on, yes=yes)
-    _print_plan(asked)
-    expected = _estimate(asked, [], jobs, on, yes=yes)
-    return _run_in_folder(prepare_sweep_folder(asked, output), jobs, on, expected)
-
-
-def _resume_sweep(folder: "SweepFolder", jobs: int | None, on: str | None, *, yes: bool) -> "FinishedSweep":
-    with folder.journal() as journal:
-        done = list(journal.done)
-    _print_plan(folder.plan)
-    terminal.print_text(f"  {len(done)} runs are done already")
-    return _run_in_folder(folder, jobs, on, _estimate(folder.plan, done, jobs, on, yes=yes))
-
-
-def _estimate(
-    asked: "SweepPlan", done: list[tuple[int, int]], jobs: int | None, on: str | None, *, yes: bool
-) -> "DurationEstimate":
-    """Returns how long a sweep will take; refuses one that is too large."""
+    One that is too large is refused before it has a folder.
+    """
     from ..studies.executor import count_workers
-    from ..studies.sweep.sweep_run import estimate_sweep, refuse_oversized_sweep
+    from ..studies.sweep.sweep_run import (
+        PLAN_FILE,
+        RESULTS_FILE,
+        describe_sweep_plan,
+        describe_sweep_speed,
+        estimate_sweep,
+        format_wall_time,
+        open_sweep_folder,
+        prepare_sweep_folder,
+        refuse_oversized_sweep,
+    )
 
+    begun, plan, done = None, asked, []
+    if path is not None and (plan is None or (path / PLAN_FILE).exists()):
+        begun = open_sweep_folder(path, plan)
+        plan, done = begun.plan, begun.read_done()
+    assert plan is not None
+    _print_lines(describe_sweep_plan(plan))
+    if begun is not None:
+        terminal.print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
-    expected = estimate_sweep(asked, done, workers)
+    expected = estimate_sweep(plan, done, workers)
     if not yes:
-        refuse_oversized_sweep(asked, expected, workers)
-    return expected
-
-
-def _print_plan(asked: "SweepPlan") -> None:
-    from ..studies.sweep.sweep_results import describe_sweep_plan
-
-    for line in describe_sweep_plan(asked):
-        terminal.print_text(line)
+        refuse_oversized_sweep(plan, expected, workers)
+    folder = begun or prepare_sweep_folder(plan, path)
+    if expected.seconds:
+        about = format_wall_time(expected.seconds)
+        terminal.print_text(f"  about {about}, by some of its cells; into {folder.path}")
+    swept = _run_in_folder(folder, jobs, on, expected)
+    if not (expected.entries or swept.runs):
+        terminal.out.print("nothing was left to run")
+    speed = [describe_sweep_speed(swept)] if swept.runs else []
+    _print_results(swept.results, [*speed, f"results: {folder.path / RESULTS_FILE}"], folder.path)
+    return swept
 
 
 def _run_in_folder(
     folder: "SweepFolder", jobs: int | None, on: str | None, expected: "DurationEstimate"
 ) -> "FinishedSweep":
-    """Runs a sweep in its folder and prints its summary; on Ctrl-C, the command that resumes it."""
+    """Runs a sweep in its folder; on Ctrl-C, prints the command that resumes it."""
     from ..studies.sweep import run_sweep
-    from ..studies.sweep.sweep_run import describe_sweep_speed, format_wall_time
 
-    if expected.seconds:
-        terminal.print_text(
-            f"  about {format_wall_time(expected.seconds)}, by some of its cells; into {folder.path}"
-        )
     try:
         with show_progress("sweeping", terminal.print_text) as progress:
-            swept = run_sweep(folder, jobs, progress, expected.entries, on)
+            return run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
-        with folder.journal() as journal:
-            done = len(journal.done)
         resume = f"trilat sweep --resume {shlex.quote(str(folder.path))}"
-        terminal.err.print(
-            f"{done} runs are done and kept; go on with: {resume}", markup=False, soft_wrap=True
-        )
+        kept = f"{len(folder.read_done())} runs are done and kept; go on with: {resume}"
+        terminal.err.print(kept, markup=False, soft_wrap=True)
         raise
-    if not (expected.entries or swept.speed.runs):
-        terminal.out.print("nothing was left to run")
-    speed = [describe_sweep_speed(swept.speed)] if swept.speed.runs else []
-    _print_results(swept.results, [*speed, f"results: {swept.folder.results}"], swept.folder.path)
-    return swept
 
 
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
-    from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
+    from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
 
-    for line in [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]:
+    _print_lines([*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))])
+
+
+def _print_lines(lines: Iterable[str]) -> None:
+    for line in lines:
         terminal.print_text(line)
 
 
@@ -223,7 +216,7 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_results import build_reproduce_command
+    from ..studies.sweep.sweep_run import build_reproduce_command
 
     results = read_results(path)
     if as_json:
@@ -319,9 +312,9 @@ def sweep_command(
 
     Finished runs are kept, however the sweep ends: --resume, or the same command with the same -o, continues.
     """
-    from ..studies.sweep import open_sweep_folder, plan_sweep
+    from ..studies.sweep import plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
-    from ..studies.sweep.sweep_results import require_polars
+    from ..studies.sweep.sweep_run import require_polars
 
     require_polars()
     given = _check_modes(options.given_options(context))
@@ -334,7 +327,7 @@ def sweep_command(
         if scenario is not None or cell is not None:
             raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
         with terminal.lines_aside(as_json):
-            swept = _resume_sweep(open_sweep_folder(resume), jobs, on, yes=yes)
+            swept = _run_sweep(None, resume, jobs, on, yes=yes)
     elif cell is not None:
         if scenario is None:
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
@@ -352,7 +345,7 @@ def sweep_command(
         if within is not None:
             return _search_margins(asked, within, output, jobs, on, as_json=as_json)
         with terminal.lines_aside(as_json):
-            swept = _start_sweep(asked, output, jobs, on, yes=yes)
+            swept = _run_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
         with terminal.lines_aside(as_json):
             _draw_map(swept.results, swept.folder.path, width, jobs, on)
@@ -371,7 +364,7 @@ def _show_results(
     confirm: int | None,
     as_json: bool,
 ) -> None:
-    from ..studies.sweep import read_results
+    from ..studies.sweep.sweep_run import describe_sweep_plan, read_results
 
     results = read_results(path)
     with terminal.lines_aside(as_json):
@@ -380,7 +373,7 @@ def _show_results(
         elif mapped:
             _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
         else:
-            _print_plan(results.plan)
+            _print_lines(describe_sweep_plan(results.plan))
             _print_results(results, [], path)
     if as_json:
         terminal.print_json(results.to_dict())

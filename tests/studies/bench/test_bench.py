@@ -17,15 +17,10 @@ from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.bench import BenchResults, bench_plan, plan_bench, prepare_bench_folder, run_bench
-from trilat_net.studies.bench.bench_cell import (
-    LEAST_CONTACT_N,
-    BenchRun,
-    BenchRunTask,
-    find_least_energy,
-    run_bench_task,
-)
-from trilat_net.studies.bench.bench_gains import (
+from trilat_net.studies.bench.bench_plan import (
     KNOWLEDGE,
+    BenchCell,
+    BenchPlan,
     choose_round_trip,
     find_stale,
     name_settings,
@@ -33,9 +28,15 @@ from trilat_net.studies.bench.bench_gains import (
     tune_laws,
     write_gains,
 )
-from trilat_net.studies.bench.bench_plan import BenchCell, BenchPlan
-from trilat_net.studies.bench.bench_run import BenchPlace
-from trilat_net.studies.bench.bench_tables import build_bench_page, encode_places, encode_runs
+from trilat_net.studies.bench.bench_results import (
+    LEAST_CONTACT_N,
+    BenchPlace,
+    BenchRun,
+    build_bench_page,
+    encode_places,
+    encode_runs,
+)
+from trilat_net.studies.bench.bench_run import BenchRunTask, find_least_energy, run_bench_task
 from trilat_net.studies.bench.bench_tasks import (
     LINKS,
     SHORTER_REACH,

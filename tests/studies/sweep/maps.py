@@ -5,7 +5,7 @@ from itertools import product
 from typing import Any
 
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.sweep.map_plane import MapPlane, build_plane
+from trilat_net.studies.sweep.stability_map import MapPlane, build_plane
 from trilat_net.studies.sweep.sweep_cell import CellClass
 
 P_D = load_scenario("p_d_margin")

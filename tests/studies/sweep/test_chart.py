@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.map_plane import PlaneAxis
 from trilat_net.studies.sweep.stability_map import (
     PanelScenarios,
+    PlaneAxis,
     StabilityCriterion,
     build_stability_map,
     evaluate_criterion,
@@ -25,7 +25,7 @@ from trilat_net.studies.sweep.stability_map import (
     trace_linear_analysis,
 )
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_results import SweepResults
+from trilat_net.studies.sweep.sweep_run import SweepResults
 from trilat_net.theory import GrowthColumn, compute_growth_column, iterate_linear_edges
 
 from .maps import KEYS, rows

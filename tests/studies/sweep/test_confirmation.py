@@ -1,6 +1,6 @@
 """Cells beside edges, run once more: which are taken, and what counts as the same."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,11 @@ from trilat_net.execution import virtual
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep import sweep_cell
 from trilat_net.studies.sweep.live_confirmation import (
-    LiveSession,
     SessionRunner,
     choose_cells_near_edges,
     confirm_cell,
+    tabulate_confirmations,
 )
-from trilat_net.studies.sweep.map_page import tabulate_confirmations
 from trilat_net.studies.sweep.sweep_cell import CellClass
 
 from .maps import KEYS, Row, by_the_line, rows
@@ -46,11 +45,11 @@ def cell(scenario: Scenario) -> Row:
 def runner(folder: Path, *problems: str, instead: Scenario | None = None) -> SessionRunner:
     """A network that is none: sessions are runs in virtual time."""
 
-    def run(scenario: Scenario, name: str) -> LiveSession:
+    def run(scenario: Scenario, name: str) -> tuple[Path, Sequence[str]]:
         log = folder / f"{name}.mcap"
         with log.open("wb") as stream:
             virtual.write_virtual_log(instead or scenario, stream)
-        return LiveSession(log, problems)
+        return log, problems
 
     return run
 
@@ -74,9 +73,9 @@ def test_a_session_is_as_long_as_the_cell_ran(tmp_path: Path) -> None:
     """Also where the cell had been extended; one that diverged has half a second more, to get there."""
     asked: list[float] = []
 
-    def run(scenario: Scenario, _: str) -> LiveSession:
+    def run(scenario: Scenario, _: str) -> tuple[Path, Sequence[str]]:
         asked.append(scenario.duration_s)
-        return LiveSession(tmp_path / "none.mcap", ["failed"])
+        return tmp_path / "none.mcap", ["failed"]
 
     for changes in ({"ran_s": 8.0}, {"ran_s": 2.5, "diverged_s": 2.5}):
         confirm_cell({**cell(CALM), **changes}, run)
@@ -88,14 +87,14 @@ def test_what_failed_confirms_nothing(tmp_path: Path) -> None:
     found = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
     assert (found.same, found.live, found.text) == (False, None, "s was killed by SIGKILL")
 
-    def torn(_: Scenario, name: str) -> LiveSession:
+    def torn(_: Scenario, name: str) -> tuple[Path, Sequence[str]]:
         (tmp_path / name).write_bytes(b"no log")
-        return LiveSession(tmp_path / name, [])
+        return tmp_path / name, []
 
     found = confirm_cell(row, torn)
     assert (found.same, found.live) == (False, None)
     assert "cell-3" in found.text
-    missing = confirm_cell(row, lambda *_: LiveSession(tmp_path / "missing.mcap", []))
+    missing = confirm_cell(row, lambda *_: (tmp_path / "missing.mcap", []))
     assert (missing.same, missing.log) == (False, None)
 
 
@@ -183,9 +182,9 @@ def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(scenario: Scenario
 
     from sites.demo_session import run_demo
 
-    def run(wanted: Scenario, _: str) -> LiveSession:
+    def run(wanted: Scenario, _: str) -> tuple[Path, Sequence[str]]:
         outcome = run_demo(wanted, tmp_path, Console(quiet=True))
-        return LiveSession(outcome.log, outcome.problems)
+        return outcome.log, outcome.problems
 
     found = confirm_cell(cell(scenario), run)
     assert found.same, found.text

@@ -12,10 +12,14 @@ from trilat_net.errors import UsageError
 from trilat_net.reporting.figure_size import make_print_size
 from trilat_net.studies.sweep import SweepResults, open_sweep_folder, prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.map_page import draw_stability_map, tabulate_edges
-from trilat_net.studies.sweep.map_plane import build_plane
-from trilat_net.studies.sweep.stability_map import StabilityMap, build_stability_map, build_sweep_command
+from trilat_net.studies.sweep.stability_map import (
+    StabilityMap,
+    build_plane,
+    build_stability_map,
+    build_sweep_command,
+)
 from trilat_net.studies.sweep.sweep_plan import plan_from_json, plan_sweep
-from trilat_net.studies.sweep.sweep_results import read_results
+from trilat_net.studies.sweep.sweep_run import RESULTS_FILE, read_results
 from trilat_net.theory import compute_growth_column
 
 from .maps import KEYS, P_D, rows
@@ -114,8 +118,8 @@ def test_an_interrupted_sweep_by_twins_goes_on_to_the_same_bytes(tmp_path: Path)
     again = open_sweep_folder(folder.path)
     assert again.plan.judge == "twins"
     swept = run_sweep(again, 1)
-    assert swept.speed.runs == 2
-    assert again.results.read_bytes() == whole.folder.results.read_bytes()
+    assert swept.runs == 2
+    assert (again.path / RESULTS_FILE).read_bytes() == (whole.folder.path / RESULTS_FILE).read_bytes()
 
 
 def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> None:

@@ -13,14 +13,10 @@ from hypothesis import strategies as st
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_layout import collect_provenance
-from trilat_net.studies.run_journal import RunJournal
-from trilat_net.studies.sweep import sweep_run as folders
+from trilat_net.studies import study_folder as folders
+from trilat_net.studies.study_folder import RunJournal
 from trilat_net.studies.sweep.sweep_cell import CellRun
-from trilat_net.studies.sweep.sweep_run import (
-    PLAN_FILE,
-    open_sweep_folder,
-    prepare_sweep_folder,
-)
+from trilat_net.studies.sweep.sweep_run import PLAN_FILE, open_sweep_folder, prepare_sweep_folder
 
 from .quick import DAMPING, SHORT, asked, outcome_of
 
@@ -111,7 +107,7 @@ def entry(cell: int, seed: int = 1) -> CellRun:
 
 
 def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
-    return RunJournal(path, sweep, CellRun, folders.build_resume_hint(path.parent))
+    return RunJournal(path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent)))
 
 
 def written(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:

@@ -12,7 +12,6 @@ from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import UsageError
 from trilat_net.scenario import parse_scenario
 from trilat_net.studies.sweep import margin_search, sweep_cell
-from trilat_net.studies.sweep.map_plane import StableInterval
 from trilat_net.studies.sweep.margin_search import (
     SCAN_POINTS,
     GridPointMargin,
@@ -24,6 +23,7 @@ from trilat_net.studies.sweep.margin_search import (
     search_key_margin,
     search_margins,
 )
+from trilat_net.studies.sweep.stability_map import StableInterval
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_net.studies.sweep.sweep_plan import SweepPlan, plan_sweep
 

@@ -20,8 +20,7 @@ from trilat_net.studies.sweep.map_page import (
     tabulate_edges,
     write_map,
 )
-from trilat_net.studies.sweep.map_plane import CELL_CLASSES, MapPlane
-from trilat_net.studies.sweep.stability_map import MapLine, StabilityMap
+from trilat_net.studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
 from trilat_net.studies.sweep.sweep_cell import CellClass
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
@@ -184,7 +183,7 @@ def test_nothing_of_matplotlib_is_left_changed() -> None:
 
 
 def test_a_place_that_did_not_run_is_no_verdict() -> None:
-    from trilat_net.studies.sweep.map_plane import build_plane
+    from trilat_net.studies.sweep.stability_map import build_plane
 
     from .maps import KEYS, P_D
 

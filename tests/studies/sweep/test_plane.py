@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.scenario_reader import list_shipped
-from trilat_net.studies.sweep.map_plane import (
+from trilat_net.studies.sweep.stability_map import (
     CELL_CLASSES,
     PlaneAxis,
     StableInterval,

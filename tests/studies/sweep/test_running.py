@@ -6,16 +6,17 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.studies.sweep import (
-    open_sweep_folder,
-    prepare_sweep_folder,
-    run_sweep,
-    sweep_cell,
-)
+from trilat_net.studies.sweep import open_sweep_folder, prepare_sweep_folder, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_results import describe_sweep_plan, summarize_sweep
-from trilat_net.studies.sweep.sweep_run import DurationEstimate, estimate_sweep, refuse_oversized_sweep
+from trilat_net.studies.sweep.sweep_run import (
+    RESULTS_FILE,
+    DurationEstimate,
+    describe_sweep_plan,
+    estimate_sweep,
+    refuse_oversized_sweep,
+    summarize_sweep,
+)
 
 from .quick import DELAYS, Judge, asked
 
@@ -32,9 +33,9 @@ def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: P
     """The judge of the package, in this process and in two others."""
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
     alone, others = (run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2))
-    assert alone.folder.results.read_bytes() == others.folder.results.read_bytes()
+    assert (alone.folder.path / RESULTS_FILE).read_bytes() == (others.folder.path / RESULTS_FILE).read_bytes()
     assert [row["cell"] for row in others.results.rows] == [0, 0, 1, 1, 2, 2]
-    assert (alone.speed.runs, others.speed.jobs) == (6, 2)
+    assert (alone.runs, others.jobs) == (6, 2)
 
 
 class _StopError(Exception):
@@ -43,7 +44,8 @@ class _StopError(Exception):
 
 def test_what_is_done_is_not_done_again_wherever_it_was_interrupted(tmp_path: Path, judge: Judge) -> None:
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
-    whole = run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1).folder.results.read_bytes()
+    run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
+    whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
     texts = judge.texts.copy()
     assert len(texts) == 24
     judge.texts.clear()
@@ -56,14 +58,14 @@ def test_what_is_done_is_not_done_again_wherever_it_was_interrupted(tmp_path: Pa
 
         with pytest.raises(_StopError):
             run_sweep(folder, 1, stopped)
-        assert not folder.results.exists()
+        assert not (folder.path / RESULTS_FILE).exists()
         folder = open_sweep_folder(folder.path)
     swept = run_sweep(folder, 1)
-    assert folder.results.read_bytes() == whole
+    assert (folder.path / RESULTS_FILE).read_bytes() == whole
     assert Counter(judge.texts) == Counter(texts)
-    assert run_sweep(folder, 1).speed.runs == 0
+    assert run_sweep(folder, 1).runs == 0
     assert Counter(judge.texts) == Counter(texts)
-    assert 0 < swept.speed.runs < 24
+    assert 0 < swept.runs < 24
 
 
 def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -> None:

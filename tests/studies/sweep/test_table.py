@@ -13,7 +13,7 @@ from trilat_net.errors import UsageError
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, read_results, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_results import (
+from trilat_net.studies.sweep.sweep_run import (
     GRID_POINTS_FILE,
     GridPoint,
     build_result_rows,

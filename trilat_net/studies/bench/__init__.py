@@ -12,6 +12,7 @@ In a folder that holds the same suite, `run_bench` goes on from its journal.
 """
 
 from .bench_plan import BenchPlan, plan_bench
-from .bench_run import BenchResults, prepare_bench_folder, run_bench
+from .bench_results import BenchResults
+from .bench_run import prepare_bench_folder, run_bench
 
 __all__ = ["BenchPlan", "BenchResults", "plan_bench", "prepare_bench_folder", "run_bench"]

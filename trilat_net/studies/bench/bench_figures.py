@@ -18,8 +18,7 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.figure_size import make_print_size
 from ..intervals import MeanInterval
-from .bench_run import BenchPlace, BenchResults
-from .bench_tables import build_bench_page, encode_places, encode_runs, list_laws, name_law
+from .bench_results import BenchPlace, BenchResults, build_bench_page, encode_places, encode_runs, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
@@ -39,9 +38,8 @@ _NONE = "#a23b53"
 def draw_bench(results: BenchResults, name: str) -> Figure:
     """Returns a figure by its name in `FIGURES_OF_BENCH`."""
     label, quantity = FIGURES_OF_BENCH[name]
-    ran = dict.fromkeys(cell.task for cell in results.plan.cells)
-    tasks = [task for task in ran if quantity != "stiffness_n_m" or task == "contact"]
-    links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
+    tasks = [task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"]
+    links = results.plan.links
     fields = {task: _collect(results, task, links, quantity) for task in tasks}
     known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
     scale: Any = Normalize(0.0, 1.0)
@@ -65,7 +63,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
 
 def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
     """Returns the laws that ran in a task."""
-    return [one for one in list_laws(results) if any(results.of(task, one[0]))]
+    return [one for one in results.plan.laws if any(results.of(task, one[0]))]
 
 
 def _collect(results: BenchResults, task: str, links: list[str], quantity: str) -> Array:

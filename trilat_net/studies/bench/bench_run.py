@@ -1,50 +1,226 @@
-"""Runs the suite: the folder with its journal, the missing runs, and the results by place.
+"""Runs the suite: a run's judgement by its end and by its twins, its numbers, the folder and its journal.
 
-Invariant: results are a function of the plan; the number of processes, their order and the number of
-interruptions do not enter. A run that is in the journal is never made again; one with other gains is another
-run. A folder belongs to one version of the program on one arithmetic.
+Invariant: a run's numbers are a function of its scenario. Errors, efforts and forces are those of the log
+that its command makes, over the time of its task; what is judged lasts as long as the judgement needs. The
+number of processes, their order and the number of interruptions do not enter. A run that is in the journal is
+never made again; one with other gains is another run. A folder belongs to one version of the program on one
+arithmetic.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from ...analysis.run_end import Stability
-from ...core.fingerprint import compute_fingerprint
+from ...analysis.arm_rows import build_arm_rows
+from ...analysis.dominance_history import evaluate_ramps
+from ...analysis.run_end import THROWN_RAD, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.torque_sources import list_walls, wall_force
+from ...analysis.twin_growth import TwinGrowth, judge_end_by_twins, measure_virtual_twins
+from ...core.ticks import NS_PER_S
+from ...core.vectors import Array
 from ...errors import UsageError
 from ...files import make_results_folder, write_whole
-from ...log.log_layout import collect_provenance
-from ...results import Result
-from ..commands import format_command
+from ...scenario import Scenario
+from ...scenario.operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..run_journal import RunJournal
-from .bench_cell import LONGEST_S, BenchRun, BenchRunTask, name_run, run_bench_task
-from .bench_plan import BenchCell, BenchPlan
+from ..record_batches import RecordBatch, join_batches, run_compiled_in_batches
+from ..study_folder import StudyFolder, build_resume_hint, describe_program
+from ..tuning.candidate import load_tuning_scenario
+from .bench_plan import BenchCell, BenchPlan, name_settings
+from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
+from .bench_tasks import SHORTER_REACH, TASKS
+
+SLAVE, USER = "s", "m1"
+BOUND_RAD_S = 5.0
+"""No joint of a bounded run is faster, rad/s, and none further from its start than `THROWN_RAD`."""
+REST_S = 2.0
+"""A run has converged if its arms stay within `SETTLED_ERROR_RAD` of their last pose for so long, s."""
+TWINS = 3
+"""Twins of a run of the first seed, pushed at all joints, at single ones, and in estimates; else one."""
+TIME_CONSTANTS = 6.0
+"""A run lasts for so many of its slowest time constants, but for no longer than `LONGEST_S`."""
+
+
+class BenchRunTask(NamedTuple):
+    """One run to be made: picklable, with all that a worker needs; `to_s` as that of a run."""
+
+    cell: BenchCell
+    seed: int
+    to_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.cell.name}, seed {self.seed}"
+
+
+class _JudgedRun(NamedTuple):
+    """A run with all of its records, and its judgement."""
+
+    scenario: Scenario
+    records: dict[str, RecordBatch]
+    end: RunEnd
+    twins: TwinGrowth
+    stability: Stability
+    text: str
+
+
+def run_bench_task(task: BenchRunTask) -> BenchRun:
+    """Makes one run, in whatever process."""
+    cell, scenario = task.cell, task.cell.build(task.seed).scenario
+    twins = TWINS if task.seed == cell.seeds[0] else 1
+    judged = _run(scenario, task.to_s or scenario.duration_s, twins)
+    if not task.to_s:
+        judged = _lengthen(judged, twins)
+    made = BenchRun(
+        cell.name,
+        cell.inputs,
+        task.seed,
+        scenario.random,
+        scenario.sha256,
+        judged.stability,
+        judged.end.behaviour,
+        judged.text,
+    )
+    made = msgspec.structs.replace(made, length_s=judged.scenario.duration_s, to_s=task.to_s)
+    if judged.end.diverged_at_s is None:
+        made = _measure(made, judged, TASKS[cell.task].duration_s)
+        if cell.task == "contact" and not made.masked:
+            made = msgspec.structs.replace(made, stiffness_n_m=_find_stiffness(task, judged))
+    return made
+
+
+def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
+    """Makes a run of so many seconds and its twins, and judges both."""
+    scenario = msgspec.structs.replace(scenario, duration_s=length_s)
+    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
+    records = {name: join_batches(blocks) for name, blocks in kept.items()}
+    trace = RunTrace(
+        [one.reduce() for one in records.values()], [one.tau_x[-1] for one in records.values()], diverged_s
+    )
+    end, growth = classify_run_end(scenario, trace), TwinGrowth("none were asked for")
+    if diverged_s is None and twins:
+        growth = measure_virtual_twins(scenario, end, length_s, twins)
+    found = judge_end_by_twins(end, growth, settles=None, rises=False)
+    return _JudgedRun(scenario, records, end, growth, found.stability, found.reason or end.text)
+
+
+def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
+    """Returns a run that lasts for its slowest time constants; not stable is what twice as long is, too."""
+    length_s = judged.scenario.duration_s
+    wanted_s = TIME_CONSTANTS * _find_time_constant_s(judged)
+    if judged.stability is Stability.OPEN or wanted_s < LONGEST_S:
+        wanted_s = min(wanted_s, LONGEST_S)
+        if length_s < wanted_s and judged.end.diverged_at_s is None:
+            length_s = float(math.ceil(wanted_s))
+            judged = _run(judged.scenario, length_s, twins)
+    if judged.stability is Stability.NOT_STABLE and judged.end.diverged_at_s is None:
+        return _run(judged.scenario, 2.0 * length_s, twins)
+    return judged
+
+
+def _find_time_constant_s(judged: _JudgedRun) -> float:
+    """Returns the slowest time constant that a run and its twins show, s; 0 where nothing falls."""
+    rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
+    rates += [one.rate_per_s for one in judged.twins.pushes if one.factor > 0.0]
+    return max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
+
+
+def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
+    scenario, whole = judged.scenario, judged.records
+    records = {name: one.between(0, round(duration_s * NS_PER_S)) for name, one in whole.items()}
+    efforts, hands, walls = [], [], []
+    for name, record in records.items():
+        spec, arm = scenario.sites[name], build_arm_rows(scenario, name)
+        efforts.append(np.mean((record.tau - arm.gravity_torque(record.q)) ** 2))
+        if spec.hands:
+            hands.append(np.mean(_find_hand_torque(scenario, name, record) ** 2))
+        tip, t_s = arm.place_end_effector(record.q, record.qd), record.t_ns / NS_PER_S
+        walls += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
+    starts = [np.abs(one.q - scenario.sites[name].q0_rad).max() for name, one in whole.items()]
+    fastest = max(np.abs(one.qd).max() for one in whole.values())
+    return msgspec.structs.replace(
+        made,
+        bounded=bool(fastest <= BOUND_RAD_S and max(starts) <= THROWN_RAD),
+        energy_j=find_least_energy(whole),
+        settled_s=_find_settled_s(whole),
+        error_rad=_follow_error_rad(scenario, records),
+        effort_nm=float(np.sqrt(np.mean(efforts))),
+        hand_nm=float(np.sqrt(np.mean(hands))),
+        wall_n=max((float(one[3 * len(one) // 4 :].mean()) for one in walls), default=None),
+        force_peak_n=max((float(one.max()) for one in walls), default=None),
+    )
+
+
+def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
+    """Returns the torque of the operators ON an arm, without the friction of its joints, shape (K, n)."""
+    dampers = (one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment))
+    torque: Array = sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
+    return torque
+
+
+def find_least_energy(records: dict[str, RecordBatch]) -> float:
+    """Returns the least over time of sum_i int -tau_x' qd dt: what came from outside until then, J.
+
+    All arms begin at rest, so that of a passive network with passive controllers none is below zero.
+    """
+    power = sum(-np.sum(one.tau_x * one.qd, axis=1) for one in records.values())
+    h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
+    return float(np.cumsum(np.concatenate([[0.0], 0.5 * h_s * (power[1:] + power[:-1])])).min())
+
+
+def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
+    """Returns since when every joint stays where it ends, s; None if that is too short a time ago."""
+    last_s = 0.0
+    for record in records.values():
+        away = np.flatnonzero(np.abs(record.q - record.q[-1]).max(axis=1) > SETTLED_ERROR_RAD)
+        last_s = max(last_s, record.t_ns[away[-1]] / NS_PER_S if len(away) else 0.0)
+    return float(last_s) if last_s <= records[SLAVE].t_ns[-1] / NS_PER_S - REST_S else None
+
+
+def _find_stiffness(task: BenchRunTask, far: _JudgedRun) -> float | None:
+    """Returns by how much more the user has to push to get so much further, along the wall's normal, N/m."""
+    built = task.cell.build(task.seed)
+    short = load_tuning_scenario(built.source, (*built.overrides, *name_settings(SHORTER_REACH)))
+    near = _run(short.scenario, far.scenario.duration_s, twins=0)
+    if None in (_find_settled_s(near.records), _find_settled_s(far.records)):
+        return None
+    (near_m, near_n), (far_m, far_n) = _find_push(near), _find_push(far)
+    return float((far_n - near_n) / (far_m - near_m))
+
+
+def _find_push(judged: _JudgedRun) -> tuple[float, float]:
+    """Returns of the last second where the user's end effector is along x, m, and how it is pushed, N."""
+    scenario, record = judged.scenario, judged.records[USER].since(judged.records[USER].t_ns[-1] - NS_PER_S)
+    tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
+    torque = _find_hand_torque(scenario, USER, record)
+    force = np.linalg.solve(np.swapaxes(tip.J, 1, 2), torque[:, :, np.newaxis])[:, 0, 0]
+    return float(tip.at[:, 0].mean()), float(force.mean())
+
+
+def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
+    """Returns the RMS over ticks and joints of q_s - sum_j alpha_sj q_j."""
+    peers, own = scenario.peers(SLAVE), records[SLAVE]
+    start = np.array([scenario.dominance[SLAVE].get(peer, 0.0) for peer in peers])
+    changes = [change for change in scenario.timeline if change.dominance == SLAVE]
+    ramps = [scenario.ramp(SLAVE, change.shares, change.start_ns, change.ramp_s) for change in changes]
+    t_s = own.t_ns / NS_PER_S
+    alpha = evaluate_ramps(start, ramps, t_s, 1.0 / scenario.sites[SLAVE].rate_hz).alpha
+    led: Array = sum(
+        (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)), np.zeros_like(own.q)
+    )
+    return float(np.sqrt(np.mean((own.q - led) ** 2)))
+
 
 ORIGIN_NAME = "origin.json"
 JOURNAL_NAME = "runs.journal"
 
 
-_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
-
-
-class BenchFolder(NamedTuple):
-    """A folder of the suite: what is asked of it, and where its runs come from."""
-
-    path: Path
-    plan: BenchPlan
-    origin: str
-
-    def journal(self) -> RunJournal[BenchRun]:
-        """Opens the journal."""
-        command = format_command("bench", "--study", self.plan.study, "--out", str(self.path))
-        remedy = f"what is done is kept: make room, and go on with: {command}"
-        return RunJournal(self.path / JOURNAL_NAME, self.origin, BenchRun, remedy)
+BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
@@ -54,8 +230,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         UsageError: it holds something else, or runs from elsewhere, or cannot be made.
     """
     chosen = path or Path("runs") / f"bench-{plan.study}"
-    known = collect_provenance()
-    facts = {"arithmetic": compute_fingerprint(), **{name: known[name] for name in _VERSIONS}}
+    arithmetic, versions = describe_program()
+    facts = {"arithmetic": arithmetic, **versions}
     file, origin = chosen / ORIGIN_NAME, json.dumps(facts, indent=2) + "\n"
     if not file.exists():
         make_results_folder(chosen, "", force=None)
@@ -66,114 +242,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
             f"{chosen}: holds runs of {there}, and this is {here}; results are not mixed: choose another "
             "folder with --out"
         )
-    return BenchFolder(chosen, plan, origin)
-
-
-QUANTITIES_OF_RUNS = ("error_rad", "effort_nm", "hand_nm", "force_peak_n", "stiffness_n_m", "settled_s")
-"""The numbers of a run that are averaged over its seeds; those of runs without contact are masked."""
-LEAST_SEEDS = 20
-"""Of fewer runs there is no interval."""
-
-
-class BenchPlace(NamedTuple):
-    """A cell with the runs of all its seeds."""
-
-    cell: BenchCell
-    runs: Sequence[BenchRun]
-
-    @property
-    def stable(self) -> int:
-        """How many of its runs are stable."""
-        return self.count(Stability.STABLE)
-
-    def count(self, stability: Stability) -> int:
-        """Returns how many of its runs have a judgement."""
-        return sum(run.stability is stability for run in self.runs)
-
-    @property
-    def judgement(self) -> Stability:
-        """Stable if all of its runs are, not stable if one is."""
-        found = {run.stability for run in self.runs}
-        return next(one for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE) if one in found)
-
-    @property
-    def masked(self) -> bool:
-        """True if a run was to touch a wall, and did not."""
-        return any(run.masked for run in self.runs)
-
-    @property
-    def energy_j(self) -> float | None:
-        """The least energy of its runs, J; None if one diverged."""
-        values = [run.energy_j for run in self.runs if run.energy_j is not None]
-        return min(values) if len(values) == len(self.runs) else None
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """The 95 % interval of the share of stable runs; None of too few."""
-        return wilson_interval(self.stable, len(self.runs)) if len(self.runs) >= LEAST_SEEDS else None
-
-    def mean(self, quantity: str) -> float | MeanInterval | None:
-        """Returns a number's mean over the seeds, with its interval if they are enough."""
-        values = [getattr(run, quantity) for run in self.runs]
-        if None in values or self.masked:
-            return None
-        return mean_interval(values) if len(values) >= LEAST_SEEDS else float(np.mean(values))
-
-
-class BenchResults(Result):
-    """The results of a suite.
-
-    Attributes:
-        plan: of what.
-        places: every cell with its runs, in the order of the plan.
-        runs: all of them, in that order.
-    """
-
-    def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
-        self.plan = plan
-        self.places = [
-            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds]) for cell in plan.cells
-        ]
-        self.runs = [run for place in self.places for run in place.runs]
-
-    def blocks(self) -> Iterator[Any]:
-        """Yields its text."""
-        from .bench_tables import compose_bench
-
-        return compose_bench(self)
-
-    def headline(self) -> str:
-        """Returns which study, and how many runs."""
-        return f"{self.plan.study}: {len(self.places)} cells, {len(self.runs)} runs"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat bench --json`."""
-        from .bench_tables import bench_to_json
-
-        return bench_to_json(self)
-
-    def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per cell."""
-        return list(self.to_dict()["places"])
-
-    def of(self, task: str, law: str = "", link: str = "") -> Iterator[BenchPlace]:
-        """Yields the places of a task, and of a law and a link if they are named."""
-        for place in self.places:
-            cell = place.cell
-            if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
-                yield place
-
-
-def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run, with the judgement of the longer one if there is one."""
-    run = runs[cell.key, seed]
-    longer = runs.get((name_run(cell.key, LONGEST_S), seed))
-    if run.stability is Stability.NOT_STABLE and run.length_s >= LONGEST_S:
-        return msgspec.structs.replace(run, confirmed=True)
-    if run.stability is not Stability.NOT_STABLE or longer is None:
-        return run
-    confirmed, words = longer.stability is Stability.NOT_STABLE, f"of {LONGEST_S:g} s: {longer.text}"
-    return msgspec.structs.replace(run, stability=longer.stability, text=words, confirmed=confirmed)
+    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(chosen))
+    return BenchFolder(chosen, plan, facts, origin, JOURNAL_NAME, BenchRun, remedy)
 
 
 def run_bench(
@@ -208,7 +278,6 @@ def run_bench(
             if tasks:
                 hint = "; what is done is kept: the same command goes on"
                 with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
-                    for number, (_, run) in enumerate(pool.each(run_bench_task, tasks, count=len(tasks)), 1):
-                        journal.add(run)
-                        progress(len(asked) - len(tasks) + number, len(asked))
+                    done = len(asked) - len(tasks)
+                    journal.complete(pool, run_bench_task, tasks, done, len(asked), progress)
         return BenchResults(plan, journal.done)

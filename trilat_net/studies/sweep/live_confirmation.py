@@ -14,9 +14,11 @@ import numpy as np
 from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
+from ...reporting.text_table import TextTable
 from ...scenario import Scenario, parse_scenario
+from .stability_map import label_axis
 from .sweep_cell import CellClass, classify_end
-from .sweep_results import ResultRow
+from .sweep_run import ResultRow
 
 MAX_SESSION_S = 60.0
 """A live session lasts as long as the cell ran: longer ones are passed over, s."""
@@ -24,15 +26,9 @@ _BEYOND_S = 0.5
 """A cell that diverged runs so much longer than it needed to, s: not to end on the very tick."""
 
 
-class LiveSession(NamedTuple):
-    """A live session that ended: its log, which may be missing, and what went wrong, in order."""
-
-    log: Path
-    problems: Sequence[str]
-
-
-SessionRunner = Callable[[Scenario, str], LiveSession]
-"""Runs a scenario over a network, called by a name, and says how it went."""
+SessionRunner = Callable[[Scenario, str], tuple[Path, Sequence[str]]]
+"""Runs a scenario over a network, called by a name; returns its log, which may be missing, and what went
+wrong, in order."""
 
 
 class ConfirmedCell(NamedTuple):
@@ -106,15 +102,30 @@ def confirm_cell(row: ResultRow, run: SessionRunner, longest_s: float = MAX_SESS
     extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
     lasts_s = min(row["ran_s"] + extra_s, longest_s + _BEYOND_S)
     scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=lasts_s)
-    session = run(scenario, f"cell-{row['cell']}")
-    log = session.log if session.log.exists() else None
+    file, problems = run(scenario, f"cell-{row['cell']}")
+    log = file if file.exists() else None
     try:
-        found = classify_log_end(open_log(session.log))
+        found = classify_log_end(open_log(file))
     except LogError as error:
-        return ConfirmedCell(row, virtual, None, "; ".join([*session.problems, str(error)]), log)
-    if session.problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
-        return ConfirmedCell(row, virtual, None, "; ".join(session.problems), log)
+        return ConfirmedCell(row, virtual, None, "; ".join([*problems, str(error)]), log)
+    if problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
+        return ConfirmedCell(row, virtual, None, "; ".join(problems), log)
     return ConfirmedCell(row, virtual, classify_end(found), found.text, log)
+
+
+def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
+    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is."""
+    heads = ("cell", *map(label_axis, axes), "seed", "virtual", "live", "", "the log shows", "log")
+    rows = []
+    for one in found:
+        values = [one.row[key] for key in axes]
+        place = [value if isinstance(value, str) else f"{value:g}" for value in values]
+        live = "none" if one.live is None else one.live.value
+        same = "same" if one.same else "DIFFERS"
+        where = "none" if one.log is None else str(one.log)
+        cell, seed = str(one.row["cell"]), str(one.row["seed"])
+        rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
+    return TextTable(heads, rows)
 
 
 GridIndex = tuple[Any, ...]

@@ -28,17 +28,16 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
 from ...reporting.text_table import TextTable
-from .live_confirmation import ConfirmedCell
-from .map_plane import (
+from .stability_map import (
     CELL_CLASSES,
+    MapLine,
     MapPanel,
     MapPlane,
     PlaneAxis,
+    StabilityMap,
     StableInterval,
     find_map_edges,
-    label_axis,
 )
-from .stability_map import MapLine, StabilityMap
 from .sweep_cell import CellClass
 
 CLASS_COLOURS = {
@@ -362,18 +361,3 @@ def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[st
     if edge.low <= value <= edge.high:
         return [f"{value:.4g}", "within"]
     return [f"{value:.4g}", f"{100.0 * (value / edge.middle - 1.0):+.1f} %"]
-
-
-def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
-    """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is."""
-    heads = ("cell", *map(label_axis, axes), "seed", "virtual", "live", "", "the log shows", "log")
-    rows = []
-    for one in found:
-        values = [one.row[key] for key in axes]
-        place = [value if isinstance(value, str) else f"{value:g}" for value in values]
-        live = "none" if one.live is None else one.live.value
-        same = "same" if one.same else "DIFFERS"
-        where = "none" if one.log is None else str(one.log)
-        cell, seed = str(one.row["cell"]), str(one.row["seed"])
-        rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
-    return TextTable(heads, rows)

@@ -26,13 +26,14 @@ from ...scenario.law_consent import list_imported_laws
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
-from .map_plane import StableInterval, label_axis
 from .stability_map import (
+    StableInterval,
     build_sweep_command,
     evaluate_criterion,
     find_criterion_edge,
     format_override,
     format_override_value,
+    label_axis,
 )
 from .sweep_plan import SweepCell, SweepPlan
 

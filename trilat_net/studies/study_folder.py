@@ -1,22 +1,39 @@
-"""The journal of a study: a line per finished run, in a file that is only ever appended to.
+"""The folder of a study: its plan, and the journal with a line per finished run, which is only appended to.
 
 A line is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
 
 Invariant: by that checksum a torn line is ignored, and so is one of another study; a process that dies at any
-moment loses no earlier line and spoils no later one.
+moment loses no earlier line and spoils no later one. A run that is in the journal is never made again.
 """
 
 import errno
 import json
 import os
 import zlib
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
+from ..core.fingerprint import compute_fingerprint
 from ..files import describe_write_error
+from ..log.log_layout import collect_provenance
+from .commands import format_command
+from .executor import Progress, WorkerPool
+
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+
+
+def describe_program() -> tuple[str, dict[str, str]]:
+    """Returns the arithmetic, and the versions of what computes: results depend on both."""
+    known = collect_provenance()
+    return compute_fingerprint(), {name: known[name] for name in _VERSIONS}
+
+
+def build_resume_hint(*words: str) -> str:
+    """Returns how a command goes on with a study that the disk interrupted."""
+    return f"what is done is kept: make room, and go on with: {format_command(*words)}"
 
 
 class JournalEntry(Protocol):
@@ -31,6 +48,8 @@ class JournalEntry(Protocol):
         """With which seed."""
 
 
+P = TypeVar("P")
+T = TypeVar("T")
 E = TypeVar("E", bound=JournalEntry)
 
 
@@ -79,6 +98,29 @@ class RunJournal(Generic[E]):
         self._put(b"%s\t%08x\n" % (text, self._checksum(text)))
         self.done[entry.cell, entry.seed] = entry
 
+    def complete(
+        self,
+        pool: WorkerPool,
+        run: Callable[[T], E],
+        tasks: Iterable[T],
+        done: int,
+        total: int,
+        show: Progress,
+    ) -> None:
+        """Makes the runs of a study that are left, and writes each down as it ends.
+
+        Args:
+            pool: makes them.
+            run: makes the run of a task.
+            tasks: those that are left, `total - done` at most.
+            done: how many runs there are already.
+            total: how many there will be.
+            show: called with the runs that are done, and their number.
+        """
+        for number, (_, entry) in enumerate(pool.each(run, tasks, count=total - done), done + 1):
+            self.add(entry)
+            show(number, total)
+
     def _put(self, data: bytes) -> None:
         try:
             if self._file.write(data) != len(data):  # a disk that became full takes a part, and says nothing
@@ -88,3 +130,31 @@ class RunJournal(Generic[E]):
 
     def _checksum(self, text: bytes) -> int:
         return zlib.crc32(text, zlib.crc32(self._study.encode()))
+
+
+class StudyFolder(NamedTuple, Generic[P, E]):
+    """The folder of a study.
+
+    Attributes:
+        path: where it is.
+        plan: what is asked of it.
+        facts: what names the study, its arithmetic, and the versions it is made with.
+        study, file, kind, remedy: of its journal.
+    """
+
+    path: Path
+    plan: P
+    facts: Mapping[str, Any]
+    study: str
+    file: str
+    kind: type[E]
+    remedy: str
+
+    def journal(self) -> RunJournal[E]:
+        """Opens the journal."""
+        return RunJournal(self.path / self.file, self.study, self.kind, self.remedy)
+
+    def read_done(self) -> list[tuple[Any, int]]:
+        """Returns the cells and seeds of the runs that are done."""
+        with self.journal() as journal:
+            return list(journal.done)

@@ -1,6 +1,6 @@
-"""The results of the suite as tables, as Markdown, as CSV and as JSON.
+"""The results of the suite: its runs by place, as tables, as Markdown, as CSV and as JSON.
 
-Invariant: a function of the results alone, without a clock: equal results give equal bytes. A number over
+Invariant: a function of the runs alone, without a clock: equal results give equal bytes. A number over
 seeds has its 95 % interval, and every run that is not stable shows. No law is ranked.
 """
 
@@ -10,16 +10,210 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
-from ...analysis.json_values import JsonObject
 from ...analysis.run_end import EndBehaviour, Stability
 from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
-from ..intervals import MeanInterval
-from .bench_cell import PASSIVE_J, BenchRun
-from .bench_plan import BenchCell, explain_no_cell
-from .bench_run import QUANTITIES_OF_RUNS, BenchPlace, BenchResults
+from ...results import Result
+from ..intervals import MeanInterval, mean_interval, wilson_interval
+from .bench_plan import BenchCell, BenchPlan, explain_no_cell
 from .bench_tasks import STUDIES, TASKS
+
+LEAST_CONTACT_N = 1.0
+"""A mean force of the wall below this, at the end, is no contact, N."""
+PASSIVE_J = -1e-3
+"""What hands, friction and wall have put into a passive run is never less, J."""
+LONGEST_S = 100.0
+"""No run is made longer; so long, too, is the one that refutes or confirms one that is not stable, s."""
+
+
+def name_run(key: str, to_s: float) -> str:
+    """Returns what the runs of a cell are called in the journal; those that were made again, of their own."""
+    return f"{key} to {to_s:g} s" if to_s else key
+
+
+class BenchRun(msgspec.Struct, frozen=True):
+    """One finished run of the suite.
+
+    Attributes:
+        name: of its cell, task/law/link.
+        inputs: a digest of what the cell is made of.
+        random: whether another seed would be another run.
+        sha256: of its scenario.
+        stability, behaviour: its judgement (docs/definitions.md), by its end and its twins.
+        text: the judgement in words.
+        length_s: how long the run was that is judged, s.
+        to_s: it was made again for so long because it was not stable, s; 0: it was not.
+        confirmed: whether that run was not stable either; None: there was none.
+        bounded: no joint passed `BOUND_RAD_S`, or left its start by more than `THROWN_RAD`.
+        energy_j: the least that hands, friction and wall had put in until any instant, J.
+        settled_s: since when all arms stay where they end, s; None: not within the run.
+        error_rad: RMS distance of the slave from its users, undelayed, weighted by dominance, over the time
+            of the task; None where the run diverged, as the numbers below.
+        effort_nm: RMS of tau - G(q) over sites and joints.
+        hand_nm: RMS torque of the operators over joints, of the sites that have one.
+        wall_n: mean force of the wall in the last quarter, N; None without a wall.
+        force_peak_n: largest force of the wall, N.
+        stiffness_n_m: what the user feels of the wall, by two reaches, N/m; None unless both come to rest.
+    """
+
+    name: str
+    inputs: str
+    seed: int
+    random: bool
+    sha256: str
+    stability: Stability
+    behaviour: EndBehaviour
+    text: str
+    length_s: float = 0.0
+    to_s: float = 0.0
+    confirmed: bool | None = None
+    bounded: bool = False
+    energy_j: float | None = None
+    settled_s: float | None = None
+    error_rad: float | None = None
+    effort_nm: float | None = None
+    hand_nm: float | None = None
+    wall_n: float | None = None
+    force_peak_n: float | None = None
+    stiffness_n_m: float | None = None
+
+    @property
+    def cell(self) -> str:
+        """Its cell, told apart from one of the same name with other gains, and from a longer run of it."""
+        return name_run(f"{self.name} {self.inputs}", self.to_s)
+
+    @property
+    def doubtful(self) -> bool:
+        """True if it is not stable, did not diverge, and is not as long as one that would confirm it."""
+        diverged = self.behaviour is EndBehaviour.DIVERGED
+        return self.stability is Stability.NOT_STABLE and not diverged and self.length_s < LONGEST_S
+
+    @property
+    def masked(self) -> bool:
+        """True if it was to touch a wall, and did not: its numbers are those of free motion."""
+        return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
+
+
+QUANTITIES_OF_RUNS = ("error_rad", "effort_nm", "hand_nm", "force_peak_n", "stiffness_n_m", "settled_s")
+"""The numbers of a run that are averaged over its seeds; those of runs without contact are masked."""
+LEAST_SEEDS = 20
+"""Of fewer runs there is no interval."""
+
+
+class BenchPlace(NamedTuple):
+    """A cell with the runs of all its seeds."""
+
+    cell: BenchCell
+    runs: Sequence[BenchRun]
+
+    @property
+    def stable(self) -> int:
+        """How many of its runs are stable."""
+        return self.count(Stability.STABLE)
+
+    def count(self, stability: Stability) -> int:
+        """Returns how many of its runs have a judgement."""
+        return sum(run.stability is stability for run in self.runs)
+
+    @property
+    def judgement(self) -> Stability:
+        """Stable if all of its runs are, not stable if one is."""
+        found = {run.stability for run in self.runs}
+        return next(one for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE) if one in found)
+
+    @property
+    def masked(self) -> bool:
+        """True if a run was to touch a wall, and did not."""
+        return any(run.masked for run in self.runs)
+
+    @property
+    def energy_j(self) -> float | None:
+        """The least energy of its runs, J; None if one diverged."""
+        values = [run.energy_j for run in self.runs if run.energy_j is not None]
+        return min(values) if len(values) == len(self.runs) else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The 95 % interval of the share of stable runs; None of too few."""
+        return wilson_interval(self.stable, len(self.runs)) if len(self.runs) >= LEAST_SEEDS else None
+
+    def mean(self, quantity: str) -> float | MeanInterval | None:
+        """Returns a number's mean over the seeds, with its interval if they are enough."""
+        values = [getattr(run, quantity) for run in self.runs]
+        if None in values or self.masked:
+            return None
+        return mean_interval(values) if len(values) >= LEAST_SEEDS else float(np.mean(values))
+
+
+class BenchResults(Result):
+    """The results of a suite.
+
+    Attributes:
+        plan: of what.
+        places: every cell with its runs, in the order of the plan.
+        runs: all of them, in that order.
+    """
+
+    def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
+        self.plan = plan
+        self.places = [
+            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds]) for cell in plan.cells
+        ]
+        self.runs = [run for place in self.places for run in place.runs]
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields verdicts, properties, each quantity of each task, and round trips."""
+        yield from (*describe_bench(self), "")
+        yield tabulate_verdicts(self)
+        for task in self.plan.tasks:
+            yield tabulate_properties(self, task)
+        for asked in list_quantities(self):
+            if asked.key != "effort_nm":
+                yield from ("", f"{asked.task}: {asked.words}")
+                yield tabulate_quantity(self, asked)
+        if self.plan.study == "round-trips":
+            yield tabulate_round_trips(self)
+
+    def headline(self) -> str:
+        """Returns which study, and how many runs."""
+        return f"{self.plan.study}: {len(self.places)} cells, {len(self.runs)} runs"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat bench --json`."""
+        return {
+            "study": self.plan.study,
+            "gains": [
+                msgspec.to_builtins(one) | {"outcome": "settled"}
+                for one in {str(c.tuned): c.tuned for c in self.plan.cells}.values()
+            ],
+            "places": list(map(_place_row, self.places)),
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per cell."""
+        return list(map(_place_row, self.places))
+
+    def of(self, task: str, law: str = "", link: str = "") -> Iterator[BenchPlace]:
+        """Yields the places of a task, and of a law and a link if they are named."""
+        for place in self.places:
+            cell = place.cell
+            if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
+                yield place
+
+
+def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
+    """Returns a run, with the judgement of the longer one if there is one."""
+    run = runs[cell.key, seed]
+    longer = runs.get((name_run(cell.key, LONGEST_S), seed))
+    if run.stability is Stability.NOT_STABLE and run.length_s >= LONGEST_S:
+        return msgspec.structs.replace(run, confirmed=True)
+    if run.stability is not Stability.NOT_STABLE or longer is None:
+        return run
+    confirmed, words = longer.stability is Stability.NOT_STABLE, f"of {LONGEST_S:g} s: {longer.text}"
+    return msgspec.structs.replace(run, stability=longer.stability, text=words, confirmed=confirmed)
+
 
 _SHOWN_LINKS = ("rtt8", "rtt136", "rtt544", "rtt1088", "rtt136-loss50", "4g", "5g", "geo", "trace")
 """Links of a table for people, if they are among those that ran; else all that ran."""
@@ -47,15 +241,10 @@ _ALWAYS = ("error_rad", "effort_nm", "settled_s")
 
 def list_quantities(results: BenchResults) -> list[BenchQuantity]:
     """Returns what is shown of the tasks that ran."""
-    tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
+    tasks = results.plan.tasks
     found = [BenchQuantity(task, key, _WORDS[key]) for key in _ALWAYS for task in tasks]
     more = {"free": ["hand_nm"], "disagree": ["hand_nm"], "contact": ["stiffness_n_m", "force_peak_n"]}
     return found + [BenchQuantity(task, key, _WORDS[key]) for task in tasks for key in more.get(task, [])]
-
-
-def list_laws(results: BenchResults) -> list[tuple[str, str]]:
-    """Returns the laws that were asked for, with their forms, in the order of the plan."""
-    return list(results.plan.laws)
 
 
 def name_law(law: str, form: str) -> str:
@@ -65,14 +254,14 @@ def name_law(law: str, form: str) -> str:
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
     """Returns a row per law: of each task over how many links it is stable, open, and not stable."""
-    tasks = list(dict.fromkeys(cell.task for cell in results.plan.cells))
+    tasks = results.plan.tasks
 
     def cell(law: str, form: str, task: str) -> str:
         found = [place.judgement for place in results.of(task, law)]
         counts = " / ".join(str(found.count(one)) for one in _JUDGEMENTS)
         return counts if found else explain_no_cell(law, form, task)
 
-    rows = [(name_law(*one), *(cell(*one, task) for task in tasks)) for one in list_laws(results)]
+    rows = [(name_law(*one), *(cell(*one, task) for task in tasks)) for one in results.plan.laws]
     return TextTable(("links: stable / open / not stable", *tasks), rows, align="lr")
 
 
@@ -82,7 +271,7 @@ _JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 def tabulate_properties(results: BenchResults, task: str) -> TextTable:
     """Returns a row per law: over how many links each property holds of all runs, and the least energy."""
     rows = []
-    for law, form in list_laws(results):
+    for law, form in results.plan.laws:
         places = list(results.of(task, law))
         if not places:
             rows.append((name_law(law, form), explain_no_cell(law, form, task), *[""] * 5))
@@ -105,11 +294,11 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
 
 def tabulate_quantity(results: BenchResults, asked: BenchQuantity) -> TextTable:
     """Returns a row per law and a column per link: means over seeds; marks say what is not stable."""
-    links = list(dict.fromkeys(cell.link for cell in results.plan.cells))
+    links = results.plan.links
     if len(links) > len(_SHOWN_LINKS):
         links = [link for link in links if link in _SHOWN_LINKS]
     rows = []
-    for law, form in list_laws(results):
+    for law, form in results.plan.laws:
         missing = explain_no_cell(law, form, asked.task)
         cells = []
         for link in links:
@@ -146,8 +335,8 @@ def tabulate_round_trips(results: BenchResults) -> TextTable:
         return f"{above / below:.3g}" if above is not None and below else "-"
 
     rows = []
-    for task in dict.fromkeys(cell.task for cell in results.plan.cells):
-        for law, _ in list_laws(results):
+    for task in results.plan.tasks:
+        for law, _ in results.plan.laws:
             first, later = error(law, task, "rtt8"), error(law, task, "rtt272")
             times = ratio(error(law, task, "rtt1088"), first), ratio(error(law, task, "rtt272-loss50"), later)
             rows.append((task, law, "-" if first is None else f"{first:.4g}", *times))
@@ -167,7 +356,7 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     yield f"not stable: {len(unstable)} runs, {confirmed} confirmed by one of 100 s; {refuted} refuted by it"
     for task in dict.fromkeys(cell.task for cell in plan.cells):
         yield f"{task}: {TASKS[task].about}"
-    for law, form in list_laws(results):
+    for law, form in results.plan.laws:
         if form == "two":
             yield f"{law} is for two sites: it runs in the tasks of one user, without the second"
     if plan.without:
@@ -201,7 +390,7 @@ def build_bench_page(results: BenchResults, command: str) -> str:
         tabulate_verdicts(results).markdown(),
         f"{OPEN_MARK}: a run is open, {UNSTABLE_MARK}: one is not stable; +-: 95 % over seeds of one link.",
     ]
-    for task in dict.fromkeys(cell.task for cell in results.plan.cells):
+    for task in results.plan.tasks:
         parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
     for asked in list_quantities(results):
         parts += [f"## {asked.task}: {asked.words}", tabulate_quantity(results, asked).markdown()]
@@ -265,29 +454,3 @@ def _encode_csv(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows({key: "" if value is None else value for key, value in row.items()} for row in rows)
     return text.getvalue()
-
-
-def compose_bench(results: BenchResults) -> Iterator[Block]:
-    """Yields verdicts, properties, each quantity of each task, and round trips."""
-    yield from (*describe_bench(results), "")
-    yield tabulate_verdicts(results)
-    for task in dict.fromkeys(cell.task for cell in results.plan.cells):
-        yield tabulate_properties(results, task)
-    for asked in list_quantities(results):
-        if asked.key != "effort_nm":
-            yield from ("", f"{asked.task}: {asked.words}")
-            yield tabulate_quantity(results, asked)
-    if results.plan.study == "round-trips":
-        yield tabulate_round_trips(results)
-
-
-def bench_to_json(results: BenchResults) -> JsonObject:
-    """Returns all that there is to say, as plain values."""
-    return {
-        "study": results.plan.study,
-        "gains": [
-            msgspec.to_builtins(one) | {"outcome": "settled"}
-            for one in {str(c.tuned): c.tuned for c in results.plan.cells}.values()
-        ],
-        "places": list(map(_place_row, results.places)),
-    }
