@@ -24,7 +24,7 @@ from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_plan, bench_results, bench_run, bench_tasks
 from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
-from trilat_net.studies.tuning import final_posture, pareto_search, search_space, tuning_plan
+from trilat_net.studies.tuning import candidate, search_space, tuning_plan
 from trilat_net.theory import (
     characteristic_roots,
     equilibrium,
@@ -84,10 +84,10 @@ STATED: list[tuple[str, str, float, float]] = [
     ("live-hands.md", "from 0 to 1 within 100 ms", 100.0, live_hand.GRIP_NS / 1e6),
     ("live-hands.md", "two, at most 50 ms", 50.0, live_hand.GLIDE_NS / 1e6),
     ("fair-comparison.md", "`--budget`, 64 per law", 64, tuning_plan.DEFAULT_BUDGET),
-    ("fair-comparison.md", "steps of 12, 8, 5, 3 %", 3, 100 * pareto_search.REFINEMENT_STEPS[-1]),
+    ("fair-comparison.md", "steps of 12, 8, 5, 3 %", 3, 100 * tuning_plan.REFINEMENT_STEPS[-1]),
     ("fair-comparison.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),
-    ("fair-comparison.md", "more than 0.2 rad from q", 0.2, final_posture.STRAYED_RAD),
-    ("fair-comparison.md", "more than 0.02 rad from q", 0.02, final_posture.TOGETHER_RAD),
+    ("fair-comparison.md", "more than 0.2 rad from q", 0.2, candidate.STRAYED_RAD),
+    ("fair-comparison.md", "more than 0.02 rad from q", 0.02, candidate.TOGETHER_RAD),
     ("linear.md", "faster than 1e-5 rad/s", 1e-5, run_end.EQUILIBRIUM_SPEED_RAD_S),
     ("linear.md", "within 1e-6/s", 1e-6, characteristic_roots.STABILITY_EDGE_PER_S),
     ("linear.md", "a scan of 24 values", 24, linear_edge.EDGE_SCAN_POINTS),

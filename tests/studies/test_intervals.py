@@ -16,8 +16,12 @@ from trilat_net.studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.sweep_run import RUN_TOTALS, collect_grid_points
 from trilat_net.studies.trials import run_trials, trials
 from trilat_net.studies.tuning import plan_tuning
-from trilat_net.studies.tuning.candidate import CandidateScore, average_scores, measure_candidate
-from trilat_net.studies.tuning.final_posture import CandidateClass
+from trilat_net.studies.tuning.candidate import (
+    CandidateClass,
+    CandidateScore,
+    average_scores,
+    measure_candidate,
+)
 
 DRAWN = """
 name = "drawn"

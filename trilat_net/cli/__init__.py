@@ -19,7 +19,7 @@ from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
-from . import bench, inputs, log, members, options, runs, sessions, studies, sweep
+from . import inputs, log, members, options, runs, sessions, studies, sweep
 from .options import flag
 
 
@@ -119,7 +119,7 @@ _KEYS = {
     "info": ["keys/m1"],
 }
 
-_MODULES = (sessions, members, runs, log, studies, sweep, bench, inputs)
+_MODULES = (sessions, members, runs, log, studies, sweep, inputs)
 _FUNCTIONS = {name: run for module in _MODULES for name, run in vars(module).items()}
 
 

@@ -1,12 +1,14 @@
-"""Studies of some runs: scenarios with what they [expect], logs side by side, laws that one procedure tunes.
+"""Studies of some runs: scenarios with what they [expect], logs side by side, tuned laws, the suite of laws.
 
-Invariant: numbers are printed and nothing is ranked.
+Invariant: numbers are printed and nothing is ranked. A suite that is interrupted goes on by the same command.
 """
 
 import os
 import platform
 import re
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from sites.demo_session import SessionResult
 
     from ..scenario import Scenario
+    from ..studies.bench import BenchPlan, BenchResults
+    from ..studies.bench.bench_run import BenchFolder
     from ..studies.trials import Trial, TrialReport, TrialResult
     from ..studies.tuning import TuningPlan
 
@@ -151,6 +155,36 @@ def run_apart(scenario: "Scenario", label: str, folder_name: str) -> "SessionRes
     return outcome
 
 
+_LINES = 10
+"""Lines of progress, where no terminal shows a bar."""
+
+
+@contextmanager
+def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Callable[[int, int], None]]:
+    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
+    if terminal.err.is_interactive:
+        with terminal.progress_bar(label) as show:
+            yield show
+        return
+    from ..net.clock import SystemClock
+    from ..studies.sweep.sweep_run import format_wall_time
+
+    clock = SystemClock()
+    began_ns, first, printed = -1, 0, 0
+
+    def line(done: int, total: int) -> None:
+        nonlocal began_ns, first, printed
+        if began_ns < 0:  # the start of processes takes seconds and is not counted
+            began_ns, first = clock.monotonic_ns(), done
+        if done in (total, first) or done * _LINES // total <= printed:
+            return
+        printed = done * _LINES // total
+        left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
+        print_line(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
+
+    yield line
+
+
 def _run_tuning(
     asked: "TuningPlan", folder: Path | None, jobs: int | None, on: str | None, *, force: bool, as_json: bool
 ) -> None:
@@ -257,3 +291,100 @@ def compare_command(
         seeds=seeds,
     )
     _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
+
+
+def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
+    """Tunes laws of a study at all delays, and writes their gains into the file of the suite."""
+    from ..studies.bench.bench_plan import GAINS_FILE, tune_laws, write_gains
+    from ..studies.bench.bench_tasks import STUDIES
+
+    asked = STUDIES[study].laws
+    unknown = [law for law in laws if law not in {law for known in asked.values() for law in known}]
+    if unknown:
+        raise UsageError(f"--law: {unknown[0]} is none of the study {study}")
+    wanted = {form: [law for law in known if law in laws or not laws] for form, known in asked.items()}
+    with show_progress("tuning", terminal.print_note) as progress:
+        found = tune_laws({form: kept for form, kept in wanted.items() if kept}, jobs, on, progress)
+    write_gains(found)
+    terminal.print_paths([GAINS_FILE])
+
+
+def _print_cell(plan: "BenchPlan", name: str) -> None:
+    """Prints the commands that make logs of a cell, one per seed."""
+    for seed in plan.cell(name).seeds:
+        terminal.print_line(f"{plan.cell(name).build(seed).command} -o {name.replace('/', '-')}-{seed}.mcap")
+
+
+def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool) -> "BenchResults":
+    from ..studies.bench import run_bench
+
+    try:
+        with show_progress("running", terminal.print_note) as progress:
+            return run_bench(folder, jobs, on, progress, confirm=confirm)
+    except KeyboardInterrupt:
+        terminal.print_note(f"what is done is kept in {folder.path}; the same command goes on")
+        raise
+
+
+def bench_command(
+    study: Annotated[str, value("--study", "full|small|round-trips", "Part of the suite to run.")] = "full",
+    small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,
+    task: Annotated[str | None, value("--task", "TASK,TASK...", "Only these tasks.")] = None,
+    law: Annotated[str | None, value("--law", "LAW,LAW...", "Only these laws.")] = None,
+    link: Annotated[
+        str | None, value("--link", "LINK,LINK...", "Other links, as in rtt68-loss10,4g.")
+    ] = None,
+    seeds: Annotated[int | None, value("--seeds", "N", "Number of seeds; default: the study's.")] = None,
+    cell: Annotated[
+        str | None, value("--cell", "TASK/LAW/LINK", "Print the commands that make logs of a cell.")
+    ] = None,
+    tune: Annotated[
+        bool,
+        typer.Option(
+            "--tune",
+            help="Tune the laws again, and store their gains with the suite.",
+            rich_help_panel="Gains",
+        ),
+    ] = False,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="Run what is not stable for 100 s: it is refuted or confirmed.")
+    ] = False,
+    output: Annotated[
+        Path | None,
+        value("--out -o", "DIR", "Folder; continues a suite in it. Default: runs/bench-STUDY."),
+    ] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs control laws on the same tasks over the same links: stability, energy, errors, effort, stiffness.
+
+    One procedure tuned the gains of every law. Finished runs are kept: the same command continues.
+    """
+    from ..studies.bench import plan_bench, prepare_bench_folder
+    from ..studies.bench.bench_figures import write_bench
+    from ..studies.bench.bench_plan import find_stale
+    from ..studies.commands import format_command
+    from ..studies.executor import check_workers
+
+    check_workers(jobs, on)
+    chosen = "small" if small else study
+    lists = [options.split_names(one) for one in (task, law, link)]
+    if tune:
+        return _tune(lists[1], chosen, jobs, on)
+    plan = plan_bench(chosen, tasks=lists[0], laws=lists[1], links=lists[2], seeds=seeds)
+    if cell is not None:
+        return _print_cell(plan, cell)
+    stale = find_stale({str(one.tuned): one.tuned for one in plan.cells}.values())
+    if stale:
+        terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
+    folder = prepare_bench_folder(plan, output)
+    terminal.print_note(f"{len(plan.cells)} cells, {plan.runs} runs, into {folder.path}")
+    results = _run(folder, jobs, on, confirm=confirm)
+    given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
+    words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
+    words += ["--confirm"] if confirm else []
+    paths = write_bench(results, folder.path, format_command("bench", "--study", chosen, *words))
+    terminal.print_result(results, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
+    return None

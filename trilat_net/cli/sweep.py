@@ -5,8 +5,7 @@ interrupted prints the command that resumes it.
 """
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +16,7 @@ from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
-from .studies import parse_seeds, run_apart
+from .studies import parse_seeds, run_apart, show_progress
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
@@ -112,10 +111,6 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
         raise typer.Exit(1)
 
 
-_LINES = 10
-"""Lines of progress, where no terminal shows a bar."""
-
-
 def _run_sweep(
     asked: "SweepPlan | None", path: Path | None, jobs: int | None, on: str | None, *, yes: bool
 ) -> "FinishedSweep":
@@ -185,32 +180,6 @@ def _print_results(results: "SweepResults", more: list[str], path: Path) -> None
 def _print_lines(lines: Iterable[str]) -> None:
     for line in lines:
         terminal.print_text(line)
-
-
-@contextmanager
-def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
-    if terminal.err.is_interactive:
-        with terminal.progress_bar(label) as show:
-            yield show
-        return
-    from ..net.clock import SystemClock
-    from ..studies.sweep.sweep_run import format_wall_time
-
-    clock = SystemClock()
-    began_ns, first, printed = -1, 0, 0
-
-    def line(done: int, total: int) -> None:
-        nonlocal began_ns, first, printed
-        if began_ns < 0:  # the start of processes takes seconds and is not counted
-            began_ns, first = clock.monotonic_ns(), done
-        if done in (total, first) or done * _LINES // total <= printed:
-            return
-        printed = done * _LINES // total
-        left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
-        print_line(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
-
-    yield line
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:

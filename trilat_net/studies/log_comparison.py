@@ -20,7 +20,7 @@ from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
 from ..theory.end_pose import certify_run
 from .intervals import MeanInterval, mean_interval
-from .tuning.final_posture import check_final_posture
+from .tuning.candidate import check_final_posture
 
 _MOST_REASONS = 6
 

@@ -47,8 +47,7 @@ from trilat_net.studies.bench.bench_tasks import (
 )
 from trilat_net.studies.record_batches import RecordBatch
 from trilat_net.studies.tuning import plan_tuning
-from trilat_net.studies.tuning.candidate import load_tuning_scenario, measure_candidate
-from trilat_net.studies.tuning.final_posture import CandidateClass
+from trilat_net.studies.tuning.candidate import CandidateClass, load_tuning_scenario, measure_candidate
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.studies.tuning import TuningPlan, plan_tuning
-from trilat_net.studies.tuning.pareto_search import ObjectivePoint
+from trilat_net.studies.tuning.tuning_plan import ObjectivePoint
 
 TRIO = """
 name = "trio"

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-from trilat_net.studies.tuning.final_posture import build_twin, check_comparable, compute_consensus_pose
+from trilat_net.studies.tuning.candidate import build_twin, check_comparable, compute_consensus_pose
 
 from .experiments import trio
 

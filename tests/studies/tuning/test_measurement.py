@@ -5,8 +5,7 @@ import pytest
 
 from tests.virtual_runs import trajectories
 from trilat_net.scenario import Scenario
-from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
-from trilat_net.studies.tuning.final_posture import CandidateClass
+from trilat_net.studies.tuning.candidate import CandidateClass, CandidateScore, measure_candidate
 
 from .experiments import trio
 

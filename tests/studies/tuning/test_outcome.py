@@ -10,7 +10,7 @@ from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.api import simulate
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_reader import open_log
-from trilat_net.studies.tuning.final_posture import (
+from trilat_net.studies.tuning.candidate import (
     CLASS_MEANINGS,
     CandidateClass,
     check_final_posture,

@@ -7,15 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.studies.tuning.candidate import CandidateScore
-from trilat_net.studies.tuning.final_posture import CandidateClass
-from trilat_net.studies.tuning.pareto_search import (
+from trilat_net.studies.tuning.candidate import CandidateClass, CandidateScore
+from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+from trilat_net.studies.tuning.tuning_plan import (
     CandidateSearch,
     Objective,
     compute_crowding,
     find_pareto_front,
 )
-from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 
 from .experiments import dominates
 

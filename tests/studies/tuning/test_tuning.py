@@ -10,19 +10,10 @@ import pytest
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.tuning import TuningResult, plan_tuning
-from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
-from trilat_net.studies.tuning.final_posture import CandidateClass
-from trilat_net.studies.tuning.pareto_search import (
-    CandidateSearch,
-    Objective,
-    find_pareto_front,
-)
+from trilat_net.studies.tuning.candidate import CandidateClass, CandidateScore, measure_candidate
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
-from trilat_net.studies.tuning.tuning_report import (
-    tabulate_front,
-    tabulate_laws,
-    write_tuning,
-)
+from trilat_net.studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
+from trilat_net.studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
 
 from .experiments import asked, dominates
 

@@ -24,11 +24,9 @@ from ...files import write_whole
 from ...scenario.laws import BUILT_IN
 from ..commands import format_toml_value
 from ..executor import Progress, Workers, ignore_progress
-from ..tuning.candidate import TuningScenario, load_tuning_scenario, measure_candidate
-from ..tuning.final_posture import CandidateClass
-from ..tuning.pareto_search import CandidateSearch
+from ..tuning.candidate import CandidateClass, TuningScenario, load_tuning_scenario, measure_candidate
 from ..tuning.search_space import SEARCH_SPACES, ModelInformation
-from ..tuning.tuning_plan import plan_tuning
+from ..tuning.tuning_plan import CandidateSearch, plan_tuning
 from .bench_tasks import (
     BASES,
     LINKS,

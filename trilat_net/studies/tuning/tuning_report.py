@@ -23,11 +23,9 @@ from ...reporting.palette import SITE_COLOURS
 from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
-from .candidate import CandidateScore
-from .final_posture import CLASS_MEANINGS, CandidateClass
-from .pareto_search import CandidateSearch, Objective
+from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
-from .tuning_plan import MAX_BUDGET, TuningPlan, TuningResult
+from .tuning_plan import MAX_BUDGET, CandidateSearch, Objective, TuningPlan, TuningResult
 
 _MAX_FRONT_ROWS = 8
 """Points of a front that the text shows; the files hold all."""
