@@ -16,7 +16,7 @@ from pathlib import Path
 from trilat_net.process import worker_pool
 from trilat_net.studies.executor import open_worker_pool, run_batch
 from trilat_net.studies.sweep import plan_sweep
-from trilat_net.studies.sweep.sweep_cell import CellTask, run_cell
+from trilat_net.studies.sweep.sweep_run import CellTask, run_cell
 
 WORKERS = 2
 CELLS = 2000

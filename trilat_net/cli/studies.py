@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sites.demo_session import SessionResult
 
     from ..scenario import Scenario
-    from ..studies.bench import BenchPlan, BenchResults
+    from ..studies.bench import BenchResults
     from ..studies.bench.bench_run import BenchFolder
     from ..studies.trials import Trial, TrialReport, TrialResult
     from ..studies.tuning import TuningPlan
@@ -191,12 +191,21 @@ def _run_tuning(
     """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
     from ..files import make_results_folder
     from ..studies.executor import count_workers
-    from ..studies.tuning.tuning_report import write_tuning
+    from ..studies.sweep.sweep_run import format_wall_time
+    from ..studies.tuning.tuning_report import describe_procedure, write_tuning
 
     workers = count_workers(jobs, on)
     chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
     if not as_json:
-        _print_procedure(asked, workers)
+        laws = ", ".join(space.law for space in asked.spaces)
+        terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
+        for line in describe_procedure(asked):
+            terminal.print_text(f"  {line}")
+        cores = "1 core" if workers == 1 else f"{workers} cores"
+        duration = format_wall_time(asked.estimate_s(workers))
+        terminal.print_text(
+            f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
+        )
     with terminal.progress_bar("searching") as progress:
         found = asked.run(jobs, progress, on)
     paths = write_tuning(found, chosen)
@@ -204,21 +213,6 @@ def _run_tuning(
         terminal.out.print()
     terminal.print_result(found, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
-
-
-def _print_procedure(asked: "TuningPlan", workers: int) -> None:
-    from ..studies.sweep.sweep_run import format_wall_time
-    from ..studies.tuning.tuning_report import describe_procedure
-
-    laws = ", ".join(space.law for space in asked.spaces)
-    terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
-    for line in describe_procedure(asked):
-        terminal.print_text(f"  {line}")
-    cores = "1 core" if workers == 1 else f"{workers} cores"
-    duration = format_wall_time(asked.estimate_s(workers))
-    terminal.print_text(
-        f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
-    )
 
 
 _option = partial(value, rich_help_panel="Tune laws")
@@ -309,12 +303,6 @@ def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None
     terminal.print_paths([GAINS_FILE])
 
 
-def _print_cell(plan: "BenchPlan", name: str) -> None:
-    """Prints the commands that make logs of a cell, one per seed."""
-    for seed in plan.cell(name).seeds:
-        terminal.print_line(f"{plan.cell(name).build(seed).command} -o {name.replace('/', '-')}-{seed}.mcap")
-
-
 def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool) -> "BenchResults":
     from ..studies.bench import run_bench
 
@@ -371,10 +359,14 @@ def bench_command(
     chosen = "small" if small else study
     lists = [options.split_names(one) for one in (task, law, link)]
     if tune:
-        return _tune(lists[1], chosen, jobs, on)
+        _tune(lists[1], chosen, jobs, on)
+        return
     plan = plan_bench(chosen, tasks=lists[0], laws=lists[1], links=lists[2], seeds=seeds)
     if cell is not None:
-        return _print_cell(plan, cell)
+        for one in plan.cell(cell).seeds:
+            log = f"{cell.replace('/', '-')}-{one}.mcap"
+            terminal.print_line(f"{plan.cell(cell).build(one).command} -o {log}")
+        return
     stale = find_stale({str(one.tuned): one.tuned for one in plan.cells}.values())
     if stale:
         terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
@@ -387,4 +379,3 @@ def bench_command(
     paths = write_bench(results, folder.path, format_command("bench", "--study", chosen, *words))
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
-    return None

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import process
-from ..analysis.run_end import NO_BUCKETS, reduce_to_buckets
+from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end, reduce_to_buckets
 from ..core.site_step import Site
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
 from ..core.vectors import Array
@@ -133,3 +133,13 @@ def run_compiled_in_batches(
             used = np.zeros((len(t_ns), 0), np.int64)
             take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
     return run.diverged_s
+
+
+def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
+    """Runs a scenario in the compiled loop; returns all records of each site, and how the run ended."""
+    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
+    records = {name: join_batches(blocks) for name, blocks in kept.items()}
+    found = records.values()
+    trace = RunTrace([one.reduce() for one in found], [one.tau_x[-1] for one in found], diverged_s)
+    return records, classify_run_end(scenario, trace)

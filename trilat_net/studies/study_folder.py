@@ -139,20 +139,15 @@ class StudyFolder(NamedTuple, Generic[P, E]):
         path: where it is.
         plan: what is asked of it.
         facts: what names the study, its arithmetic, and the versions it is made with.
-        study, file, kind, remedy: of its journal.
+        remedy: what the error of a full disk advises.
+        journal: opens the journal.
     """
 
     path: Path
     plan: P
     facts: Mapping[str, Any]
-    study: str
-    file: str
-    kind: type[E]
     remedy: str
-
-    def journal(self) -> RunJournal[E]:
-        """Opens the journal."""
-        return RunJournal(self.path / self.file, self.study, self.kind, self.remedy)
+    journal: Callable[[], RunJournal[E]]
 
     def read_done(self) -> list[tuple[Any, int]]:
         """Returns the cells and seeds of the runs that are done."""

@@ -1,6 +1,7 @@
 """Theory on a map: conditions in closed form, lines column by column, and neither from the runs."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -12,7 +13,6 @@ from hypothesis import strategies as st
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.stability_map import (
-    PanelScenarios,
     PlaneAxis,
     StabilityCriterion,
     build_stability_map,
@@ -20,6 +20,7 @@ from trilat_net.studies.sweep.stability_map import (
     find_criterion_edge,
     format_override,
     format_override_value,
+    load_place,
     panel_scenarios,
     trace_closed_form,
     trace_linear_analysis,
@@ -62,9 +63,9 @@ def test_lines_do_not_depend_on_what_ran_nor_on_how_many_processes_there_are() -
 
 def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
-    at = PanelScenarios(plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
-    scenarios = [at.scenario(100.0, d) for d in damping.values]
+    scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
         [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
     )
@@ -75,9 +76,9 @@ def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -
 @pytest.mark.long
 def test_a_coarse_map_has_the_line_of_the_linear_analysis_to_its_digits() -> None:
     """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
-    at = PanelScenarios(plan_sweep("p_d_margin"), (), *KEYS)
+    at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
-    scenarios = [at.scenario(100.0, d) for d in damping.values]
+    scenarios = [at(100.0, d) for d in damping.values]
     line, _ = trace_linear_analysis(
         [compute_growth_column(scenarios, "control.d", damping.values)] * 2, damping
     )
@@ -117,7 +118,7 @@ def test_a_place_of_a_panel_is_the_cell_of_the_plan() -> None:
         delay, damping = cell.values[:2]
         assert isinstance(delay, float)
         assert isinstance(damping, float)
-        assert at.scenario(delay, damping) == asked.scenario(*cell.overrides)
+        assert at(delay, damping) == asked.scenario(*cell.overrides)
 
 
 @pytest.mark.parametrize(

@@ -98,14 +98,6 @@ def _mark(axes: Axes, results: BenchResults, task: str, links: list[str]) -> Non
             axes.plot(*at, marker=".", color="#ffffff", markersize=2.0)
 
 
-def write_bench_figures(results: BenchResults, folder: Path) -> list[Path]:
-    """Writes all figures into a folder, and returns their paths."""
-    paths = [folder / f"bench-{name}.png" for name in FIGURES_OF_BENCH]
-    for path, name in zip(paths, FIGURES_OF_BENCH, strict=True):
-        style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
-    return paths
-
-
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
     """Writes the page, the tables and the figures of a suite, and returns their paths."""
     texts = {
@@ -115,4 +107,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     }
     for name, text in texts.items():
         write_whole(folder / name, text)
-    return [*(folder / name for name in texts), *write_bench_figures(results, folder)]
+    figures = {folder / f"bench-{name}.png": name for name in FIGURES_OF_BENCH}
+    for path, name in figures.items():
+        style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
+    return [*(folder / name for name in texts), *figures]

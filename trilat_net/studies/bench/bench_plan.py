@@ -345,7 +345,11 @@ def _list_cells(
         for law in (law for law in laws_of_form if law in laws):
             for task in (task for task in tasks if explain_no_cell(law, form, task) == "no gains"):
                 for link, (random, mean_ms) in facts.items():
-                    tuned = _find_gains(gains, form, law, choose_round_trip(2.0 * mean_ms))
+                    at_ms = choose_round_trip(2.0 * mean_ms)
+                    tuned = gains.get((form, law, at_ms))
+                    if tuned is None:
+                        remedy = f"make them: trilat bench --tune --law {law}"
+                        raise UsageError(f"there are no gains of {law} for {at_ms} ms; {remedy}")
                     chosen = tuple(range(1, 1 + (seeds if random else 1)))
                     yield BenchCell(task, law, link, form, tuned, chosen)
 
@@ -355,17 +359,6 @@ def _describe_link(link: str) -> tuple[bool, float]:
     scenario = load_tuning_scenario(BASES["two"], name_settings({"link": dict(LINKS[link])})).scenario
     first = next(iter(scenario.links.values()))
     return scenario.random, first.moments().mean_ms
-
-
-def _find_gains(
-    gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, round_trip_ms: int
-) -> TunedGains:
-    found = gains.get((form, law, round_trip_ms))
-    if found is None:
-        raise UsageError(
-            f"there are no gains of {law} for {round_trip_ms} ms; make them: trilat bench --tune --law {law}"
-        )
-    return found
 
 
 def _choose(option: str, name: str, known: Sequence[str]) -> str:

@@ -96,7 +96,14 @@ class BenchRun(msgspec.Struct, frozen=True):
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
 
-QUANTITIES_OF_RUNS = ("error_rad", "effort_nm", "hand_nm", "force_peak_n", "stiffness_n_m", "settled_s")
+QUANTITIES = {
+    "error_rad": "RMS distance of the slave from its users, rad",
+    "effort_nm": "effort, RMS of tau - G(q), N m",
+    "hand_nm": "RMS torque of the hands, N m",
+    "force_peak_n": "largest force of the wall, N",
+    "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
+    "settled_s": "since when all arms stay where they end, s",
+}
 """The numbers of a run that are averaged over its seeds; those of runs without contact are masked."""
 LEAST_SEEDS = 20
 """Of fewer runs there is no interval."""
@@ -169,10 +176,10 @@ class BenchResults(Result):
         yield tabulate_verdicts(self)
         for task in self.plan.tasks:
             yield tabulate_properties(self, task)
-        for asked in list_quantities(self):
-            if asked.key != "effort_nm":
-                yield from ("", f"{asked.task}: {asked.words}")
-                yield tabulate_quantity(self, asked)
+        for task, key in list_quantities(self):
+            if key != "effort_nm":
+                yield from ("", f"{task}: {QUANTITIES[key]}")
+                yield tabulate_quantity(self, task, key)
         if self.plan.study == "round-trips":
             yield tabulate_round_trips(self)
 
@@ -220,31 +227,12 @@ _SHOWN_LINKS = ("rtt8", "rtt136", "rtt544", "rtt1088", "rtt136-loss50", "4g", "5
 OPEN_MARK, UNSTABLE_MARK = "?", "!"
 
 
-class BenchQuantity(NamedTuple):
-    """A number of the runs of a task, as it is shown."""
-
-    task: str
-    key: str
-    words: str
-
-
-_WORDS = {
-    "error_rad": "RMS distance of the slave from its users, rad",
-    "effort_nm": "effort, RMS of tau - G(q), N m",
-    "settled_s": "since when all arms stay where they end, s",
-    "hand_nm": "RMS torque of the hands, N m",
-    "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
-    "force_peak_n": "largest force of the wall, N",
-}
-_ALWAYS = ("error_rad", "effort_nm", "settled_s")
-
-
-def list_quantities(results: BenchResults) -> list[BenchQuantity]:
-    """Returns what is shown of the tasks that ran."""
-    tasks = results.plan.tasks
-    found = [BenchQuantity(task, key, _WORDS[key]) for key in _ALWAYS for task in tasks]
+def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
+    """Returns what is shown of the tasks that ran: each with a key of `QUANTITIES`."""
     more = {"free": ["hand_nm"], "disagree": ["hand_nm"], "contact": ["stiffness_n_m", "force_peak_n"]}
-    return found + [BenchQuantity(task, key, _WORDS[key]) for task in tasks for key in more.get(task, [])]
+    tasks = results.plan.tasks
+    found = [(task, key) for key in ("error_rad", "effort_nm", "settled_s") for task in tasks]
+    return found + [(task, key) for task in tasks for key in more.get(task, [])]
 
 
 def name_law(law: str, form: str) -> str:
@@ -292,21 +280,21 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
     return TextTable((task, *heads), rows, align="lr")
 
 
-def tabulate_quantity(results: BenchResults, asked: BenchQuantity) -> TextTable:
+def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
     """Returns a row per law and a column per link: means over seeds; marks say what is not stable."""
     links = results.plan.links
     if len(links) > len(_SHOWN_LINKS):
         links = [link for link in links if link in _SHOWN_LINKS]
     rows = []
     for law, form in results.plan.laws:
-        missing = explain_no_cell(law, form, asked.task)
+        missing = explain_no_cell(law, form, task)
         cells = []
         for link in links:
-            place = next(results.of(asked.task, law, link), None)
-            cells.append(missing if place is None else _describe_place(place, asked.key))
+            place = next(results.of(task, law, link), None)
+            cells.append(missing if place is None else _describe_place(place, quantity))
         if missing != "-":
             rows.append((name_law(law, form), *cells))
-    return TextTable((asked.task, *links), rows, align="lr")
+    return TextTable((task, *links), rows, align="lr")
 
 
 def _describe_place(place: BenchPlace, quantity: str) -> str:
@@ -392,8 +380,8 @@ def build_bench_page(results: BenchResults, command: str) -> str:
     ]
     for task in results.plan.tasks:
         parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
-    for asked in list_quantities(results):
-        parts += [f"## {asked.task}: {asked.words}", tabulate_quantity(results, asked).markdown()]
+    for task, key in list_quantities(results):
+        parts += [f"## {task}: {QUANTITIES[key]}", tabulate_quantity(results, task, key).markdown()]
     if results.plan.study == "round-trips":
         parts += ["## Delay against loss", tabulate_round_trips(results).markdown()]
     parts += ["## Gains", tabulate_gains(results).markdown()]
@@ -432,7 +420,7 @@ def _place_row(place: BenchPlace) -> dict[str, Any]:
         "share_low": low,
         "share_high": high,
     }
-    for key in QUANTITIES_OF_RUNS:
+    for key in QUANTITIES:
         value = place.mean(key)
         row[key], row[f"{key}_half"] = value if isinstance(value, MeanInterval) else (value, None)
     row |= dict.fromkeys(_GONE)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import evaluate_ramps
-from ...analysis.run_end import THROWN_RAD, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.run_end import THROWN_RAD, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.torque_sources import list_walls, wall_force
 from ...analysis.twin_growth import TwinGrowth, judge_end_by_twins, measure_virtual_twins
@@ -28,8 +28,8 @@ from ...files import make_results_folder, write_whole
 from ...scenario import Scenario
 from ...scenario.operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..record_batches import RecordBatch, join_batches, run_compiled_in_batches
-from ..study_folder import StudyFolder, build_resume_hint, describe_program
+from ..record_batches import RecordBatch, run_whole
+from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import BenchCell, BenchPlan, name_settings
 from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
@@ -96,14 +96,8 @@ def run_bench_task(task: BenchRunTask) -> BenchRun:
 def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
     """Makes a run of so many seconds and its twins, and judges both."""
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
-    records = {name: join_batches(blocks) for name, blocks in kept.items()}
-    trace = RunTrace(
-        [one.reduce() for one in records.values()], [one.tau_x[-1] for one in records.values()], diverged_s
-    )
-    end, growth = classify_run_end(scenario, trace), TwinGrowth("none were asked for")
-    if diverged_s is None and twins:
+    (records, end), growth = run_whole(scenario), TwinGrowth("none were asked for")
+    if end.diverged_at_s is None and twins:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
     found = judge_end_by_twins(end, growth, settles=None, rises=False)
     return _JudgedRun(scenario, records, end, growth, found.stability, found.reason or end.text)
@@ -243,7 +237,9 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
             "folder with --out"
         )
     remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(chosen))
-    return BenchFolder(chosen, plan, facts, origin, JOURNAL_NAME, BenchRun, remedy)
+    return BenchFolder(
+        chosen, plan, facts, remedy, lambda: RunJournal(chosen / JOURNAL_NAME, origin, BenchRun, remedy)
+    )
 
 
 def run_bench(

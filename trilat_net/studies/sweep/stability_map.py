@@ -15,6 +15,7 @@ P+d counts as it is computed, from tick to tick; of the roots' line only those w
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -581,19 +582,6 @@ class StabilityMap(NamedTuple):
     title: str
 
 
-class PanelScenarios(NamedTuple):
-    """The scenarios of a panel along the keys x and y, of its cells and between them. Picklable."""
-
-    plan: SweepPlan
-    fixed: tuple[str, ...]
-    x: str
-    y: str
-
-    def scenario(self, right: float, up: float) -> Scenario:
-        """Returns the scenario of a place."""
-        return self.plan.scenario(*self.fixed, format_override(self.x, right), format_override(self.y, up))
-
-
 def build_stability_map(
     results: SweepResults,
     commands: tuple[str, ...],
@@ -616,7 +604,7 @@ def build_stability_map(
         return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
     lines = [
-        [trace_zero_exponent(panel), trace_closed_form(one.scenario, drawn.x, drawn.y)]
+        [trace_zero_exponent(panel), trace_closed_form(one, drawn.x, drawn.y)]
         for panel, one in zip(drawn.panels, at, strict=True)
     ]
     remarks: dict[str, None] = {}
@@ -632,17 +620,22 @@ def build_stability_map(
     return StabilityMap(drawn, kept, tuple(remarks), commands, title)
 
 
-def _column(task: tuple[PanelScenarios, float, PlaneAxis]) -> GrowthColumn:
+def _column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
     at, x, y = task
-    return compute_growth_column([at.scenario(x, up) for up in y.values], y.key, y.values)
+    return compute_growth_column([at(x, up) for up in y.values], y.key, y.values)
 
 
-def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelScenarios:
-    """Returns what makes the scenario of any place of a panel."""
+def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> ScenarioAt:
+    """Returns what makes the scenario of any place of a panel along the keys x and y; it is picklable."""
     settings = dict(panel.settings)
     fixed = plan.laws.get(settings.pop(LAW_AXIS, next(iter(plan.laws), "")), ())
     others = tuple(format_override(key, value) for key, value in settings.items())
-    return PanelScenarios(plan, (*fixed, *others), x, y)
+    return partial(load_place, plan, (*fixed, *others), x, y)
+
+
+def load_place(plan: SweepPlan, fixed: Sequence[str], x: str, y: str, right: float, up: float) -> Scenario:
+    """Returns the scenario of a place, of a cell or between some, along the keys x and y."""
+    return plan.scenario(*fixed, format_override(x, right), format_override(y, up))
 
 
 def build_sweep_command(plan: SweepPlan, *more: str) -> str:

@@ -402,7 +402,9 @@ SweepFolder = StudyFolder[SweepPlan, CellRun]
 def _folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolder:
     study = hashlib.sha256(_text(facts).encode()).hexdigest()
     remedy = build_resume_hint("sweep", "--resume", str(path))
-    return SweepFolder(path, plan, facts, study, JOURNAL_FILE, CellRun, remedy)
+    return SweepFolder(
+        path, plan, facts, remedy, lambda: RunJournal(path / JOURNAL_FILE, study, CellRun, remedy)
+    )
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:

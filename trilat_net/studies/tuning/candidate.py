@@ -29,9 +29,7 @@ from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
 from ...analysis.run_end import (
     EndBehaviour,
     RunEnd,
-    RunTrace,
     Stability,
-    classify_run_end,
     find_hanging_sites,
 )
 from ...analysis.site_signals import SETTLED_ERROR_RAD
@@ -46,7 +44,7 @@ from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ...scenario.validate import refuse_live_only
 from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
-from ..record_batches import RecordBatch, join_batches, run_compiled_in_batches
+from ..record_batches import RecordBatch, run_whole
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02
@@ -315,10 +313,8 @@ class _Run(NamedTuple):
 
 
 def _run(scenario: Scenario) -> _Run:
-    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
-    records = list(map(join_batches, kept.values()))
-    trace = RunTrace([one.reduce() for one in records], [one.tau_x[-1] for one in records], diverged_s)
+    of_site, end = run_whole(scenario)
+    records = list(of_site.values())
     t_s, q, e = _aligned(records)
     mean = q.mean(axis=0)
     apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
@@ -333,7 +329,7 @@ def _run(scenario: Scenario) -> _Run:
         efforts.append(np.mean(beyond_nm**2))
         saturated.append(np.mean(np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm))
     return _Run(
-        end=classify_run_end(scenario, trace),
+        end=end,
         fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
         apart_rad=float(np.abs(apart[:, last]).max()),
         spread_rad=_rms(apart),
