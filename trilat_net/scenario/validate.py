@@ -180,6 +180,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         why = f"; {drawn['value']:g} was drawn with seed {resolved['seed']}" if drawn else ""
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
     _check_joint_space(scenario)
+    _check_damping(scenario)
     _check_start_poses(scenario)
     for name in scenario.names:
         _check_limits(scenario, name)
@@ -207,12 +208,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _check_joint_space(scenario: Scenario) -> None:
-    """Refuses arms that share different coordinates, and gains that a light joint cannot take.
-
-    A torque -K qd that is held over a period h makes a single joint of inertia M swing from tick to tick from
-    K h / M = 1 on (of the second-order scheme, 2 of the digital one); of several joints the largest
-    eigenvalue of h K M^-1 counts, here in the start pose.
-    """
+    """Refuses arms that share different coordinates, and laws that are for no chain."""
     counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     first = scenario.names[0]
     spaces = {name: site.task.space for name, site in scenario.sites.items()}
@@ -228,19 +224,29 @@ def _check_joint_space(scenario: Scenario) -> None:
                 "compared one by one, so all arms need as many joints, or a task (task.space)",
                 path=f"sites.{name}.arm",
             )
-    for name, model in scenario.arms.items():
-        site = scenario.sites[name]
-        if model.chain is not None and site.control.planar:
+        law = scenario.sites[name].control
+        if scenario.arms[name].chain is not None and law.planar:
             raise ScenarioError(
-                f"{site.control.tag} has the regressor of the planar arm of two links, and this arm is a "
-                "chain: choose adaptive",
+                f"{law.tag} has the regressor of the planar arm of two links, and this arm is a chain: choose "
+                "adaptive",
                 path=f"sites.{name}.control.law",
             )
+
+
+def _check_damping(scenario: Scenario) -> None:
+    """Refuses gains that a light joint cannot take.
+
+    A torque -K qd that is held over a period h makes a single joint of inertia M swing from tick to tick from
+    K h / M = 1 on (of the second-order scheme, 2 of the digital one); of several joints the largest
+    eigenvalue of h K M^-1 counts, here in the start pose.
+    """
+    for name, model in scenario.arms.items():
+        site = scenario.sites[name]
         if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
         gains = site.control.gains(model.theta)
-        damping = np.zeros(counts[name]) + gains.Kp + gains.d + np.divide(gains.rho, gains.width)
-        damping += gains.Kd if spaces[name] == "joints" else 0.0
+        damping = np.zeros(model.counts.joints) + gains.Kp + gains.d + np.divide(gains.rho, gains.width)
+        damping += gains.Kd if site.task.space == "joints" else 0.0
         scaled = np.sqrt(damping)
         spread, modes = np.linalg.eigh(
             scaled * np.linalg.inv(model.inertia(np.array(site.q0_rad))) * scaled[:, None]
