@@ -227,8 +227,8 @@ def _check_joint_space(scenario: Scenario) -> None:
         law = scenario.sites[name].control
         if scenario.arms[name].chain is not None and law.planar:
             raise ScenarioError(
-                f"{law.tag} has the regressor of the planar arm of two links, and this arm is a chain: choose "
-                "adaptive",
+                f"{law.tag} has the regressor of the planar arm of two links, and this arm is a chain: "
+                "choose adaptive",
                 path=f"sites.{name}.control.law",
             )
 
