@@ -8,7 +8,6 @@ import dataclasses
 import time
 
 import numpy as np
-from trilat_net.studies.sweep.cell_result import classify_cell
 
 from tests.theory.delay_equations import equations
 from trilat_net.errors import ScenarioError
@@ -17,6 +16,7 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.process import count_cores, worker_pool
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
+from trilat_net.studies.sweep.sweep_cell import classify_cell
 
 from .stopwatch import best_s
 
