@@ -251,6 +251,8 @@ def _solve_for_root(pencil: Pencil, first: complex, names: Sequence[str]) -> Cha
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
             delta, derivative = pencil.at(s)
+            if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):  # exp(-s T) far to the left
+                return None
             try:
                 if pencil.E is None:
                     mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
