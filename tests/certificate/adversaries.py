@@ -64,8 +64,8 @@ SEEN = 1e-6
 SLOW_PER_S = 0.01
 """A stable root this slow hardly dies within eight times the run: then the root decides."""
 NEAR_AN_EDGE = (0.8, 1.2)
-DEAD_RAD_S = 1e-11
-"""Slower is at rest."""
+DEAD_RAD_S, AT_REST_RAD_S = 1e-11, 1e-4
+"""Slower has died; slower than the second is called a rest, if every push dies."""
 NUDGE_RAD, LINEAR_RAD_S, LOST_RAD_S = 1e-8, 1e-5, 1e-13
 """A push; a difference that is made small again; one that is lost in the rounding of the numbers."""
 WINDOW_S = 4.0
@@ -444,7 +444,8 @@ def find_wide_truth(scenario: Scenario) -> Truth:
 
     The exponent is that of a push in the last three quarters. One so small that it does not double or halve
     a motion within the judged half of the run itself is near an edge, and so is a motion that dies although a
-    push in it grows, for the while that it lasts.
+    push in it grows, for the while that it lasts, and one slower than `AT_REST_RAD_S` that drawn delays keep
+    up although every push in it dies.
     """
     whole, ends_s = prolong_scenario(scenario, LONGER * scenario.duration_s), scenario.duration_s
     run = FusedRun(whole)
@@ -455,6 +456,7 @@ def find_wide_truth(scenario: Scenario) -> Truth:
     exponent = measure_exponent(whole, LONGER * ends_s)
     lasts = late > max(0.5 * early, DEAD_RAD_S)
     near = abs(exponent) * 0.5 * ends_s < np.log(2.0) or (exponent > GROWS_PER_S and not lasts)
+    near |= scenario.links_random and lasts and exponent < -GROWS_PER_S and late < AT_REST_RAD_S
     return Truth(lasts or exponent > GROWS_PER_S, exponent, bool(near))
 
 
