@@ -105,7 +105,8 @@ class SearchSpace(NamedTuple):
 
     def controls(self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
         """Returns the control of every site; gains of chains that make a torque have a number per joint."""
-        tables = {name: self._write(scenario, name, knowledge, gains) for name in scenario.names}
+        longest_ms = 0.5 * _find_longest_trip_ms(scenario)
+        tables = {name: self._write(scenario, name, knowledge, gains, longest_ms) for name in scenario.names}
         weights = weigh_joints(scenario)
         for table in tables.values() if weights else ():
             for key in _TORQUE_GAINS:
@@ -114,7 +115,12 @@ class SearchSpace(NamedTuple):
         return tables
 
     def _write(
-        self, scenario: Scenario, site: str, knowledge: ModelInformation, gains: GainValues
+        self,
+        scenario: Scenario,
+        site: str,
+        knowledge: ModelInformation,
+        gains: GainValues,
+        longest_ms: float,
     ) -> dict[str, Any]:
         if self.kind is None:
             told = {"gravity": knowledge.gravity} if self.told == "gravity" else {}
@@ -128,7 +134,7 @@ class SearchSpace(NamedTuple):
             knowledge.gravity,
             estimate,
             knowledge.box_sides(scenario, site),
-            0.5 * _find_longest_trip_ms(scenario),
+            longest_ms,
         )
         return {"law": law, **self.kind.write_control(gains, at)}
 
