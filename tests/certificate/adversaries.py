@@ -615,8 +615,8 @@ class Judged(NamedTuple):
 
     drawn: Drawn
     truth: Truth
-    certified: str
-    swept: str
+    certified: str = ""
+    swept: str = ""
 
 
 def judge_experiment(seed: int, *, stored: bool = True) -> Judged:
@@ -680,9 +680,9 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
     )
 
 
-def tally_clear(judged: Iterable[Judged]) -> Tally:
-    """The same of what `certify` says, of those that are not near an edge."""
-    return tally(one for one in judged if not one.truth.near)
+def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
+    """The same, of those that are not near an edge."""
+    return tally((one for one in judged if not one.truth.near), by)
 
 
 def main() -> None:

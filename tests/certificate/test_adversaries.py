@@ -14,13 +14,16 @@ from trilat_net.scenario import Scenario
 from .adversaries import (
     ROWS,
     SEEDS,
+    Judged,
     Row,
+    Tally,
     count_stored,
     find_truth,
     judge_experiment,
     read_truth,
     say_of,
     say_of_run,
+    say_of_sweep,
     tally,
     tally_clear,
     under_noise,
@@ -139,7 +142,23 @@ def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
 )
 def test_whatever_is_drawn_does_not_fool_it(first: int, count: int) -> None:
     """Of those near no edge; `truths.csv` has the rates at which pushes grow."""
-    found = tally_clear(map(judge_experiment, range(first, first + count)))
+    _hold(tally_clear(map(judge_experiment, range(first, first + count))))
+
+
+@pytest.mark.parametrize("first", range(WIDE_FROM, WIDE_FROM + 360, 90))
+def test_whatever_is_drawn_does_not_fool_a_sweep(first: int) -> None:
+    """The same by the compiled run alone, without a log; a chain of its own is one more layout to compile."""
+    drawn = [(seed, draw_experiment(seed)) for seed in range(first, first + 90)]
+    words = [
+        Judged(one, read_truth(seed, one), swept=say_of_sweep(one.scenario))
+        for seed, one in drawn
+        if not one.has.endswith("chain")
+    ]
+    _hold(tally_clear(words, "swept"))
+
+
+def _hold(found: Tally) -> None:
+    """No unstable run is called stable; few words are wrong otherwise, or missing."""
     assert found.false_ok == 0
     assert found.false_alarm <= 0.01 * found.runs
     assert found.undecided <= max(1, OPEN_SHARE * found.runs)

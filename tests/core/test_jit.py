@@ -1,5 +1,11 @@
 """Machine code of the cache: what one process has compiled another may load, beside that of a third."""
 
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
 from tests.core.compiled import printed
 
 SYMBOLS = """
@@ -21,3 +27,30 @@ def test_symbols_of_leaves_tell_layouts_apart_whatever_a_process_has_met_before(
     )
     assert one == other
     assert one["6"] != one["7"]
+
+
+CLOSURES = """
+import sys, numba, numpy as np
+from trilat_net.core.jit import compile_named
+for factor in map(float, sys.argv[1:]):
+    def call(values):
+        for i in range(values.shape[0]):
+            values[i] *= factor
+    made = compile_named(call, f"times_{factor}", numba.types.none(numba.float64[::1]))
+    made(values := np.ones(1))
+    print(values[0], made.stats.cache_hits.total())
+"""
+
+
+def test_closures_of_one_form_that_two_processes_compiled_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As built-in laws are: the same numbers in and out, another torque; one process loads them all."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    file = tmp_path / "closures.py"
+    file.write_text(CLOSURES)
+    run = [
+        subprocess.run([sys.executable, file, *factors], capture_output=True, text=True, check=True).stdout
+        for factors in ("2", "3", "23")
+    ]
+    assert [said.split() for said in run] == [["2.0", "0"], ["3.0", "0"], ["2.0", "1", "3.0", "1"]]

@@ -6,6 +6,7 @@ zero raise as they do in plain Python.
 """
 
 import dis
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -20,7 +21,7 @@ from numba.extending import intrinsic
 
 from ..errors import LawFailed, ScenarioError
 from .control import limit_torque
-from .jit import bind_leaf, leaf
+from .jit import bind_leaf, compile_named, leaf
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
@@ -145,6 +146,15 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 
 
 @cache
+def _digest_built_in(torque: Callable[..., Any]) -> str:
+    """Returns a hash of the sources of the laws of this package; empty for a law of somebody else's."""
+    file = Path(torque.__code__.co_filename)
+    if file.parent != Path(__file__).parents[1] / "laws":
+        return ""
+    return hashlib.sha256(b"".join(one.read_bytes() for one in sorted(file.parent.glob("*.py")))).hexdigest()
+
+
+@cache
 def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     """Returns a compiled function of the law's numbers, the site, its links, what came and what is sent."""
     law_dtype, received_dtype, to_all_dtype, sent_dtype = form.law, form.received, form.to_all, form.sent
@@ -167,6 +177,9 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     rows = [kinds.typeof(np.zeros(1, dtype)) for dtype in (form.site, form.link)]
     floats = types.float64
     signature = types.none(floats[::1], *rows, floats[:, ::1], floats[::1])
+    if made_of := _digest_built_in(torque):
+        name = hashlib.sha256(f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode())
+        return compile_named(call, f"law_{name.hexdigest()[:32]}", signature, **_CHECKED)
     called = numba.njit(signature, **_CHECKED)(call)
     if any(known.return_type != types.none for known in compute.nopython_signatures):
         raise NumbaError("torque returns something: compiled, it writes now.tau instead")

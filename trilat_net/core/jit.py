@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
 
 from ..process import let_signals_kill
 
@@ -115,13 +116,38 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
     return cast(Callable[P, R], compiled.compile(tuple(map(numba.typeof, arguments))))
 
 
+def _at_cache(make: Callable[[], R]) -> R:
+    """Makes something of Numba's whose machine code is kept in the directory for compiled leaves."""
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = str(_CACHE)
+    try:
+        return make()
+    finally:
+        _config.CACHE_DIR = before
+
+
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
     if _CACHE is None:
         return cast(Callable[P, R], numba.njit(**_OPTIONS)(function))
-    before = _config.CACHE_DIR
-    _config.CACHE_DIR = str(_CACHE)
-    try:
-        return cast(Callable[P, R], numba.njit(cache=True, **_OPTIONS)(function))
-    finally:
-        _config.CACHE_DIR = before
+    return _at_cache(lambda: cast(Callable[P, R], numba.njit(cache=True, **_OPTIONS)(function)))
+
+
+class _NamedCache(FunctionCache):
+    """Machine code of a function whose name tells all that it is made of, what it closes over too."""
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
+        return signature, codegen.magic_tuple()
+
+
+def compile_named(function: Callable[..., None], name: str, signature: Any, **options: Any) -> Any:
+    """Compiles a closure for a signature, or loads it if one of this name was compiled before.
+
+    The name goes into the symbols of the machine code: no two closures may share one in any process.
+    """
+    function.__qualname__ = name
+    dispatcher = numba.njit(**options)(function)
+    if _CACHE is not None:
+        dispatcher._cache = _at_cache(lambda: cast(Any, _NamedCache)(function))
+    dispatcher.compile(signature)
+    return dispatcher
