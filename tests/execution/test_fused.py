@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tests.core.compiled import printed
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
-from trilat_net.analysis.metrics.metric_catalogue import QUANTITIES
+from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution import virtual
@@ -134,7 +134,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     fused.advance(0.5 * scenario.duration_s)
     fused.advance(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
-    whole = {one.key: compute_log_metrics(log).whole(one).value for one in QUANTITIES if one.key in TOTALS}
+    whole = {one.key: compute_log_metrics(log).whole(one).value for one in quantities() if one.key in TOTALS}
     found = fused.totals._asdict()
     for key in TOTALS:
         assert found[key] == (whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)), key

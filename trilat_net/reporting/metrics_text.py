@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 
 from ..analysis.metrics.log_metrics import LogMetrics
-from ..analysis.metrics.metric_catalogue import QUANTITIES, Metric, Quantity
+from ..analysis.metrics.measures import Metric, Quantity, quantities
 from .result_text import Block, MarkedText
 from .terminal_output import sanitize
 from .text_table import TextTable
@@ -20,8 +20,8 @@ _MAX_LINES = 16
 def compose_metrics(found: LogMetrics) -> Iterator[Block]:
     """Yields a table per group and kind of place, statics, impedances, and reasons of missing numbers."""
     reasons: dict[str, list[str]] = {}
-    for (group, _), quantities in groupby(QUANTITIES, key=lambda one: (one.group, one.of)):
-        yield from _compose_group(group, list(quantities), found, reasons)
+    for (group, _), members in groupby(quantities(), key=lambda one: (one.group, one.of)):
+        yield from _compose_group(group, list(members), found, reasons)
     yield from _compose_statics(found)
     yield from _compose_impedance(found)
     for why, where in reasons.items():
@@ -33,10 +33,10 @@ def _explain(what: str, why: str) -> MarkedText:
 
 
 def _compose_group(
-    group: str, quantities: Sequence[Quantity], found: LogMetrics, reasons: dict[str, list[str]]
+    group: str, members: Sequence[Quantity], found: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
     """Yields a row per quantity and a column per place that apply; collects reasons of missing numbers."""
-    rows = {quantity: found.places(quantity) for quantity in quantities}
+    rows = {quantity: found.places(quantity) for quantity in members}
     could = {q: places for q, places in rows.items() if any(one.applies for one in places.values())}
     names = [
         name for name in next(iter(rows.values())) if any(places[name].applies for places in could.values())

@@ -196,6 +196,8 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         no_gaps: true: there is a record of every tick, from 0 to the last that any site had to make; false
             asks nothing.
         windows: expectations of parts of the run, see `ExpectWindow`.
+        metrics: [least, most] of any number that `trilat metrics` measures, by its key, of the whole run as
+            `trilat compare` has it.
     """
 
     stable: bool | None = None
@@ -217,6 +219,7 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     late_samples_max: Annotated[int, Meta(ge=0)] | None = None
     no_gaps: bool = False
     windows: tuple[ExpectWindow, ...] = ()
+    metrics: dict[str, LeastMost] = {}
 
     @property
     def asks(self) -> bool:
@@ -239,12 +242,15 @@ def find_expect_problem(expect: Expect, sites: Mapping[str, int]) -> KeyProblem 
     for n, window in enumerate(expect.windows):
         if found := find_window_problem(window, sites):
             return found._replace(key=f"windows[{n}].{found.key}".rstrip("."))
+    for key, (low, high) in expect.metrics.items():
+        if low > high:
+            return KeyProblem(f"metrics.{key}", f"must be [least, most], is [{low:g}, {high:g}]")
     for least, most in (
         ("peak_error_min_rad", "peak_error_max_rad"),
         ("end_error_min_rad", "end_error_max_rad"),
         ("mean_age_min_ms", "mean_age_max_ms"),
     ):
-        low, high = getattr(expect, least), getattr(expect, most)
-        if low is not None and high is not None and low > high:
-            return KeyProblem(least, f"must be at most {most} = {high:g}, is {low:g}")
+        floor, ceiling = getattr(expect, least), getattr(expect, most)
+        if floor is not None and ceiling is not None and floor > ceiling:
+            return KeyProblem(least, f"must be at most {most} = {ceiling:g}, is {floor:g}")
     return None

@@ -14,10 +14,13 @@ import msgspec
 import numpy as np
 
 from ..analysis.arm_rows import build_arm_rows
+from ..analysis.metrics.log_metrics import measure_whole
+from ..analysis.metrics.measures import Metric
 from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
 from ..analysis.torque_sources import list_walls, wall_force
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S
 from ..core.vectors import Array
+from ..execution.virtual import simulate_scenario
 from ..execution.virtual_comparison import find_absent_samples
 from ..log.log_reader import Log
 from ..scenario import Expect, Scenario
@@ -205,7 +208,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     `end` is its judgement. None stands for what the run cannot give: too short, or it did not come to it.
     `end_...` is of the last second, `ages` has links "j->i", `late_samples` came too late for what their link
     meant to do with them, `missing` counts ticks without a record, and a window has no quantities where the
-    run ended before it did.
+    run ended before it did. `metrics` has those of `docs/metrics.md` that are expected.
     """
 
     simulated_s: float
@@ -222,6 +225,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     late_samples: int
     missing: int
     windows: tuple[dict[str, Range], ...] = ()
+    metrics: dict[str, Metric] = {}
 
 
 def compute_run_metrics(
@@ -293,6 +297,8 @@ def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
 
 def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns its metrics."""
+    if scenario.expect.metrics:
+        return measure_log(simulate_scenario(scenario))
     tallies = {name: _site_stats(scenario, name) for name in scenario.names}
     run = run_in_batches(scenario, {name: tally.add for name, tally in tallies.items()})
     made = sum(tally.records for tally in tallies.values())
@@ -322,13 +328,14 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         tally.add(RecordBatch(part.t_ns, part.q, part.qd, part.e, part.tau, part.tau_x, used))
         wanted = scenario.ticks(name) if diverged_at_s is None else made.get(name, 0)
         missing += max(0, wanted - len(part))
-    return compute_run_metrics(
+    found = compute_run_metrics(
         scenario,
         tallies,
         diverged_at_s=diverged_at_s,
         late_samples=sum(sample.arrived_tick is not None for sample in find_absent_samples(log)),
         missing=missing,
     )
+    return msgspec.structs.replace(found, metrics=measure_whole(log, scenario.expect.metrics))
 
 
 def _site_stats(scenario: Scenario, site: str) -> SiteStats:

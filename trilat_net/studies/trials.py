@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import asdict
 
+from ..analysis.metrics.log_metrics import find_quantity
 from ..analysis.run_end import Stability
 from ..core.jit import is_core_cached
 from ..errors import LawFailed, LogError, ScenarioError, TrilatError
@@ -51,7 +52,7 @@ from ..scenario.scenario_reader import read_experiment, reseed_scenario
 from .commands import format_command, format_toml_value, set_options
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
-from .measure_run import RunMetrics, measure_log, measure_virtual_run
+from .measure_run import Range, RunMetrics, measure_log, measure_virtual_run
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
@@ -90,6 +91,7 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
         *_evaluate_poses(expect, metrics),
         *([gaps] if expect.no_gaps else []),
         *_evaluate_windows(expect, metrics),
+        *_evaluate_metrics(expect, metrics),
     ]
 
 
@@ -146,20 +148,31 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
-        for key, (least, most) in window.asked:
+        for key, limits in window.asked:
             site = f" {window.site}" if window.site else ""
             name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
-            unit = _find_unit(key)
-            wanted = f"{least:g} to {most:g} {unit}".rstrip()
-            found = ranges.get(key)
-            if found is None:
-                yield ExpectationResult(name, False, "never", wanted)
-                continue
-            text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
-            spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
-            margin = spare / half if half else None
-            value = found.most if found.least == found.most else None
-            yield ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)
+            yield _compare_with_range(name, ranges.get(key), limits, _find_unit(key))
+
+
+def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    for key, limits in expect.metrics.items():
+        value, why, _ = metrics.metrics[key]
+        found = None if value is None else Range(value, value)
+        yield _compare_with_range(f"metrics.{key}", found, limits, find_quantity(key).unit, why)
+
+
+def _compare_with_range(
+    name: str, found: Range | None, limits: Sequence[float], unit: str, why: str = "never"
+) -> ExpectationResult:
+    least, most = limits
+    wanted = f"{least:g} to {most:g} {unit}".rstrip()
+    if found is None:
+        return ExpectationResult(name, False, why, wanted)
+    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
+    spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
+    margin = spare / half if half else None
+    value = found.most if found.least == found.most else None
+    return ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)
 
 
 class TrialResult(NamedTuple):
@@ -287,6 +300,11 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
             "synchronised_by_s = 12.0; the template of `trilat scenario new` lists them all",
             source=source,
         )
+    for key in expect.metrics:
+        try:
+            find_quantity(key)
+        except KeyError as error:
+            raise ScenarioError(error.args[0], path=f"expect.metrics.{key}", source=source) from None
     by_s = expect.synchronised_by_s
     if by_s is not None and by_s >= end_s:
         problem = f"must be before the end of the run at {end_s:g} s, is {by_s:g}"

@@ -10,7 +10,7 @@ import pytest
 import trilat_net
 from tests.analysis import logs
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
-from trilat_net.analysis.metrics.metric_catalogue import QUANTITIES
+from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 
 from .written import simulated
@@ -25,7 +25,7 @@ def told(log: Log) -> dict[str, Any]:
     assert set(found["sites"]) == set(log.sites)
     assert len(found["links"]) == len(log.sites) * (len(log.sites) - 1)
     unknown = found["unknown"]
-    for quantity in QUANTITIES:
+    for quantity in quantities():
         kind = "run" if quantity.of == "run" else f"{quantity.of}s"
         places = {"run": found["run"]} if kind == "run" else found[kind]
         for name, values in places.items():
@@ -115,5 +115,5 @@ def test_loops_are_told_of_where_a_clock_was_read() -> None:
 
 def test_the_docs_have_a_line_for_every_quantity() -> None:
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
-    for quantity in QUANTITIES:
+    for quantity in quantities():
         assert f"`{quantity.key}`" in page, quantity.key

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.log_editing import edited, opened, recorded, without
 from trilat_net.core.two_link_arm import end_effector_jacobian
+from trilat_net.errors import ScenarioError
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import ExpectWindow, window_quantities
@@ -28,6 +29,7 @@ from trilat_net.studies.record_batches import (
     run_compiled_in_batches,
     run_in_batches,
 )
+from trilat_net.studies.trials import evaluate_expectations
 
 RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
 SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}
@@ -319,3 +321,30 @@ def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any
         one, other = join_batches(ticked[name]), join_batches(looped[name])
         for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+
+
+def test_any_metric_may_be_expected_of_a_run_and_of_its_log() -> None:
+    """Equal to what `trilat compare` has of the whole run; what has no number does not hold, and says why."""
+    asked = {"chatter_nm": [0.0, 1e-9], "rms_error_rad": [0.0, 10.0], "theta_error_last": [0.0, 1.0]}
+    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})
+    log = trilat_net.simulate(scenario)
+    compared = trilat_net.compare(log, log).metrics
+    run, logged = measure_virtual_run(scenario), measure_log(log)
+    assert run.metrics == logged.metrics
+    found = {one.key: one for one in evaluate_expectations(scenario.expect, run)}
+    assert [found[f"metrics.{key}"].held for key in asked] == [False, True, False]
+    assert found["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
+    assert "nothing is learnt" in found["metrics.theta_error_last"].measured
+
+
+@pytest.mark.parametrize(
+    ("metrics", "said"),
+    [
+        ({"chater_nm": [0, 1]}, "expect.metrics.chater_nm: no metric 'chater_nm'; did you mean 'chatter_nm'"),
+        ({"chatter_nm": [2, 1]}, r"expect.metrics.chatter_nm: must be \[least, most\], is \[2, 1\]"),
+        ({"chatter_nm": 1}, "expect.metrics"),
+    ],
+)
+def test_an_expected_metric_that_cannot_be_is_refused(metrics: dict[str, Any], said: str) -> None:
+    with pytest.raises(ScenarioError, match=said):
+        trilat_net.trials("free", set={"expect": {"metrics": metrics}})

@@ -42,7 +42,8 @@ def only(expect: Expect, **changes: Any) -> ExpectationResult:
 
 
 def test_every_key_that_asks_is_answered_and_no_other() -> None:
-    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | {"windows"} == set(Expect.__struct_fields__)
+    tables = {"windows", "metrics"}
+    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(Expect.__struct_fields__)
     assert evaluate_expectations(Expect(), CALM) == []
     for key, value in {**READINGS, **OTHERS}.items():
         assert only(Expect(**{key: value})).key.split(".")[0] == key

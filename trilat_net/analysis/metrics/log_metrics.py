@@ -1,84 +1,36 @@
 """All metrics of a log, their JSON, and the comparison of several logs.
 
-Invariant: every entry of the catalogue is present for every place it applies to, as a number or with the
-reason for its absence; in JSON the number is null and `unknown` has the reason. Link and loop metrics add
-no definition to those of docs/definitions.md. A comparison has one column per log and one row per metric
-of the whole run.
+Invariant: every quantity is present for every place it applies to, as a number or with the reason for its
+absence; in JSON the number is null and `unknown` has the reason. Whatever a file of this folder measures
+belongs to it. A comparison has one column per log and one row per metric of the whole run.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+import pkgutil
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...core.task_space import PLACE
+from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
-from ..aligned import align_records
-from ..arm_rows import build_arm_rows
-from ..dominance_history import trace_dominance
-from ..file_overview import describe_site_health
-from ..following import JointFollowing, follow_rows
-from ..link_summary import LinkSummary, summarise_links
+from ..run_view import RunView
 from ..site_signals import follows_in_task_space
-from ..torque_sources import attribute_torque, list_walls
-from . import motion_metrics as motion
 from . import static_windows
 from .measured_impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
-from .metric_catalogue import (
-    ENERGY,
-    LOOP,
-    QUANTITIES,
-    Metric,
-    MetricValues,
-    Quantity,
-    SiteRun,
-    metric,
-    unavailable,
-)
-from .motion_metrics import ParameterEstimates
-from .port_energy import measure_delay_energy, measure_port_energy
+from .measures import Metric, MetricValues, Quantity, list_measures, quantities
+from .motion_metrics import ParameterEstimates, read_all_estimates
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
-
-def measure_link(use: LinkSummary) -> MetricValues:
-    """Returns effective delay, loss and bursts of a link."""
-    age, never = use.age_ms, "no sample ever came into use"
-    unknown = "of no sample it is known whether it came"
-    lossless = Metric(None, "nothing was lost", applies=False)
-    return {
-        "age_mean_ms": metric(age.mean if age else None, never),
-        "age_p99_ms": metric(age.p99 if age else None, never),
-        "age_max_ms": metric(age.max if age else None, never),
-        "silence_ms": metric(use.silence_ms, never),
-        "loss": metric(use.loss, unknown),
-        "burst": lossless if use.loss == 0.0 else metric(use.burst, unknown),
-        "late_samples": metric(use.counts.late if use.counts else None, f"no records of {use.site}"),
-    }
-
-
-def measure_loop(log: Log, site: str) -> MetricValues:
-    """Returns lateness, computing time and overruns of a site's loop, and its missing records."""
-    missing = {"missing": metric(log.missing(site))}
-    if log.driver != "live":
-        return unavailable(LOOP, "no clock was read", applies=False) | missing
-    if not len(log[site]):
-        return unavailable(LOOP, f"no records of {site}") | missing
-    health = describe_site_health(log, site)
-    busy = health["busy_us"]
-    return {
-        "late_p99_us": metric(health["late_us"]["p99"]),
-        "late_max_us": metric(health["late_us"]["max"]),
-        "busy_p99_us": metric(busy["p99"] if busy else None, "no second record"),
-        "overruns": metric(health["overruns"]),
-        **missing,
-    }
-
+for _found in pkgutil.iter_modules(import_module(__package__).__path__):
+    import_module(f"{__package__}.{_found.name}")
 
 _ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
 """Units along an axis in place of those of a joint."""
@@ -141,7 +93,7 @@ class LogMetrics(Result):
         return [{**row, "value": one.value, "why": one.why} for row, one in self._each() if one.applies]
 
     def _each(self) -> Iterator[tuple[dict[str, str], Metric]]:
-        for quantity in QUANTITIES:
+        for quantity in quantities():
             words = {"group": quantity.group, "key": quantity.key, "name": quantity.name}
             for place, one in self.places(quantity).items():
                 yield {**words, "of": place or "run", "unit": quantity.unit}, one
@@ -176,92 +128,58 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         LogError: a record cannot be read, or names a change that is none.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is no number
-        return _measure(log)
+        return _measure(RunView(log))
 
 
-def _measure(log: Log) -> LogMetrics:
-    scenario, specs = log.scenario, log.scenario.sites
-    runs = {
-        site: SiteRun(own, attribute_torque(own, scenario), trace_dominance(log, site, own.t_s))
-        for site, own in align_records(log).items()
+def _measure(view: RunView) -> LogMetrics:
+    log, scenario = view.log, view.scenario
+    found: dict[str, dict[str, MetricValues]] = {
+        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
     }
-    absent = [site for site in log.sites if site not in runs]
-    estimates = {site: motion.read_parameter_estimates(scenario, run.records) for site, run in runs.items()}
-    shared = {site: _view_shared(scenario, run) for site, run in runs.items()}
-    windows = [] if absent else static_windows.find_static_windows(shared)
-    loads = static_windows.find_joint_loads(scenario, windows)
-    ratios = static_windows.find_sharing_ratios(scenario, windows, loads)
+    for one in list_measures():
+        for place, values in found[one.of].items():
+            values.update(one.measure(view, place))
     return LogMetrics(
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
-        {
-            **motion.measure_spread(log, runs),
-            **static_windows.measure_force_sharing(absent, windows, ratios),
-        },
-        {site: _measure_site(log, site, runs.get(site), estimates.get(site)) for site in log.sites},
-        {
-            use.name: {
-                **motion.measure_following(log, runs, use.peer, use.site),
-                **measure_delay_energy(log, runs, use.peer, use.site),
-                **measure_link(use),
-            }
-            for use in summarise_links(log)
-        },
-        {
-            f"{site}/{n}": motion.measure_wall_contact(wall, runs.get(site))
-            for site in log.sites
-            for n, wall in enumerate(list_walls(specs[site]), 1)
-        },
-        estimates,
-        static_windows.count_static_windows(absent, windows),
-        loads,
-        ratios,
-        static_windows.estimate_stiffness(windows),
-        estimate_impedances(shared),
+        found["run"][""],
+        *(found["site"], found["link"], found["wall"]),
+        view.once(read_all_estimates),
+        static_windows.count_static_windows(view),
+        view.once(static_windows.find_joint_loads),
+        view.once(static_windows.find_sharing_ratios),
+        static_windows.estimate_stiffness(view),
+        estimate_impedances(view),
         TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
         _find_joint_names(scenario),
     )
+
+
+def find_quantity(key: str) -> Quantity:
+    """Returns the quantity of a key.
+
+    Raises:
+        KeyError: there is none; the message names the nearest.
+    """
+    known = {one.key: one for one in quantities()}
+    if key not in known:
+        near = suggest_nearest(key, list(known))
+        raise KeyError(f"no metric {key!r}{near}; docs/metrics.md has them all")
+    return known[key]
+
+
+def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
+    """Returns quantities of the whole run by their keys."""
+    asked = {key: find_quantity(key) for key in keys}
+    if not asked:
+        return {}
+    metrics = compute_log_metrics(log)
+    return {key: metrics.whole(one) for key, one in asked.items()}
 
 
 def _find_joint_names(scenario: Scenario) -> tuple[str, ...]:
     """Returns the names that the files of the arms give their joints; () if not all name them alike."""
     names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
     return names.pop() if len(names) == 1 else ()
-
-
-def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
-    """Returns a site's run as what sites share: in task space places for angles, and forces for torques.
-
-    What an operator was to do is turned into forces in the first pose, so that what stands still does.
-    """
-    records, torque, dominance = run
-    arm = build_arm_rows(scenario, records.site)
-    follows = follow_rows(arm, records.q, records.qd, np.array(records.axes))
-    if isinstance(follows, JointFollowing):
-        return run
-    axes, script = np.array(records.axes), torque.script
-    forces = torque._replace(
-        operator_now=follows.project(torque.operator_now),
-        operator_held=follows.project(torque.operator_held),
-        environment_now=follows.project(torque.environment_now),
-        environment_held=follows.project(torque.environment_held),
-    )
-    if script is not None:
-        script = script @ (follows.inverse[0] @ follows.J[0]).T
-    places = records._replace(q=axes * records.x, qd=axes * records.xd, tau_x=axes * records.wrench)
-    return SiteRun(places, forces._replace(script=script), dominance)
-
-
-def _measure_site(
-    log: Log, site: str, run: SiteRun | None, estimates: ParameterEstimates | None
-) -> MetricValues:
-    none = unavailable(ENERGY, f"no records of {site}", of="site")
-    return {
-        **motion.measure_tracking(log, site),
-        **motion.measure_effort(log, site),
-        **(measure_port_energy(log.scenario, run) if run else none),
-        **motion.measure_parameter_error(log.scenario, site, estimates),
-        **measure_loop(log, site),
-    }
 
 
 METRICS_JSON_VERSION = 1
@@ -389,7 +307,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
         LogError: a record cannot be read, or names a change that is none.
     """
     measured = [compute_log_metrics(log) for log in logs]
-    rows = [ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured)) for one in QUANTITIES]
+    rows = [ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured)) for one in quantities()]
     kept = tuple(row for row in rows if any(entry.applies for entry in row.entries))
     return MetricComparison(tuple(names) or tuple(Path(log.source).stem for log in logs), kept)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.vectors import Array
 from ..aligned import Bools, find_latest_rows
-from .metric_catalogue import SiteRun
+from ..run_view import RunView, SiteRun
 
 Complex = NDArray[np.complex128]
 
@@ -157,8 +157,9 @@ class ImpedanceEstimate(NamedTuple):
         return "" if self.kind == "reflection" else "N m s/rad"
 
 
-def estimate_impedances(runs: Mapping[str, SiteRun]) -> list[ImpedanceEstimate]:
+def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
     """Returns the impedance at every operator, and its reflection of every environment elsewhere."""
+    runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
     walls = [site for site, run in runs.items() if run.torque.environment.any()]
     pairs = [(site, "") for site in operators]

@@ -7,15 +7,12 @@ record contribute nothing. A parameter counts if the control law adapts it (Gamm
 there is no error, but the estimates are still reported.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from ...core.exogenous import TorqueSource
 from ...core.site_setup import Law
 from ...core.vectors import Array
-from ...log.log_reader import Log
 from ...log.site_log import find_task_errors
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
@@ -24,8 +21,9 @@ from ..aligned import AlignedRecords, Bools, find_latest_rows
 from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
 from ..base_parameters import find_base_parameters, find_consistent_links
 from ..json_values import JsonObject
+from ..run_view import RunView
 from ..torque_sources import wall_depth, wall_force
-from .metric_catalogue import (
+from .measures import (
     CONTACT,
     EFFORT,
     FOLLOWING,
@@ -34,8 +32,9 @@ from .metric_catalogue import (
     TRACKING,
     Metric,
     MetricValues,
-    SiteRun,
+    Quantity,
     measure_shared,
+    measures,
     metric,
     peak,
     rms,
@@ -46,8 +45,20 @@ LONG_END_S = 5.0
 """Length of the end of a run for slopes of estimates and for contact, s."""
 
 
-def measure_tracking(log: Log, site: str) -> MetricValues:
+@measures(
+    "site",
+    TRACKING,
+    Quantity("settle_s", "settled", "s"),
+    Quantity("rms_error_rad", "RMS e", "rad"),
+    Quantity("max_error_rad", "peak |e|", "rad"),
+    Quantity("max_error_end_rad", "peak |e|, last 1 s", "rad"),
+    Quantity("rms_error_m", "RMS e", "m"),
+    Quantity("max_error_m", "peak |e|", "m"),
+    Quantity("max_error_end_m", "peak |e|, last 1 s", "m"),
+)
+def measure_tracking(view: RunView, site: str) -> MetricValues:
     """Returns settling, RMS and peak of a site's e."""
+    log = view.log
     part = log[site]
     if not len(part):
         return unavailable(TRACKING, f"no records of {site}")
@@ -69,15 +80,25 @@ def measure_tracking(log: Log, site: str) -> MetricValues:
     }
 
 
-def measure_spread(log: Log, runs: Mapping[str, SiteRun]) -> MetricValues:
+@measures(
+    "run",
+    SPREAD,
+    Quantity("spread_rms_rad", "RMS spread, undelayed", "rad"),
+    Quantity("spread_max_rad", "largest spread", "rad"),
+    Quantity("spread_end_rad", "largest spread, last 1 s", "rad"),
+    Quantity("spread_rms_m", "RMS spread, undelayed", "m"),
+    Quantity("spread_max_m", "largest spread", "m"),
+    Quantity("spread_end_m", "largest spread, last 1 s", "m"),
+)
+def measure_spread(view: RunView, _run: str) -> MetricValues:
     """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
 
     In task space between their places, along axes that all follow. Instants are the ticks of the first site
     at which every other site has its own latest tick recorded.
     """
-    absent = [site for site in log.sites if site not in runs]
-    if absent:
-        return unavailable(SPREAD, f"no records of {', '.join(absent)}")
+    log, runs = view.log, view.sites
+    if view.absent:
+        return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
     first = runs[log.sites[0]].records
     known, poses = first.known.copy(), []
     for records in (run.records for run in runs.values()):
@@ -105,12 +126,24 @@ def measure_spread(log: Log, runs: Mapping[str, SiteRun]) -> MetricValues:
     return measure_shared(SPREAD, log.scenario.sites[log.sites[0]].task.space, measure)
 
 
-def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
+@measures(
+    "link",
+    FOLLOWING,
+    Quantity("following_rms_rad", "RMS q_m(t-T) - q_s", "rad"),
+    Quantity("following_max_rad", "peak |q_m(t-T) - q_s|", "rad"),
+    Quantity("following_end_rad", "the same, last 1 s", "rad"),
+    Quantity("following_rms_m", "RMS x_m(t-T) - x_s", "m"),
+    Quantity("following_max_m", "peak |x_m(t-T) - x_s|", "m"),
+    Quantity("following_end_m", "the same, last 1 s", "m"),
+)
+def measure_following(view: RunView, link: str) -> MetricValues:
     """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of the tick.
 
     At every tick t_k of the slave from its first sample of that master on: the master's angles in the record
     whose sample the slave has in use, less the slave's own.
     """
+    log, runs, use = view.log, view.sites, view.links[link]
+    peer, site = use.peer, use.site
     if [log.scenario.sites[name].role for name in (peer, site)] != ["master", "slave"]:
         return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
     absent = [name for name in (peer, site) if name not in runs]
@@ -137,8 +170,18 @@ def measure_following(log: Log, runs: Mapping[str, SiteRun], peer: str, site: st
     return measure_shared(FOLLOWING, log.scenario.sites[site].task.space, measure)
 
 
-def measure_effort(log: Log, site: str) -> MetricValues:
+@measures(
+    "site",
+    EFFORT,
+    Quantity("effort_nm2_s", "effort, int |tau|^2", "N²m²s", "sum"),
+    Quantity("rms_tau_nm", "RMS tau", "N m"),
+    Quantity("peak_tau_nm", "peak |tau|", "N m"),
+    Quantity("saturated_share", "ticks at the limit"),
+    Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
+)
+def measure_effort(view: RunView, site: str) -> MetricValues:
     """Returns effort and saturation of a site."""
+    log = view.log
     part = log[site]
     if not len(part):
         return unavailable(EFFORT, f"no records of {site}")
@@ -154,11 +197,27 @@ def measure_effort(log: Log, site: str) -> MetricValues:
     }
 
 
-def measure_wall_contact(wall: TorqueSource, run: SiteRun | None) -> MetricValues:
+@measures(
+    "wall",
+    CONTACT,
+    Quantity("force_mean_n", "normal force, mean", "N"),
+    Quantity("force_deviation_n", "its deviation", "N"),
+    Quantity("force_peak_n", "its peak", "N"),
+    Quantity("hits", "hits", "", "sum"),
+    Quantity("contact_share", "ticks in contact"),
+    Quantity("depth_max_m", "deepest", "m"),
+    Quantity("end_force_mean_n", "normal force, mean, last 5 s", "N"),
+    Quantity("end_force_deviation_n", "its deviation, last 5 s", "N"),
+    Quantity("end_force_peak_n", "its peak, last 5 s", "N"),
+    Quantity("end_hits", "hits, last 5 s", "", "sum"),
+)
+def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without records.
 
     The first record, of all and after a gap, begins no contact: its beginning is unknown.
     """
+    site, wall = view.walls[name]
+    run = view.sites.get(site)
     if run is None:
         return unavailable(CONTACT, "no records of the site")
     t_s, known, end_effector = run.records.nominal_s, run.records.known, run.torque.end_effector
@@ -237,6 +296,11 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
     return ParameterEstimates(adapted.tolist(), theta, *ends, slope, base)
 
 
+def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
+    """Returns the estimates of every site with records."""
+    return {site: read_parameter_estimates(view.scenario, run.records) for site, run in view.sites.items()}
+
+
 def _in_base(arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array) -> BaseEstimates:
     base = find_base_parameters(arm, learnt)
     first, last = (base.combination @ theta_hat[[0, -1]].T).T.tolist()
@@ -245,14 +309,23 @@ def _in_base(arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: 
     return BaseEstimates(base.kept.tolist(), truth, first, last, *consistent)
 
 
-def measure_parameter_error(
-    scenario: Scenario, site: str, estimates: ParameterEstimates | None
-) -> MetricValues:
+@measures(
+    "site",
+    LEARNING,
+    Quantity("theta_error_first", "|theta_hat - theta| at first"),
+    Quantity("theta_error_last", "the same at last"),
+    Quantity("theta_energy_first_j", "theta~' Gamma^-1 theta~ / 2 at first", "J"),
+    Quantity("theta_energy_last_j", "the same at last", "J"),
+    Quantity("theta_slope_per_s", "|theta_hat'|, last 5 s", "1/s"),
+    Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
+)
+def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     """Returns the distance of the estimates from theta at both ends, and their rate of change at the end.
 
     Distance and energy of a chain are those of the combinations that torques determine: what else its
     estimates are off by stays as it is, and acts on nothing.
     """
+    scenario, estimates = view.scenario, view.once(read_all_estimates).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
     arm = build_arm_rows(scenario, site)

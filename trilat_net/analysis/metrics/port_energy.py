@@ -9,18 +9,16 @@ estimate, plus one term per link, E_ij = int qd_i' dtau_ij dt, dtau_ij = S_i ( p
 being what the link carries and S_i the law's gain; docs/metrics.md has it for each law, and the sources.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
-from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import follow_rows
-from .metric_catalogue import ENERGY, Metric, MetricValues, SiteRun, metric, unavailable
+from ..run_view import RunView
+from .measures import ENERGY, Metric, MetricValues, Quantity, measures, metric, unavailable
 
 _NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
 
@@ -58,12 +56,26 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     return energy
 
 
-def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
+@measures(
+    "site",
+    ENERGY,
+    Quantity("controller_j", "given by the controller", "J", "sum"),
+    Quantity("hands_j", "given by hands", "J", "sum"),
+    Quantity("hands_most_j", "given by hands at most", "J"),
+    Quantity("walls_j", "given by environment", "J", "sum"),
+    Quantity("walls_most_j", "given by environment at most", "J"),
+    Quantity("friction_j", "taken by friction", "J", "sum"),
+    Quantity("mechanical_j", "gained by the arm", "J", "sum"),
+    Quantity("unaccounted_j", "unaccounted for", "J"),
+)
+def measure_port_energy(view: RunView, site: str) -> MetricValues:
     """Returns the energies of a site's ports, over the periods with both ends recorded.
 
     Stops of joints count as environment; friction takes what the arm gains less.
     """
-    records, torque, _ = run
+    if site not in view.sites:
+        return unavailable(ENERGY, f"no records of {site}", of="site")
+    scenario, (records, torque, _) = view.scenario, view.sites[site]
     arm = build_arm_rows(scenario, records.site)
     spec, known, q = scenario.sites[records.site], records.known_periods, records.q
     if not known.any():
@@ -95,14 +107,21 @@ def measure_port_energy(scenario: Scenario, run: SiteRun) -> MetricValues:
     return {**found, "mechanical_j": metric(change[-1]), "unaccounted_j": metric(float(unaccounted.max()))}
 
 
-def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site: str) -> MetricValues:
+@measures(
+    "link",
+    ENERGY,
+    Quantity("delay_j", "given by the delay", "J", "sum"),
+    Quantity("delay_most_j", "given by the delay at most", "J"),
+)
+def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     """Returns the energy that the delay of a link injects: in all, and the most until any time, J.
 
     Over the periods that follow from records alone and in which the site follows its peers; of the torque
     that the law asks for, before its limit.
     """
-    arm = build_arm_rows(log.scenario, site)
-    gains = log.scenario.sites[site].control.gains(arm.theta)
+    runs, peer, site = view.sites, view.links[link].peer, view.links[link].site
+    arm = build_arm_rows(view.scenario, site)
+    gains = view.scenario.sites[site].control.gains(arm.theta)
     absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
@@ -111,13 +130,13 @@ def measure_delay_energy(log: Log, runs: Mapping[str, SiteRun], peer: str, site:
     records, other, factors = runs[site].records, runs[peer].records, runs[site].dominance
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
-    view = view_delayed_peer(records, PeerTrajectory(other))
-    known = view.seen.known & view.now.known & records.follows
+    delayed = view_delayed_peer(records, PeerTrajectory(other))
+    known = delayed.seen.known & delayed.now.known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
     j = list(records.used).index(peer)
-    torque = _delay_torque(gains, arm, records, other, view, factors.alpha[:, [j]], factors.rate[:, [j]])
+    torque = _delay_torque(gains, arm, records, other, delayed, factors.alpha[:, [j]], factors.rate[:, [j]])
     injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
     return {"delay_j": metric(injected[-1]), "delay_most_j": metric(max(0.0, float(injected.max())))}
 

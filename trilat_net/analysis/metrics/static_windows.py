@@ -21,7 +21,8 @@ from ..aligned import find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..lyapunov_weights import find_closed_groups, left_perron_vector
 from ..run_end import STATIC_SPEED_RAD_S
-from .metric_catalogue import Metric, MetricValues, SiteRun, metric
+from ..run_view import RunView, SiteRun
+from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
 
 WINDOW_S = 1.0
 """Length of a window, s; an interval must be as long."""
@@ -60,8 +61,11 @@ class StaticWindow(NamedTuple):
     alpha: Array
 
 
-def find_static_windows(runs: Mapping[str, SiteRun]) -> list[StaticWindow]:
-    """Returns the static windows of all sites, in order."""
+def find_static_windows(view: RunView) -> list[StaticWindow]:
+    """Returns the static windows of all sites, in order; none if one has no records."""
+    if view.absent:
+        return []
+    runs = view.shared
     first = next(iter(runs.values())).records
     rows, still = {}, first.known.copy()
     for site, (records, torque, dominance) in runs.items():
@@ -116,10 +120,10 @@ class StiffnessEstimate(NamedTuple):
     stiffness_nm_rad: float | None
 
 
-def estimate_stiffness(windows: list[StaticWindow]) -> list[StiffnessEstimate]:
+def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
     """Returns the stiffness between each two static windows between which one operator alone moved."""
     estimates = []
-    for before, after in pairwise(windows):
+    for before, after in pairwise(view.once(find_static_windows)):
         moved, known = [], True
         for site, now in after.script.items():
             then = before.script[site]
@@ -185,11 +189,11 @@ class JointLoad(NamedTuple):
     imbalance: Metric
 
 
-def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[JointLoad]:
+def find_joint_loads(view: RunView) -> list[JointLoad]:
     """Returns the loaded joints of every static window."""
     loads = []
-    for window in windows:
-        weights = _torque_weights(scenario, window.alpha)
+    for window in view.once(find_static_windows):
+        weights = _torque_weights(view.scenario, window.alpha)
         for joint in range(min(map(len, window.torque.values()))):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
             least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
@@ -199,23 +203,30 @@ def find_joint_loads(scenario: Scenario, windows: list[StaticWindow]) -> list[Jo
     return loads
 
 
-def count_static_windows(absent: list[str], windows: list[StaticWindow]) -> Metric:
+def count_static_windows(view: RunView) -> Metric:
     """Returns the number of static windows."""
-    if absent:
-        return Metric(None, f"no records of {', '.join(absent)}")
-    return metric(len(windows) or None, "no second in which all sites rest under torques that stand")
+    if view.absent:
+        return Metric(None, f"no records of {', '.join(view.absent)}")
+    return metric(
+        len(view.once(find_static_windows)) or None,
+        "no second in which all sites rest under torques that stand",
+    )
 
 
-def measure_force_sharing(
-    absent: list[str], windows: list[StaticWindow], pairs: list[SharingRatio]
-) -> MetricValues:
+@measures(
+    "run",
+    SHARING,
+    Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
+)
+def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns the largest deviation of force sharing from the dominance factors."""
+    pairs = view.once(find_sharing_ratios)
     offs = [pair.off for pair in pairs if pair.off is not None]
     if offs:
         return {"sharing_off": metric(max(offs))}
     whys = "; ".join(dict.fromkeys(pair.expected_nm.why for pair in pairs))
-    why = count_static_windows(absent, windows).why or whys or "no two sites are loaded in a window at rest"
-    return {"sharing_off": Metric(None, why, applies=bool(absent))}
+    why = count_static_windows(view).why or whys or "no two sites are loaded in a window at rest"
+    return {"sharing_off": Metric(None, why, applies=bool(view.absent))}
 
 
 def _weigh_load(
@@ -234,16 +245,14 @@ def _weigh_load(
     return JointLoad(window.from_s, window.to_s, joint + 1, torque, shown, imbalance)
 
 
-def find_sharing_ratios(
-    scenario: Scenario, windows: list[StaticWindow], loads: list[JointLoad]
-) -> list[SharingRatio]:
+def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     """Returns the force sharing of every joint in a static window at which two sites are loaded.
 
     The operator that feels is a spring; if both are or none, the slave is the site of the torque.
     """
-    at = {window.from_s: window for window in windows}
+    scenario, at = view.scenario, {window.from_s: window for window in view.once(find_static_windows)}
     pairs = []
-    for load in loads:
+    for load in view.once(find_joint_loads):
         if len(load.torque_nm) == 2:
             pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
             torque = load.torque_nm[pushed]

@@ -1,0 +1,70 @@
+"""A metric is one file: whoever shows, compares or expects metrics knows one put beside the others."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import trilat_net
+from trilat_net.analysis.metrics.measures import Quantity, list_measures, measures
+from trilat_net.analysis.run_view import RunView
+
+METRIC = """
+import numpy as np
+
+from trilat_net.analysis.metrics.measures import Quantity, measures, metric
+
+
+@measures("site", "haste", Quantity("haste_rad_s", "mean |qd|", "rad/s"))
+def measure_haste(view, site):
+    return {"haste_rad_s": metric(float(np.abs(view.log[site].qd).mean()))}
+"""
+LOOK = """
+import json, sys
+import trilat_net.analysis.metrics
+trilat_net.analysis.metrics.__path__.append(sys.argv[1])
+import trilat_net as tn
+log = tn.simulate("free", {"duration_s": 0.5})
+found = tn.metrics(log)
+asked = {"duration_s": 0.5, "expect": {"metrics": {"haste_rad_s": [0.0, 10.0]}}}
+(trial,) = tn.trials("free", set=asked)
+print(json.dumps({
+    "json": found.to_dict()["sites"]["s"]["haste_rad_s"],
+    "text": found.summary(),
+    "frame": [row["key"] for row in found.to_rows()],
+    "compared": tn.compare(log, log).metrics.row("haste_rad_s").values,
+    "expected": [[one.key, one.held] for one in trial.check().outcomes],
+}))
+"""
+
+
+def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None:
+    (tmp_path / "haste.py").write_text(METRIC)
+    command = [sys.executable, "-c", LOOK, str(tmp_path)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert out.returncode == 0, out.stderr
+    found = json.loads(out.stdout.splitlines()[-1])
+    assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
+    assert "mean |qd|" in found["text"]
+    assert "haste_rad_s" in found["frame"]
+    assert ["metrics.haste_rad_s", True] in found["expected"]
+
+
+def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
+    def measure_again(_view: RunView, _site: str) -> dict[str, object]:
+        return {}
+
+    with pytest.raises(
+        ValueError, match=r"rms_error_rad has two definitions, in .*motion_metrics and .*test"
+    ):
+        measures("site", "twice", Quantity("rms_error_rad", "again"))(measure_again)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["free", "contact"])
+def test_a_measure_gives_the_quantities_that_it_declares(name: str) -> None:
+    view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
+    for one in list_measures():
+        for place in view.places(one.of):
+            assert set(one.measure(view, place)) == {quantity.key for quantity in one.quantities}

@@ -1,0 +1,144 @@
+"""What a metric is: the quantities of a kind of place, and the function that measures them.
+
+Invariant: a value is a finite number, or None with a reason. A key has one definition, beside its function
+in one file of this folder, and in docs/metrics.md; whoever shows, compares or asks finds it by its file.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.task_space import PLACE
+from ..run_view import RunView
+
+
+class Metric(NamedTuple):
+    """A number, or the reason why there is none.
+
+    Attributes:
+        value, why: the number, finite, or None; the reason, or "".
+        applies: False if no log of this experiment could have one: then nothing is unknown.
+    """
+
+    value: float | None
+    why: str = ""
+    applies: bool = True
+
+
+MetricValues = dict[str, Metric]
+"""Metrics by the keys of their quantities."""
+
+
+def metric(value: float | None, why: str = "it is no finite number") -> Metric:
+    """Returns a metric of a number; with the reason if it is None or not finite."""
+    return Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
+
+
+def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
+    """Returns the quantities of a group, or those of it that are `of` a kind of place, without a number."""
+    return {q.key: Metric(None, why, applies) for q in quantities() if q.group == group and of in ("", q.of)}
+
+
+def measure_shared(group: str, space: str, measure: Callable[[slice], dict[str, Metric]]) -> MetricValues:
+    """Returns the quantities of a group of what sites share: angles, rad, or places, m, or both of a pose.
+
+    `measure` takes the columns of what is shared, and gives the quantities by their keys without the unit.
+    """
+    found = unavailable(group, "sites share angles, not places", applies=False)
+    if space == "joints":
+        parts = [("rad", slice(None))]
+    else:
+        found = unavailable(group, "sites share places, not angles", applies=False)
+        parts = [("m", slice(0, PLACE)), ("rad", slice(PLACE, None))][: 1 + (space == "pose")]
+    for unit, columns in parts:
+        found |= {f"{key}_{unit}": one for key, one in measure(columns).items()}
+    return found
+
+
+def rms(values: ArrayLike) -> float:
+    """Returns the root mean square over rows of the column with the largest; NaN of no rows, shape (K, n)."""
+    array = np.asarray(values, dtype=np.float64)
+    if not array.size:
+        return math.nan
+    return float(np.sqrt(np.einsum("kj,kj->j", array, array) / len(array)).max())
+
+
+def peak(values: ArrayLike) -> float:
+    """Returns the largest absolute value; NaN of none."""
+    array = np.asarray(values, dtype=np.float64)
+    return float(np.abs(array).max()) if array.size else math.nan
+
+
+class Quantity(NamedTuple):
+    """A number that a run, or each of its sites, links or walls has.
+
+    Attributes:
+        key: its name in programs; ends in its unit, if any.
+        name: its name for people.
+        unit: its unit; "" for a number without.
+        whole: reduction to the run: "max" or "sum" over all places.
+        of: the kind of place that has one: "run", "site", "link" or "wall".
+        group: its heading.
+    """
+
+    key: str
+    name: str
+    unit: str = ""
+    whole: str = "max"
+    of: str = ""
+    group: str = ""
+
+
+Measuring = Callable[[RunView, str], MetricValues]
+"""Returns the quantities of a place, by their keys; each a number or the reason why there is none."""
+
+
+class Measure(NamedTuple):
+    """Quantities of a kind of place, and what measures them."""
+
+    of: str
+    group: str
+    quantities: tuple[Quantity, ...]
+    measure: Measuring
+
+
+_MEASURES: list[Measure] = []
+TRACKING, SPREAD, FOLLOWING = "tracking", "apart", "slave and master"
+EFFORT, ENERGY, CONTACT, LEARNING = "effort", "energy", "walls", "learning"
+SHARING, NETWORK, LOOP = "force sharing", "network", "loop"
+_SHOWN = (TRACKING, SPREAD, FOLLOWING, EFFORT, ENERGY, CONTACT, SHARING, LEARNING, NETWORK, LOOP)
+"""Headings in the order in which they are shown; others follow."""
+
+
+def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
+    """Declares that a function measures these quantities of every "run", "site", "link" or "wall".
+
+    Raises:
+        ValueError: another function measures one of them.
+    """
+
+    def declare(measure: Measuring) -> Measuring:
+        known = {one.key: other for other in _MEASURES for one in other.quantities}
+        for one in quantities:
+            if (other := known.get(one.key)) and other.measure.__module__ != measure.__module__:
+                homes = f"{other.measure.__module__} and {measure.__module__}"
+                raise ValueError(f"metric {one.key} has two definitions, in {homes}")
+        told = tuple(one._replace(of=of, group=group) for one in quantities)
+        _MEASURES.append(Measure(of, group, told, measure))
+        return measure
+
+    return declare
+
+
+def list_measures() -> list[Measure]:
+    """Returns what is measured, in the order in which it is shown."""
+    place = {group: n for n, group in enumerate(_SHOWN)}
+    return sorted(_MEASURES, key=lambda one: place.get(one.group, len(place)))
+
+
+def quantities() -> list[Quantity]:
+    """Returns all quantities, in that order."""
+    return [quantity for one in list_measures() for quantity in one.quantities]
