@@ -18,39 +18,25 @@ from pathlib import Path
 
 import numpy as np
 
-from trilat_net.core.chain import MAX_JOINTS, build_chain, find_acceleration, place_joints
-from trilat_net.net.arm_port import ArmPort
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.arms import build_arm
+import trilat_net as tn
 
 SCENARIO = Path(__file__).with_suffix(".toml")
 PERIOD_S = 0.001
 HEAVIER = 1.1
-VISCOUS, COULOMB = 0.1, 0.2  # N m s/rad and N m per kg m^2 of a joint's inertia at the start
+VISCOUS, COULOMB = 0.1, 0.2  # N m s/rad and N m for a joint that 1 N m accelerates by 1 rad/s^2
 LEAN_NM = 0.5
 
 
-class Robot:
+class Robot(tn.SimulatedArm):
     """A chain of joints with friction, a brake, and sensors of the torque from outside."""
 
-    def __init__(self, scenario: Scenario, site: str) -> None:
-        spec = scenario.sites[site]
-        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True)  # a planar one as a chain of two
-        assert arm.chain is not None
-        self.q, self.qd = np.array(spec.q0_rad), np.zeros(arm.counts.joints)
+    def __init__(self, scenario: tn.Scenario, site: str) -> None:
+        super().__init__(scenario, site, HEAVIER)
         self.tau_x = np.zeros_like(self.q)
-        self._joints = build_chain(arm.chain.joints, MAX_JOINTS)
-        self._theta, self._gravity = HEAVIER * arm.theta, np.array(arm.chain.gravity_m_s2)
-        self._size = np.diag(arm.inertia(self.q))
-        self._accelerations = np.zeros_like(self.q)
+        fall = self.accelerate(self.tau_x)  # compiles
+        pushes = np.eye(len(self.q))
+        self._size = 1.0 / np.array([(self.accelerate(push) - fall) @ push for push in pushes])
         self._moved_s = 0.0
-        self._accelerate(np.zeros_like(self.q))  # compiles
-
-    def _accelerate(self, torque: np.ndarray) -> None:
-        place_joints(self._joints, self.q)
-        find_acceleration(
-            self._joints, self._theta, self._gravity, self.q, self.qd, torque, self._accelerations
-        )
 
     def apply(self, tau: tuple[float, ...] | None) -> None:
         """Moves on by a period under a torque; None: the brakes hold it.
@@ -64,9 +50,7 @@ class Robot:
         self._moved_s += PERIOD_S
         self.tau_x[0] = -LEAN_NM * math.sin(self._moved_s)  # the torque ON the arm is its negative
         friction = self._size * (VISCOUS * self.qd + COULOMB * np.tanh(self.qd / 0.01))
-        self._accelerate(np.array(tau) - self.tau_x - friction)
-        self.qd += PERIOD_S * self._accelerations
-        self.q += PERIOD_S * self.qd
+        self.move(np.array(tau) - self.tau_x - friction, PERIOD_S)
 
 
 def main() -> None:
@@ -79,10 +63,10 @@ def main() -> None:
     parser.add_argument("--sensor", action="store_true", help="send the torque that the joints measure")
     options = parser.parse_args()
 
-    scenario = load_scenario(options.scenario)
+    scenario = tn.load_scenario(options.scenario)
     robot = Robot(scenario, options.site)
     session = options.session or scenario.name
-    with ArmPort.connected(session, options.site, [options.connect]) as port:
+    with tn.ArmPort.connected(session, options.site, [options.connect]) as port:
         next_s = time.monotonic()
         while not port.over:
             port.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())

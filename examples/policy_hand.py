@@ -11,25 +11,17 @@ tick, while somebody leads and while the lead changes. Two terminals:
 
 import argparse
 import math
-from collections.abc import Sequence
-from contextlib import ExitStack
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
+from typing import Any
 
 import numpy as np
 
-from sites.running_session import open_hand
-from trilat_net.net import topics
-from trilat_net.net.arm_port import Hand
-from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import resolve_member_connection
-from trilat_net.net.discovery import connect_to_session, find_site_info, send_change
-from trilat_net.net.messages import State
-from trilat_net.net.requests import ChangeRequest
-from trilat_net.net.wire import decode, split_states
-from trilat_net.scenario import Scenario, parse_embedded
+import trilat_net as tn
 
-PERIOD_NS = 16_000_000
-RAMP_S, AHEAD_S = 1.0, 0.1
+PERIOD_S = 0.016
+RAMP_S, SPARE_S = 1.0, 0.5
 RADIUS_M, TURN_S = 0.10, 3.0
 
 
@@ -43,22 +35,21 @@ def circle(start: Sequence[float], t_s: float, radius_m: float) -> tuple[float, 
 class References:
     """The references of all sites, tick by tick, and how far they step."""
 
-    def __init__(self, bus: Bus, session: str) -> None:
-        self._inbox: Inbox = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
+    def __init__(self) -> None:
         self._last: dict[str, tuple[int, np.ndarray]] = {}
         self.steps: dict[str, list[tuple[float, float]]] = {}
+        self.now_s = 0.0
 
-    def poll(self) -> None:
-        """Takes in the records that have come."""
-        while (message := self._inbox.poll()) is not None:
-            for payload in split_states(message[1]):
-                record = decode(payload, State)
-                q_des = np.array(record.q_des)
-                tick, before = self._last.get(record.site, (-2, q_des))
-                if record.tick == tick + 1:
-                    step = float(np.abs(q_des - before).max())
-                    self.steps.setdefault(record.site, []).append((record.t_ns * 1e-9, step))
-                self._last[record.site] = record.tick, q_des
+    def add(self, records: Iterable[Any]) -> None:
+        """Takes in records that have come."""
+        for record in records:
+            q_des = np.array(record.q_des)
+            tick, before = self._last.get(record.site, (-2, q_des))
+            self.now_s = record.t_ns * 1e-9
+            if record.tick == tick + 1:
+                step = float(np.abs(q_des - before).max())
+                self.steps.setdefault(record.site, []).append((self.now_s, step))
+            self._last[record.site] = record.tick, q_des
 
     def largest(self, site: str, spans: Sequence[tuple[float, float]]) -> float:
         """Returns the largest step of a site's reference within some times, rad."""
@@ -74,49 +65,41 @@ def main() -> None:
     parser.add_argument("--alone", action="store_true", help="leave m1 to a real person")
     parser.add_argument("--seconds", type=float, default=15.0, help="in all; the lead changes at each third")
     options = parser.parse_args()
-    clock, session = SystemClock(), options.session
-    connection = resolve_member_connection(None, options.connect, None, None, [], None)
-
-    def names(text: str) -> tuple[str, ...]:
-        return parse_embedded(text, session).names
-
-    reached = connect_to_session(connection, clock, session, names, stopped=lambda: False, timeout_s=10.0)
-    with reached as bus:
-        assert bus is not None
-        scenario = parse_embedded(find_site_info(bus, clock, session, "s", names).scenario, session)
-        report(*lead(bus, clock, session, scenario, options.seconds, alone=options.alone))
+    name, reached = options.session, {"connect": options.connect}
+    session = tn.session(name, **reached)
+    person = nullcontext(None) if options.alone else tn.hand(name, "m1", source="person", **reached)
+    with tn.hand(name, "m2", source="policy", **reached) as program, person as other:
+        report(*lead(session, program, other, options.seconds, time.monotonic, time.sleep))
 
 
 def lead(
-    bus: Bus, clock: Clock, session: str, scenario: Scenario, seconds: float, *, alone: bool
+    session: Any,
+    program: Any,
+    person: Any,
+    seconds: float,
+    now_s: Callable[[], float],
+    wait_s: Callable[[float], None],
 ) -> tuple[References, Sequence[tuple[float, float]]]:
     """Moves both hands for some time; returns the references, and when the lead changed, s."""
-    references, ramps = References(bus, session), []
-    with ExitStack() as stack:
-        program = stack.enter_context(open_hand(bus, clock, session, "m2", scenario, "policy"))
-        person: Hand | None = None
-        if not alone:
-            person = stack.enter_context(open_hand(bus, clock, session, "m1", scenario, "person"))
-        leads = iter([(seconds / 3.0, "m1"), (2.0 * seconds / 3.0, "m2")])
-        change_s, leader = next(leads)
-        first, start = program.pose, (0.0, 0.0) if person is None else person.pose
-        begun_ns = clock.monotonic_ns()
-        while (t_s := 1e-9 * (clock.monotonic_ns() - begun_ns)) < seconds and not program.over:
+    references, ramps = References(), []
+    leads = iter([(seconds / 3.0, "m1"), (2.0 * seconds / 3.0, "m2")])
+    change_s, leader = next(leads)
+    first, start = program.pose, (0.0, 0.0) if person is None else person.pose
+    begun_s = now_s()
+    with session.records() as take:
+        while (t_s := now_s() - begun_s) < seconds and not program.over:
             program.move(*circle(first, t_s, RADIUS_M))
             if person is not None:
                 person.move(*circle(start, t_s, 1.3 * RADIUS_M))
-            references.poll()
+            references.add(take())
             if t_s >= change_s:
                 shares = {"m1": 0.9, "m2": 0.1} if leader == "m1" else {"m1": 0.1, "m2": 0.9}
-                reply = send_change(
-                    bus, clock, session, "s", ChangeRequest(dominance="s", to=shares, ramp_s=RAMP_S)
-                )
-                from_s = reply.tick / scenario.sites["s"].rate_hz
-                ramps.append((from_s, from_s + RAMP_S))
-                print(f"{leader} leads from t = {from_s:.3f} s on, by a ramp of {RAMP_S:g} s")
+                said = session.set_dominance("s", shares, RAMP_S)
+                ramps.append((references.now_s, references.now_s + RAMP_S + SPARE_S))
+                print(f"{leader} leads: {said}")
                 change_s, leader = next(leads, (math.inf, ""))
-            clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
-        references.poll()
+            wait_s(PERIOD_S)
+        references.add(take())
     return references, ramps
 
 

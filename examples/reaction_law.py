@@ -10,11 +10,10 @@ once at its own, and after the delay at the other. The energy in a site's spring
 in the record too, under `ch`, and every tool shows it by its name.
 """
 
-import trilat_net
-from trilat_net.core.user_law import LawContext, LawInput
+import trilat_net as tn
 
 
-@trilat_net.compiled
+@tn.compiled
 class Reaction:
     """tau_i = G - d qd_i + the pulls of the site's springs + those of the peers' springs, as received."""
 
@@ -24,11 +23,11 @@ class Reaction:
     }
     remembers = ("felt_most",)
 
-    def __init__(self, facts: LawContext, K: float = 20.0, d: float = 12.0) -> None:
+    def __init__(self, facts: tn.LawContext, K: float = 20.0, d: float = 12.0) -> None:
         self.K, self.d = K, d
         self.felt_most = [0.0] * facts.joints  # the largest pull of peers so far, per joint
 
-    def torque(self, now: LawInput) -> None:
+    def torque(self, now: tn.LawInput) -> None:
         """Writes now.tau, and what the peers get."""
         energy = 0.0
         for i in range(now.joints):

@@ -12,7 +12,7 @@ c v = b qd_sd + F, and sends v - (c / b) F. See docs/laws.md.
 import math
 from typing import ClassVar
 
-from trilat_net.core.user_law import LawContext, LawInput
+import trilat_net as tn
 
 
 class Wave:
@@ -21,13 +21,13 @@ class Wave:
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
     remembers = ("q_sd", "played")
 
-    def __init__(self, facts: LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0) -> None:
+    def __init__(self, facts: tn.LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0) -> None:
         self.b, self.K, self.B = b, K, B
         self.c = math.sqrt(2.0 * b)
         self.q_sd = [[0.0] * facts.joints for _ in facts.peers]
         self.played = [[0.0] * facts.joints for _ in facts.peers]
 
-    def torque(self, now: LawInput) -> list[float]:
+    def torque(self, now: tn.LawInput) -> list[float]:
         """Returns the torque of each joint, and sends the waves."""
         if now.k == 0:
             self.q_sd = [list(peer.q) for peer in now.peers]  # they begin where they stand
@@ -45,7 +45,7 @@ class Wave:
                 tau[i] += force
         return tau
 
-    def follow(self, now: LawInput, j: int, i: int, v: float) -> tuple[float, float]:
+    def follow(self, now: tn.LawInput, j: int, i: int, v: float) -> tuple[float, float]:
         """Returns the torque of a spring whose far end the line moves, and the wave that goes back."""
         stretch = self.q_sd[j][i] - now.q[i]
         qd_sd = (self.c * v - self.K * stretch + self.B * now.qd[i]) / (self.b + self.B)

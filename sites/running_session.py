@@ -15,6 +15,7 @@ import numpy as np
 from trilat_net.core.chain import build_chain, place_end_effector, place_joints
 from trilat_net.core.vectors import Vector
 from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.net import topics
 from trilat_net.net.access_rules import OPERATOR
 from trilat_net.net.arm_port import Hand
 from trilat_net.net.bus import Bus
@@ -27,8 +28,9 @@ from trilat_net.net.discovery import (
     find_site_info,
     send_change,
 )
-from trilat_net.net.messages import Info
+from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators import find_live_hand
@@ -103,6 +105,22 @@ class RunningSession:
         with self._reach() as bus:
             _find_running(bus, self._clock, self.name, site)
             return send_change(bus, self._clock, self.name, site, request)
+
+    @contextmanager
+    def records(self, *sites: str) -> Iterator[Callable[[], list[State]]]:
+        """Listens to sites, by default to all; yields a function that returns the records that came since.
+
+        >>> with tn.session("paper").records("s") as take:  # doctest: +SKIP
+        ...     [record.q_des for record in take()]
+        """
+        with self._reach(operates=False) as bus:
+            rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or "*"]
+
+            def take() -> list[State]:
+                payloads = (message[1] for ring in rings for message in iter(ring.poll, None))
+                return [decode(one, State) for payload in payloads for one in split_states(payload)]
+
+            yield take
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
         """Measures round trips, clock offsets and links of the session; as `trilat ping`."""

@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 
 import trilat_net
+from sites.running_session import RunningSession, open_hand
 from tests.log_editing import recorded
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.net.arm_port import EnablePort
 from trilat_net.net.bus import Bus
+from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
@@ -168,7 +170,7 @@ def test_a_switch_is_let_go_at_once_when_the_program_before_it_ends(monkeypatch:
 
 @pytest.mark.long
 def test_a_program_hands_over_and_back_without_a_step(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The example in a session without a late tick: no reference steps further while the lead changes."""
     example = runpy.run_path(str(LOOK.with_name("policy_hand.py")))
@@ -176,8 +178,21 @@ def test_a_program_hands_over_and_back_without_a_step(
     session = Session.whole(scenario, tmp_path)
 
     def act(bus: Bus, clock: RelayClock) -> None:
-        clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
-        example["report"](*example["lead"](bus, clock, SESSION, scenario, 9.0, alone=False))
+        def wait_s(time_s: float) -> None:
+            clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+
+        running = RunningSession(SESSION, Connection((), []))
+        monkeypatch.setattr(running, "_clock", clock)
+        monkeypatch.setattr(running, "_reach", lambda **_: nullcontext(bus))
+        wait_s(1.0)
+        with (
+            open_hand(bus, clock, SESSION, "m2", scenario) as program,
+            open_hand(bus, clock, SESSION, "m1", scenario) as person,
+        ):
+            moved = example["lead"](
+                running, program, person, 9.0, lambda: 1e-9 * clock.monotonic_ns(), wait_s
+            )
+        example["report"](*moved)
 
     session.stranger(act)
     assert trilat_net.verify(session.run()).passed

@@ -63,3 +63,13 @@ def test_the_tour_names_what_exists() -> None:
 def test_the_tour_is_short() -> None:
     assert TOUR.count("\n") <= 120
     assert (Path(house.ROOT) / "README.md").read_text(encoding="utf-8").count("\n") < 100
+
+
+def test_examples_import_the_interface_alone() -> None:
+    """Whoever reads one learns what a program of his own may use."""
+    inside = re.compile(r"^\s*(?:from|import) (?:trilat_net\.|sites|recorder|live)", re.MULTILINE)
+    assert not [
+        path.name
+        for path in (house.ROOT / "examples").rglob("*.py")
+        if inside.search(path.read_text(encoding="utf-8"))
+    ]

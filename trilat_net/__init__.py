@@ -41,19 +41,25 @@ if _TYPE_CHECKING:
     from .api import verify as verify
     from .api import view as view
     from .core.compiled_law import compiled as compiled
+    from .core.user_law import LawContext as LawContext
+    from .core.user_law import LawInput as LawInput
     from .execution.rerun import rerun as rerun
     from .log.log_reader import open_log as open_log
     from .log.log_signature import create_signing_keys as create_signing_keys
     from .log.log_signature import sign_log as sign_log
+    from .net.arm_port import ArmPort as ArmPort
+    from .net.arm_port import EnablePort as EnablePort
     from .net.member_keys import create_keys as create_keys
     from .net.member_keys import read_member_keys as read_member_keys
     from .reporting.figures.registry import figure as figure
+    from .scenario import Scenario as Scenario
     from .scenario import list_shipped as list_shipped
     from .scenario import load_scenario as load_scenario
     from .scenario import read_template as read_template
     from .scenario.describe import describe_scenario as describe_scenario
     from .scenario.law_skeleton import new_law as new_law
     from .scenario.measured_traces import import_trace as import_trace
+    from .scenario.simulated_arm import SimulatedArm as SimulatedArm
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -68,15 +74,18 @@ _NAMES = {
     "trilat_net.api": "bench certify check_file compare export info linear margin metrics recover report "
     "simulate sweep tune verify view",
     "trilat_net.core.compiled_law": "compiled",
+    "trilat_net.core.user_law": "LawContext LawInput",
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
     "trilat_net.log.log_signature": "create_signing_keys sign_log",
+    "trilat_net.net.arm_port": "ArmPort EnablePort",
     "trilat_net.net.member_keys": "create_keys read_member_keys",
     "trilat_net.reporting.figures.registry": "figure",
-    "trilat_net.scenario": "list_shipped load_scenario read_template",
+    "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
     "trilat_net.scenario.law_skeleton": "new_law",
     "trilat_net.scenario.measured_traces": "import_trace",
+    "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

@@ -22,6 +22,10 @@ MAX_LAW_MEMORY = 1024
 class LawContext(NamedTuple):
     """The knowledge of a law before it begins.
 
+    >>> class Damper:
+    ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
+    ...         self.d = [d] * facts.joints
+
     Attributes:
         site: the site's name.
         rate_hz: its tick rate, Hz.
@@ -97,6 +101,9 @@ class PeerView(NamedTuple):
 
 class LawInput(NamedTuple):
     """The input of a law at a tick; a vector has one number per joint, or per coordinate that sites share.
+
+    >>> def torque(self, now: tn.LawInput) -> list[float]:
+    ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
 
     In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken one by one.
 

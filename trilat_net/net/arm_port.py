@@ -176,10 +176,10 @@ class OutsidePort(SitePort):
 class EnablePort(OutsidePort):
     """The dead-man switch of an arm: what its program says for as long as somebody holds it.
 
-    with EnablePort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:
-        while not switch.over:
-            switch.send(held=button.is_pressed())  # at least every 100 ms
-            time.sleep(0.02)
+    >>> with tn.EnablePort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:  # doctest: +SKIP
+    ...     while not switch.over:
+    ...         switch.send(held=button.is_pressed())  # at least every 100 ms
+    ...         time.sleep(0.02)
     """
 
     channel, member = topics.ENABLE, OPERATOR
@@ -190,7 +190,12 @@ class EnablePort(OutsidePort):
 
 
 class ArmPort(OutsidePort):
-    """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one."""
+    """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one.
+
+    >>> with tn.ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:  # doctest: +SKIP
+    ...     port.send(robot.q, robot.qd)
+    ...     tau = port.torque()
+    """
 
     channel = topics.MEASURED
 

@@ -235,6 +235,9 @@ def _drop_unused(arm: dict[str, Any]) -> None:
 class Scenario(Frozen, frozen=True, dict=True):
     """An experiment, resolved: every value of every site and link is explicit.
 
+    >>> tn.load_scenario("paper").names
+    ('m1', 'm2', 's')
+
     Attributes:
         name: the name of the session and the log.
         title: one line for people.
