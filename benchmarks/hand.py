@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import trilat_net
-from tests.live.processes import PAPER, Session, Stage
-from tests.live.test_hands import HOLDER
+from tests.live.processes import HOLDER, PAPER, Session, Stage
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics

@@ -27,24 +27,26 @@ def room(path: Path) -> str:
     return below[0] if top == "trilat_net" else top
 
 
-def _imported(path: Path) -> Iterator[Path]:
-    """Yields the files of this program that a file imports, wherever in it the import stands."""
+def imported_names(path: Path) -> Iterator[tuple[str, ...]]:
+    """Yields what a file imports, wherever in it the import stands, as the parts of a dotted name."""
     package = path.relative_to(ROOT).parent.parts
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             parts = (*base, *(node.module or "").split(".")) if node.module else base
-            names = [(*parts, alias.name) for alias in node.names]
+            yield from ((*parts, alias.name) for alias in node.names)
         elif isinstance(node, ast.Import):
-            names = [tuple(alias.name.split(".")) for alias in node.names]
-        else:
-            continue
-        for name in names:
-            for parts in (name, name[:-1]):
-                at = ROOT.joinpath(*parts)
-                if parts and parts[0] in TOPS and (found := _module(at)) is not None:
-                    yield found
-                    break
+            yield from (tuple(alias.name.split(".")) for alias in node.names)
+
+
+def _imported(path: Path) -> Iterator[Path]:
+    """Yields the files of this program that a file imports."""
+    for name in imported_names(path):
+        for parts in (name, name[:-1]):
+            at = ROOT.joinpath(*parts)
+            if parts and parts[0] in TOPS and (found := _module(at)) is not None:
+                yield found
+                break
 
 
 def _module(at: Path) -> Path | None:

@@ -29,7 +29,7 @@ from tests.documentation import (
 )
 from tests.golden.surface import all_options
 from tests.live.processes import BEGUN, Process
-from tests.scenario.test_measured_traces import irtt
+from tests.scenario.round_trips import irtt
 
 BLOCKS = [block for page in PAGES for block in find_blocks(page)]
 SCENARIOS = resources.files("trilat_net") / "scenarios"

@@ -36,6 +36,12 @@ def test_the_house_is_no_larger_than_it_may_be() -> None:
     assert sum(lines) <= 69_300
 
 
+def test_no_test_imports_another() -> None:
+    files = [path for top in ("tests", "benchmarks") for path in (house.ROOT / top).rglob("*.py")]
+    found = [(path.name, *name) for path in files for name in house.imported_names(path)]
+    assert not [name for name in found if any(part.startswith("test_") for part in name[1:])]
+
+
 def test_no_body_is_longer_than_forty_lines() -> None:
     assert not [
         (path.name, *found) for path in house.files() for found in house.bodies(path) if found[1] > 40

@@ -18,10 +18,10 @@ from scipy.optimize import brentq
 from scipy.stats import uniform
 
 import trilat_net
+from tests.analysis.ages_in_use import in_order, newest_wins
 from tests.analysis.certificate import runs
-from tests.analysis.test_link_summary import in_order, newest_wins
 from tests.cli.running import trilat
-from tests.theory import test_dde, test_energy
+from tests.theory import delay_equations, energy
 from tests.theory.figures_of_runs import measured, value
 from tests.theory.loops import RODS
 from tests.virtual_runs import sampled
@@ -221,8 +221,8 @@ def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
 
 def distances(scheme: str) -> list[float]:
     """From the exact solution of `paper`, rad, at three rates, and the orders between them."""
-    far = [test_dde.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
-    return [*far, *test_dde.order("paper", scheme)]
+    far = [delay_equations.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
+    return [*far, *delay_equations.order("paper", scheme)]
 
 
 def shipped_trials() -> list[Any]:
@@ -375,12 +375,12 @@ PAGES: dict[str, dict[str, Make]] = {
         "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances("second_order"),
         "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances("digital"),
         "part of max V | `paper` {}, `asymmetric` {}; orders {} and {}": lambda: [
-            *[test_energy.booked(name).residual for name in ("paper", "asymmetric")],
-            *[test_energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
+            *[energy.booked(name).residual for name in ("paper", "asymmetric")],
+            *[energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
         ],
         "the same with `digital` | {}, order {} and {}": lambda: [
-            test_energy.booked("paper", "digital").residual,
-            *[test_energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
+            energy.booked("paper", "digital").residual,
+            *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
         "{} runs of the twenty-two": lambda: [len(shipped_trials())],
         "run once): {} s simulated": lambda: [sum(one.scenario.duration_s for one in shipped_trials())],

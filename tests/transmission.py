@@ -8,14 +8,42 @@ Nothing here is of the package: it is what the runs in time are compared with.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 Complex = NDArray[np.complex128]
 
 WALL = (500.0, 5.0)
 """K and B of the environment at the slave, the last site."""
+PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
+VARIANTS: dict[str, dict[str, Any]] = {
+    "ideal": {"acceleration": 1.0},
+    "without qdd": {},
+    "three": {"force_peer": (1.0, 0.0), "force_own": (0.0, -1.0), "acceleration": 1.0},
+    "no forces": {"force_peer": 0.0},
+}
+TABLE = {
+    ("ideal", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
+    ("ideal", 0.001): (1.0, 0.992, 0.979, 0.970, 0.938),
+    ("ideal", 0.02): (0.990, 0.840, 0.686, 0.580, 0.720),
+    ("ideal", 0.2): (0.802, 0.234, 0.041, 3.14, 1.00),
+    ("without qdd", 0.0): (0.999, 0.980, 0.921, 0.690, 0.976),
+    ("without qdd", 0.001): (0.999, 0.973, 0.904, 0.667, 1.004),
+    ("without qdd", 0.02): (0.990, 0.832, 0.650, 0.350, 1.75),
+    ("without qdd", 0.2): (0.802, 0.234, 0.034, 3.62, 0.976),
+    ("three", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
+    ("three", 0.001): (1.0, 0.999, 0.997, 0.987, 0.903),
+    ("three", 0.02): (0.999, 0.984, 0.936, 0.766, 2.35),
+    ("three", 0.2): (0.989, 0.764, 0.708, 1.55, 1.00),
+    ("no forces", 0.0): (0.167, 0.177, 0.200, 0.244, 2.38),
+    ("no forces", 0.001): (0.167, 0.177, 0.199, 0.245, 2.42),
+    ("no forces", 0.02): (0.167, 0.175, 0.191, 0.313, 2.95),
+    ("no forces", 0.2): (0.167, 0.193, 0.333, 0.491, 2.38),
+}
+"""Transmitted over true impedance at 0.1, 0.5, 1, 2 and 5 Hz, per variant and delay, s."""
 
 
 def balance(
@@ -64,3 +92,8 @@ def rightmost_root(alpha: NDArray[np.float64], loads: Sequence[tuple[float, floa
     values = [np.linalg.det(balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
     scaled = np.fft.fft(values) / (degree + 1)  # coefficients of (s / 10)^k
     return float(10.0 * np.roots(scaled[::-1]).real.max())
+
+
+def printed(value: float) -> Any:
+    """A printed number: within half of its last digit, of three."""
+    return pytest.approx(value, rel=2e-3, abs=6e-4)

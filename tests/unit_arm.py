@@ -7,6 +7,7 @@ with one gain for both joints keeps that line: x is q1, and q2 = q1 / 2.
 from collections.abc import Mapping
 from typing import Any
 
+from tests.transmission import VARIANTS
 from tests.virtual_runs import Array, Run, sampled, trajectories
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.law_consent import allow_own_laws
@@ -40,6 +41,8 @@ def hand(to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: flo
 
 H50 = hand(0.3)
 """The hand of most tests."""
+WALL = hand(0.0, 500.0, 5.0)
+DRIVE = {"kind": "multisine", "amplitude_nm": [2.0, 1.0], "frequencies_hz": [1.0], "end_s": 1000.0}
 
 
 def _toml(value: Any) -> str:
@@ -92,3 +95,18 @@ def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:
     columns = next(iter(scenario.names))
     fields = scenario.layout(columns).columns()
     return [{name: rows[:, k, fields[name]] for name in fields} for k in range(len(times_s))]
+
+
+def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any) -> Scenario:
+    """A driven master and a slave at a wall, `delay_s` apart, under a variant of the four-channel law."""
+
+    def one(at: int) -> dict[str, Any]:
+        law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
+        return {key: value[at] if isinstance(value, tuple) else value for key, value in law.items()}
+
+    sites = {
+        "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},
+        "s": {"hands": [WALL], "control": one(1)},
+    }
+    link = {"model": "constant", "delay_ms": 1e3 * delay_s}
+    return unit_scenario(sites, {}, link=link, duration_s=duration_s)

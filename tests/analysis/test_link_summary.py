@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import trilat_net
+from tests.analysis.ages_in_use import in_order, newest_wins
 from trilat_net.analysis.delivery import predict_delivery
 from trilat_net.analysis.link_summary import bin_ages, compute_statistics, summarise_links
 from trilat_net.errors import LogError
@@ -149,25 +150,6 @@ def test_ages_in_the_records_are_what_the_fates_of_the_samples_make_them(link):
     t_ns = np.arange(len(part)) * 10**9 // part.rate_hz
     ages = [(t_ns[tick] - fate.stamp_ns[n]) / 1e6 for tick, n in enumerate(in_use) if n >= 0]
     assert tuple(busy()[link].age_ms) == pytest.approx(tuple(compute_statistics(ages)))
-
-
-def newest_wins(cdf, h_ms):
-    """Mean and deviation of the age in use: it exceeds n h where none of the last n samples is there yet."""
-    none_yet = np.cumprod(1.0 - cdf(h_ms * np.arange(1, 20_000)))
-    return moments(np.concatenate([[1.0], none_yet]), h_ms)
-
-
-def in_order(cdf, h_ms):
-    """The same where none overtakes: it exceeds n h unless the n-th sample back and all older are there."""
-    all_there = np.cumprod(cdf(h_ms * np.arange(1, 20_000))[::-1])[::-1]
-    return moments(np.concatenate([[1.0], 1.0 - all_there]), h_ms)
-
-
-def moments(exceeds, h_ms):
-    """Mean and deviation of n h, n >= 1, from the probabilities of n > 0, 1, 2..."""
-    n = np.arange(len(exceeds))
-    mean = h_ms * exceeds.sum()
-    return mean, math.sqrt(h_ms**2 * ((2 * n + 1) * exceeds).sum() - mean**2)
 
 
 def hyperexponential(t_ms):

@@ -9,6 +9,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
+from tests.execution.logs import external_log
 from trilat_net.log.log_reader import open_log
 
 LAWS = Path(__file__).parents[1] / "laws.py"
@@ -147,8 +148,6 @@ def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
-    from tests.execution.test_user_laws import external_log
-
     (tmp_path / "outside.mcap").write_bytes(external_log())
     trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses("sites.s.plant", "as in --replace m")
     assert trilat("rerun", "outside.mcap", "--replace", "m", cwd=tmp_path).code == 0

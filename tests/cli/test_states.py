@@ -10,7 +10,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.log.test_session_check import split
+from tests.log.dealt import split
 from tests.log_editing import edited, recorded
 from tests.log_surgery import repacked, taken_apart
 from trilat_net.log.log_reader import open_log

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.core.test_safeguards import RATE_NM_S, largest_step, ordered
+from tests.control_laws.law_settings import LAWS
+from tests.core.guarded_runs import RATE_NM_S, largest_step, ordered
 from tests.log_editing import opened, recorded
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.execution.verify import verify
@@ -14,19 +15,6 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.laws import LAWS as ALL_LAWS
 
-LAWS: dict[str, tuple[str, dict[str, Any]]] = {
-    "six_channel": ("paper", {"control.acceleration": 0.5, "control.force_own": 0.1}),
-    "four_channel": ("two_sites", {"control.acceleration": 0.5}),
-    "saturated_pd": ("paper", {}),
-    "authority": ("paper", {"sites.s.control.leads": False}),
-    "impedance": ("paper", {"sites.s.control.follows": True}),
-    "sync": ("paper", {}),
-    "smith": ("two_sites", {"sites.m.control.predicts": True}),
-    "lee_spong": ("paper", {}),
-    "adaptive_kinematics": ("paper", {}),
-    "adaptive_robust": ("paper", {}),
-}
-"""Per law a shipped scenario and settings."""
 LONG = [name if name == "saturated_pd" else pytest.param(name, marks=pytest.mark.long) for name in LAWS]
 
 

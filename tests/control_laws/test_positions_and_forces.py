@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.log_editing import opened
-from tests.transmission import rightmost_root, transmitted
-from tests.unit_arm import hand, last_rows, unit_scenario
+from tests.transmission import PAIR, TABLE, VARIANTS, printed, rightmost_root, transmitted
+from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
 from tests.virtual_runs import trajectories
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.errors import ScenarioError
@@ -19,32 +19,6 @@ from trilat_net.scenario.describe import describe_law_conditions
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.linear_analysis import analyse_linear_loop
 
-PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
-VARIANTS: dict[str, dict[str, Any]] = {
-    "ideal": {"acceleration": 1.0},
-    "without qdd": {},
-    "three": {"force_peer": (1.0, 0.0), "force_own": (0.0, -1.0), "acceleration": 1.0},
-    "no forces": {"force_peer": 0.0},
-}
-TABLE = {
-    ("ideal", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
-    ("ideal", 0.001): (1.0, 0.992, 0.979, 0.970, 0.938),
-    ("ideal", 0.02): (0.990, 0.840, 0.686, 0.580, 0.720),
-    ("ideal", 0.2): (0.802, 0.234, 0.041, 3.14, 1.00),
-    ("without qdd", 0.0): (0.999, 0.980, 0.921, 0.690, 0.976),
-    ("without qdd", 0.001): (0.999, 0.973, 0.904, 0.667, 1.004),
-    ("without qdd", 0.02): (0.990, 0.832, 0.650, 0.350, 1.75),
-    ("without qdd", 0.2): (0.802, 0.234, 0.034, 3.62, 0.976),
-    ("three", 0.0): (1.0, 1.0, 1.0, 1.0, 1.0),
-    ("three", 0.001): (1.0, 0.999, 0.997, 0.987, 0.903),
-    ("three", 0.02): (0.999, 0.984, 0.936, 0.766, 2.35),
-    ("three", 0.2): (0.989, 0.764, 0.708, 1.55, 1.00),
-    ("no forces", 0.0): (0.167, 0.177, 0.200, 0.244, 2.38),
-    ("no forces", 0.001): (0.167, 0.177, 0.199, 0.245, 2.42),
-    ("no forces", 0.02): (0.167, 0.175, 0.191, 0.313, 2.95),
-    ("no forces", 0.2): (0.167, 0.193, 0.333, 0.491, 2.38),
-}
-"""Transmitted over true impedance at 0.1, 0.5, 1, 2 and 5 Hz, per variant and delay, s."""
 SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; rightmost root; beta_s / beta
     0.0: ((0.201, 0.278, 0.201, 0.278), (0.999, 0.921, 1.0, 1.0), -5.858, (np.inf, 1.0)),
     0.25: ((0.195, 0.257, 0.195, 0.277), (0.373, 0.448, 0.373, 0.513), -5.989, (1.857, 0.867)),
@@ -52,26 +26,6 @@ SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; ri
     1.0: ((0.999, 0.921, 1.0, 1.0), (0.201, 0.278, 0.201, 0.278), -5.858, (1.0, np.inf)),
 }
 USERS = [(50.0, 10.0), (50.0, 10.0), (500.0, 5.0)]
-WALL = hand(0.0, 500.0, 5.0)
-DRIVE = {"kind": "multisine", "amplitude_nm": [2.0, 1.0], "frequencies_hz": [1.0], "end_s": 1000.0}
-
-
-def printed(value: float) -> Any:
-    """A printed number: within half of its last digit, of three."""
-    return pytest.approx(value, rel=2e-3, abs=6e-4)
-
-
-def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any) -> Scenario:
-    def one(at: int) -> dict[str, Any]:
-        law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
-        return {key: value[at] if isinstance(value, tuple) else value for key, value in law.items()}
-
-    sites = {
-        "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},
-        "s": {"hands": [WALL], "control": one(1)},
-    }
-    link = {"model": "constant", "delay_ms": 1e3 * delay_s}
-    return unit_scenario(sites, {}, link=link, duration_s=duration_s)
 
 
 def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:

@@ -1,4 +1,4 @@
-"""Chains with their dynamics and kinematics as Pinocchio computed them: `chain_references.json`, typed.
+"""Chains with their dynamics as Pinocchio computed them, `chain_references.json`, and as our leaves do.
 
 `make_chain_references.py` makes the file anew; to read it, nothing but the file is needed.
 """
@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trilat_net
+from trilat_net.core.chain import inverse_dynamics, mass_matrix, place_joints, propagate_motion
+from trilat_net.core.vectors import RowArray
 from trilat_net.scenario.urdf import UrdfChain, UrdfJoint
 
 Array = NDArray[np.float64]
@@ -93,3 +95,31 @@ def to_chain(name: str, entry: dict) -> UrdfChain:
 
 def _rows(matrix: list) -> tuple:
     return tuple(map(tuple, matrix))
+
+
+class Arm(NamedTuple):
+    """A chain's rows, of one layout for all lengths, and its parameters."""
+
+    rows: RowArray
+    theta: Array
+
+
+def moving(arm: Arm, state: ChainState, v: Array) -> None:
+    """Places the rows in a state, and propagates its motion with v."""
+    place_joints(arm.rows, state.q)
+    propagate_motion(arm.rows, state.gravity, state.qd, v, state.a)
+
+
+def torque_for(arm: Arm, v: Array, a: Array) -> Array:
+    """The torque of inverse dynamics for v and a."""
+    torque = np.zeros(len(arm.rows))
+    inverse_dynamics(arm.rows, arm.theta, v, a, torque)
+    return torque
+
+
+def full_matrix(arm: Arm) -> Array:
+    """M, of which the leaf fills the lower half."""
+    mass_matrix(arm.rows, arm.theta)
+    n = len(arm.rows)
+    lower = np.tril(arm.rows["M"][:, :n])
+    return lower + np.tril(lower, -1).T

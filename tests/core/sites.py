@@ -1,4 +1,4 @@
-"""Sites of the shipped scenarios, stepped by hand."""
+"""Sites of the shipped scenarios, stepped by hand or executed, and their records as text."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -10,7 +10,10 @@ from trilat_net.core.site_setup import LinkSetup, SiteSetup
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import Arrival, TickInput, TickRecord
 from trilat_net.core.vectors import Points
+from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
+
+VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 
 
 def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSetup:
@@ -45,3 +48,16 @@ def sample(tick: int, peer: int = 0) -> Arrival:
 
 def stepped(site: Site, ticks: Iterable[TickInput]) -> list[TickRecord]:
     return [site.step(tick) for tick in ticks]
+
+
+def bits(output: TickRecord) -> str:
+    """All that a step computes of a tick, exactly, as text."""
+    return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(output[-2:])
+
+
+def executed(scenario: str, **overrides: object) -> list[str]:
+    """A virtual run, every record as text."""
+    run = virtual.execute_virtual(
+        load_scenario(scenario, {k.replace("__", "."): v for k, v in overrides.items()})
+    )
+    return [f"{site.name} {output.tick} {bits(output)}" for site, _, output in run]

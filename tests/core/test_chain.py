@@ -1,36 +1,24 @@
 """The leaves of a chain against Pinocchio's numbers, and its own laws."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
-from tests.core.chain_references import ChainState, chain_references
+from tests.core.chain_references import Arm, chain_references, full_matrix, moving, torque_for
 from trilat_net.core.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
     ChainJoint,
     build_chain,
     find_acceleration,
-    inverse_dynamics,
-    mass_matrix,
     parameter_gradient,
     place_end_effector,
     place_joints,
-    propagate_motion,
 )
-from trilat_net.core.vectors import Array, RowArray
+from trilat_net.core.vectors import Array
 
 REFERENCES = chain_references()
 EPS = np.finfo(float).eps
 each = pytest.mark.parametrize("name", REFERENCES)
-
-
-class Arm(NamedTuple):
-    """A chain's rows, of one layout for all lengths, and its parameters."""
-
-    rows: RowArray
-    theta: Array
 
 
 def build(name: str, **drive: float) -> Arm:
@@ -39,24 +27,6 @@ def build(name: str, **drive: float) -> Arm:
         ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive) for one in joints
     ]
     return Arm(build_chain(made, MAX_JOINTS), np.concatenate([one.inertia for one in joints]))
-
-
-def moving(arm: Arm, state: ChainState, v: Array) -> None:
-    place_joints(arm.rows, state.q)
-    propagate_motion(arm.rows, state.gravity, state.qd, v, state.a)
-
-
-def torque_for(arm: Arm, v: Array, a: Array) -> Array:
-    torque = np.zeros(len(arm.rows))
-    inverse_dynamics(arm.rows, arm.theta, v, a, torque)
-    return torque
-
-
-def full_matrix(arm: Arm) -> Array:
-    mass_matrix(arm.rows, arm.theta)
-    n = len(arm.rows)
-    lower = np.tril(arm.rows["M"][:, :n])
-    return lower + np.tril(lower, -1).T
 
 
 def apart(got: Array, wanted: Array) -> float:

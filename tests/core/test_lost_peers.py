@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.core.test_safeguards import reasons
+from tests.core.guarded_runs import reasons
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.analysis.dominance_history import list_losses, trace_dominance

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 import trilat_net
-from tests.core.test_safeguards import largest_step, ordered
-from tests.core.test_task_space import POSE, build
+from tests.core.guarded_runs import largest_step, ordered
+from tests.core.task_sites import POSE, build
 from tests.task_arms import posed_arms
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.analysis.certificate.energy_terms import measure_torque_error

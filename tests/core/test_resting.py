@@ -1,6 +1,5 @@
 """How arms come to rest: of all that waits, holds, is stopped or in fault, by the equations of `resting`."""
 
-import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -10,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.core.guarded_runs import LIMITS, TEXT, adaptive_text, guarded, ordered, stopped_log
 from tests.core.rests import gravity_of, integrals, reference, rest_torque
-from tests.core.test_safeguards import LIMITS, adaptive_text, guarded, ordered
-from tests.core.test_session_life import TEXT
 from trilat_net.analysis.arm_rows import build_arm_rows, inertia_product_rows
 from trilat_net.core.resting import limit_torque_rate
 from trilat_net.core.site_arrays import build_site_arrays
@@ -30,18 +28,10 @@ from trilat_net.scenario.laws import LAWS
 AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
 
 
-@functools.cache
-def stopped(law: str) -> Log:
-    """The slave is stopped at 2 s, while it moves, and enabled at 3.5 s."""
-    return ordered(
-        guarded(text=adaptive_text() if law == "adaptive" else TEXT), {"s": {2000: "stop", 3500: "enable"}}
-    )
-
-
 @pytest.mark.parametrize("law", ["adaptive", "pd_d"])
 def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
     """q_ref = q + v (t - t^2 / 2 T), and qd_ref is its derivative."""
-    log = stopped(law)
+    log = stopped_log(adaptive_text() if law == "adaptive" else TEXT)
     part, gains = log["s"], log.scenario.setup("s").rest
     assert set(part.mode[2000:3500]) == {"stopped"}
     assert np.abs(part.qd[2000]).max() > 0.05
@@ -52,7 +42,7 @@ def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
 
 def test_the_torque_of_a_stop_is_the_law_and_what_rests() -> None:
     """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s, and no step where it begins."""
-    log = stopped("pd_d")
+    log = stopped_log(TEXT)
     part, rows = log["s"], slice(2000, 3500)
     q, qd = part.q[rows], part.qd[rows]
     e, ed = q - part.q_des[rows], qd - part.qd_des[rows]

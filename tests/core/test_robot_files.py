@@ -13,8 +13,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.chain_references import Array, ChainState, chain_references, to_chain
-from tests.core.test_chain import Arm, full_matrix, moving, torque_for
+from tests.core.chain_references import (
+    Arm,
+    Array,
+    ChainState,
+    chain_references,
+    full_matrix,
+    moving,
+    to_chain,
+    torque_for,
+)
 from trilat_net.core.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,

@@ -1,80 +1,32 @@
 """Limits, faults, stops: what no law, peer or order can make an arm do."""
 
-import functools
-import io
-from typing import Any
-
 import numpy as np
 import pytest
 
 import trilat_net
+from tests.core.guarded_runs import (
+    LIMITS,
+    RATE_NM_S,
+    TEXT,
+    adaptive_text,
+    guarded,
+    largest_step,
+    ordered,
+    reasons,
+    stopped_log,
+)
 from tests.core.rests import gravity_of, rest_torque
-from tests.core.test_session_life import TEXT
-from trilat_net.analysis.aligned import RESTING_MODES
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.core.safeguards import BLEND_S
-from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.core.ticks import LifeReason
 from trilat_net.core.user_law import LawContext, LawInput
 from trilat_net.errors import ScenarioError
-from trilat_net.execution import virtual
 from trilat_net.execution.rerun import rerun
-from trilat_net.execution.resumption import read_output
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
-from trilat_net.log.log_reader import Log, open_log
-from trilat_net.scenario import Scenario, load_scenario, parse_scenario, to_core_change
-from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
 from trilat_net.scenario.run_changes import make_site_order
-
-RATE_NM_S = 500.0
-LIMITS = {"tau_rate_limit_nm_s": RATE_NM_S, "qd_des_limit_rad_s": 6.0, "q_min_rad": -4.0, "q_max_rad": 4.0}
-KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "limit": 4.0}
-
-
-def adaptive_text() -> str:
-    """The scenario of the rule, with the paper's law."""
-    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
-    return text.replace('law = "pd_d"', 'law = "adaptive"')
-
-
-def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
-    """The scenario of the rule, with limits of all sites or of one."""
-    overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
-    return allow_own_laws(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
-
-
-def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
-    """A virtual run in which sites are given orders at ticks."""
-
-    def change(site: str, tick: int, order: str) -> CoreChange:
-        t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
-        made = make_site_order(scenario, site, order, t_ns, ticks)
-        return to_core_change(scenario, made)
-
-    commands = {
-        site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
-        for site, of_site in orders.items()
-    }
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, commands=commands)
-    stream.seek(0)
-    return open_log(stream)
-
-
-def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
-    """The modes of a site, each with its reason, as they followed each other."""
-    found: list[tuple[str, LifeReason]] = []
-    for state in log[site].states:
-        reason = find_life_reason(read_output(state, log[site].peers))
-        if not found or found[-1] != (state.mode, reason):
-            found.append((state.mode, reason))
-    return found
-
-
-@functools.cache
-def stopped_log() -> Log:
-    """The slave is stopped at 2 s, while it moves, and enabled at 3.5 s."""
-    return ordered(guarded(), {"s": {2000: "stop", 3500: "enable"}})
 
 
 @pytest.mark.long
@@ -86,14 +38,8 @@ def test_a_log_with_orders_is_executed_again_in_every_way() -> None:
     assert again.sites["s"].identical == 6000
 
 
-@functools.cache
-def adaptive_stop() -> Log:
-    """The slave under the adaptive law is stopped at 2 s and enabled at 3 s."""
-    return ordered(guarded(text=adaptive_text()), {"s": {2000: "stop", 3000: "enable"}})
-
-
 def test_a_site_that_is_stopped_goes_on_learning() -> None:
-    log = adaptive_stop()
+    log = stopped_log(adaptive_text(), 3000)
     theta_hat = log["s"].theta_hat
     assert np.ptp(theta_hat[2000:3000], axis=0).max() > 1e-3
     assert verify(log).identical == 12_000
@@ -119,19 +65,6 @@ def test_a_passed_limit_is_a_fault_until_it_is_reset(limits: dict[str, object], 
     assert any("s is in FAULT: a joint is" in event.text for event in log.events)
     assert verify(log).differing == 0
     assert len(log["s"]) == 6000
-
-
-def largest_step(log: Log, site: str, first: int = 0) -> float:
-    """The largest change of the torque of a joint from tick to tick; before tick 0 there is none.
-
-    Less what brakes an arm that comes to rest, B |qd| against its motion.
-    """
-    part = log[site]
-    steps = np.diff(np.vstack([np.zeros_like(part.tau[:1]), part.tau]), axis=0)
-    resting = np.isin(part.mode, RESTING_MODES)[:, None]
-    brake = np.abs(part.qd) * resting * np.array(log.scenario.setup(site).rest.damping)
-    against = np.where(steps * part.qd < 0.0, brake, 0.0)
-    return float((np.abs(steps) - against)[first:].max())
 
 
 @pytest.mark.long

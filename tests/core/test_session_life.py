@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import trilat_net
+from tests.core.guarded_runs import TEXT
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.core.session_life import MIN_ALIGN_NS
 from trilat_net.core.ticks import LifeReason
@@ -12,39 +13,6 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, parse_scenario
 
-TEXT = """
-name = "glide"
-duration_s = {duration_s}
-rate_hz = {rate_hz}
-[arm]
-[control]
-law = "pd_d"
-K = 60.0
-Kd = 4.0
-d = 12.0
-[on_stale]
-action = "glide"
-align_speed_rad_s = {speed}
-align_limit_rad = {limit}
-[link]
-delay_ms = 100
-outages_s = {outages_s}
-[sites.m]
-q0_rad = [0.8, 0.3]
-[[sites.m.hands]]
-kind = "spring"
-to_rad = [-0.4, 0.9]
-move_start_s = 0.5
-move_end_s = 4.0
-stiffness_nm_rad = 80.0
-damping_nm_s_rad = 8.0
-[sites.s]
-role = "slave"
-q0_rad = [0.1, 0.4]
-[dominance]
-m = {{ s = 1.0 }}
-s = {{ m = 1.0 }}
-"""
 OUTAGE = "[[2.0, 2.6]]"
 
 

@@ -9,30 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.compiled import printed
-from tests.core.sites import sample, setup, stepped
+from tests.core.sites import VECTORS, bits, sample, setup, stepped
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
 
-VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-
 
 def finite(output: TickRecord) -> bool:
     return all(math.isfinite(v) for field in VECTORS for v in getattr(output, field))
-
-
-def bits(output: TickRecord) -> str:
-    return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(output[-2:])
-
-
-def executed(scenario: str, **overrides: object) -> list[str]:
-    """A virtual run, every record as text."""
-    run = virtual.execute_virtual(
-        load_scenario(scenario, {k.replace("__", "."): v for k, v in overrides.items()})
-    )
-    return [f"{site.name} {output.tick} {bits(output)}" for site, _, output in run]
 
 
 arrivals = st.lists(
@@ -69,7 +55,7 @@ def test_a_record_holds_the_state_at_its_tick_and_its_inputs() -> None:
 
 
 _PROGRAM = """
-from tests.core.test_site_step import executed
+from tests.core.sites import executed
 for scheme in ("second_order", "digital"):
     print("\\n".join(executed("asymmetric", scheme=scheme, duration_s=0.25, link__delay_ms=20,
                               links={"m2->m1": {"delay_ms": 33.5}})))

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.core.chain_references import chain_references
-from trilat_net.core.chain import ChainJoint, place_joints
+from tests.core.task_sites import PLACE, POSE, build
+from trilat_net.core.chain import place_joints
 from trilat_net.core.rotation import (
     arctan,
     rotation_matrix,
@@ -16,42 +16,15 @@ from trilat_net.core.rotation import (
     turn_rate,
     turning_velocity,
 )
-from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
-from trilat_net.core.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup, TaskSetup
+from trilat_net.core.site_arrays import SiteArrays
+from trilat_net.core.site_setup import TaskSetup
 from trilat_net.core.task_space import update_pose, update_task_errors, update_wrench
 from trilat_net.core.vectors import Array, Row
 
-CHAIN = chain_references()["arm7"].chain
-THETA = np.concatenate([one.inertia for one in CHAIN.joints])
 vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def build(task: TaskSetup) -> SiteArrays:
-    joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m) for one in CHAIN.joints
-    )
-    chain = ChainSetup(joints, tip_m=CHAIN.tip_origin_m, tip_rotation=CHAIN.tip_rotation, task=task)
-    numbers = {"theta": THETA, "g_m_s2": 9.81, "lengths_m": (0.0, 0.0), "tau_limit_nm": 1e3}
-    return build_site_arrays(
-        SiteSetup(
-            name="a",
-            rate_hz=1000,
-            scheme=Scheme.SECOND_ORDER,
-            gains=Gains(Law.ADAPTIVE, Lambda=(2.0,), Kp=(1.0,), Kd=(1.0,)),
-            qd_limit_rad_s=100.0,
-            q0=(0.0, -0.4, 0.2, -1.7, 0.1, 1.5, 0.3),
-            qd0=(0.0,) * 7,
-            actors=(),
-            links=(LinkSetup("b", 1.0, 1000, (0.0,) * len(task.axes)),),
-            chain=chain,
-            **numbers,
-        ),
-        pages=8,
-    )
-
-
-PLACE, POSE = TaskSetup((1.0,) * 3, 0.5), TaskSetup((1.0,) * 6, 1.0, posture_rate=0.7)
 tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 
 

@@ -4,7 +4,11 @@ import io
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from tests.log_editing import edited, opened, recorded
+import pytest
+
+from tests.execution.deliveries import TICKS
+from tests.log_editing import SHORT, edited, opened, recorded
+from trilat_net.core.ticks import PlantState
 from trilat_net.execution import virtual
 from trilat_net.execution.rerun import Rerun
 from trilat_net.log.log_reader import Log
@@ -50,3 +54,17 @@ def all_identical(again: Rerun) -> bool:
         effect.identical == effect.executed == len(again.before[name]) and effect.first is None
         for name, effect in again.sites.items()
     )
+
+
+def external_log() -> bytes:
+    """A log as a live session with an arm outside writes it: s moved as nobody here computes."""
+    outside = {"sites.s.plant": "external", "sites.s.arm.known": False}
+    scenario = load_scenario("two_sites", dict(SHORT) | outside)
+    moves = {k: PlantState([0.01 * k, -0.3], [0.25 * (k % 3), 1e-3 * k]) for k in range(TICKS)}
+    stream = io.BytesIO()
+    run = virtual.execute_virtual
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual, "execute_virtual", lambda s, n=None, **_: run(s, n, measured={"s": moves}))
+        patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
+        virtual.write_virtual_log(scenario, stream)
+    return stream.getvalue()

@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from tests.execution.deliveries import SITES, TICKS
-from tests.execution.logs import OTHER_PLATFORM, numbers, without_records
+from tests.execution.logs import OTHER_PLATFORM, external_log, numbers, without_records
 from tests.log_editing import Record, edited, opened, recorded
-from trilat_net.core.ticks import PlantState
 from trilat_net.errors import LawFailed, ScenarioError, UsageError
 from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
@@ -196,19 +195,6 @@ def test_a_law_that_fails_ends_the_run_with_a_finished_log_that_says_why(how: st
     assert verdict.agreed
     assert verdict.identical == 3 * at + 2
     assert compare_with_virtual(log).fed.first is None
-
-
-def external_log() -> bytes:
-    """A log as a live session with an arm outside writes it: s moved as nobody here computes."""
-    scenario = load_scenario("two_sites", {**SHORT, "sites.s.plant": "external", "sites.s.arm.known": False})
-    moves = {k: PlantState([0.01 * k, -0.3], [0.25 * (k % 3), 1e-3 * k]) for k in range(TICKS)}
-    stream = io.BytesIO()
-    run = virtual.execute_virtual
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual, "execute_virtual", lambda s, n=None, **_: run(s, n, measured={"s": moves}))
-        patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
-        virtual.write_virtual_log(scenario, stream)
-    return stream.getvalue()
 
 
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])

@@ -11,8 +11,15 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import combinations, count
+from typing import Self
+
+from .processes import FOLLOWS, GLIDE, PAPER, Session, Stage, connections
 
 _numbers = count()
+ALL = (*PAPER, "recorder")
+PORT = "tcp/0.0.0.0:7447"
+CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
+"""How far each clock is ahead, s, and by how much it runs faster, ppm."""
 
 
 class NoNamespaces(Exception):  # noqa: N818 - it names a reason
@@ -172,3 +179,31 @@ def reaches(made: Machines, name: str, address: str) -> bool:
 def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     """All pairs, both ways."""
     return [pair for two in combinations(names, 2) for pair in (two, two[::-1])]
+
+
+class Apart(Session):
+    """Three sites and a recorder, each on its machine with its clock."""
+
+    def __init__(self, stage: Stage, apart: Machines, *options: str) -> None:
+        super().__init__(stage, "paper", PAPER, *options)
+        self._apart, self.before = apart, {name: apart.on(name) for name in ALL}
+
+    def ways(self, name: str) -> list[str]:
+        """How the README says it: through a router, or by who listens where the others reach it."""
+        offset_s, drift_ppm = CLOCKS[name]
+        clock = ["--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm)]
+        if name in self._apart.centre:
+            return [*clock, "--router", f"tcp/{self._apart.centre[name]}:7447"]
+        others = PAPER if name == "recorder" else PAPER[: PAPER.index(name)]
+        listen = () if name == "recorder" else ("--insecure", "--listen", PORT)
+        return [*clock, *listen, *connections([f"tcp/{self._apart.address[other]}:7447" for other in others])]
+
+    @classmethod
+    def following(cls, stage: Stage, apart: Machines, duration_s: int) -> Self:
+        """A session under `glide`, in which every site follows its peers."""
+        session = cls(stage, apart, "--duration", str(duration_s), *GLIDE)
+        session.all()
+        session.begun()
+        for name in PAPER:
+            session.processes[name].prints(FOLLOWS)
+        return session

@@ -1,18 +1,23 @@
-"""Real processes of a session, started, watched and ended by a test."""
+"""Real processes of a session, started, watched and ended by a test, and what their log says."""
 
 import contextlib
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from tests.cli.running import COMMAND, PLAIN
+from tests.faults.invariants import SILENT_TICKS, count_silence, stretches
 from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.scenario.law_consent import allow_own_laws
 
@@ -21,6 +26,22 @@ BEGUN = "the session begins"
 PATIENCE_S = 60.0
 TALKING = ("--set", "control.law=tests.channel_law:Talking")
 """Options of a session whose laws send to all and to each."""
+GLIDE = (
+    *("--set", 'on_stale.action="glide"'),
+    *("--set", "on_stale.align_speed_rad_s=1.0"),
+    *("--set", "on_stale.align_limit_rad=3.0"),
+)
+JOINS, FOLLOWS = "joins the running session", " s, run, "
+HOLDER = """
+import sys, time, trilat_net
+with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be killed", timeout_s=60.0) as hand:
+    start = hand.pose
+    while True:
+        hand.move(start[0] + 0.05, start[1] + 0.05)
+        if hand.holds:
+            print("holds", flush=True)
+        time.sleep(0.01)
+"""
 
 
 class Process:
@@ -241,3 +262,53 @@ def equal_to_virtual_time(log: Log) -> None:
         assert twins.plain.identical == twins.plain.records == records
     else:
         assert twins.plain.first is None or twins.plain.first.tick >= twins.excused_from
+
+
+def pause(time_s: float) -> None:
+    """Lets a session go on for a time."""
+    clock = SystemClock()
+    clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+
+
+def ticks_to_hold(log: Log) -> dict[str, list[int]]:
+    """Of every hold of each site, how many ticks after its last sample in use it began."""
+    found: dict[str, list[int]] = {site: [] for site in log.sites}
+    for site, holds in found.items():
+        for stretch in stretches(log[site].states):
+            before = ""
+            for state, silent in count_silence(stretch):
+                assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (site, state.tick)
+                if state.mode == "hold" != before:
+                    holds.append(silent)
+                before = state.mode
+    return found
+
+
+def engaged_after_s(log: Log) -> list[float]:
+    """Of each start that joined, how long after its first tick it followed its peers, s."""
+    found = []
+    for site, starts in log.starts.items():
+        part = log[site]
+        for first, _ in starts:
+            engaged = (part.tick >= first) & (part.mode == "run")
+            assert engaged.any(), (site, first)
+            found.append(float(part.tick[np.argmax(engaged)] - first) / part.rate_hz)
+    return found
+
+
+class Holder:
+    """A process that holds m1 until it is killed."""
+
+    def __init__(self, session: Session, folder: Path, before: Sequence[str] = ()) -> None:
+        words = [*before, sys.executable, "-c", HOLDER, "m1", *session.endpoints]
+        self._printed, root = folder / "holder.txt", Path(__file__).parents[2]
+        with self._printed.open("wb") as sink:
+            self._process = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
+
+    def holds(self) -> bool:
+        return b"holds" in self._printed.read_bytes()
+
+    def end(self) -> None:
+        """Kills it."""
+        self._process.kill()
+        self._process.wait()

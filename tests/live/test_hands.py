@@ -2,8 +2,6 @@
 
 import math
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,46 +10,17 @@ import numpy as np
 import pytest
 
 import trilat_net
-from tests.cli.running import PLAIN, trilat
+from tests.cli.running import trilat
 from tests.net.waiting import until
 from trilat_net.analysis.certificate.stability_certificate import BROKEN_BALANCE_SHARE
 from trilat_net.log.log_reader import Log
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
 from .namespaces import Machines, bridged
-from .processes import PAPER, Session, Stage, connections
+from .processes import PAPER, Holder, Session, Stage, connections
 
 GONE_S = 0.320
 """From the last sign of life of whoever holds an arm to no force on it."""
-
-HOLDER = """
-import sys, time, trilat_net
-with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be killed", timeout_s=60.0) as hand:
-    start = hand.pose
-    while True:
-        hand.move(start[0] + 0.05, start[1] + 0.05)
-        if hand.holds:
-            print("holds", flush=True)
-        time.sleep(0.01)
-"""
-
-
-class Holder:
-    """A process that holds m1 until it is killed."""
-
-    def __init__(self, session: Session, folder: Path, before: Sequence[str] = ()) -> None:
-        words = [*before, sys.executable, "-c", HOLDER, "m1", *session.endpoints]
-        self._printed, root = folder / "holder.txt", Path(__file__).parents[2]
-        with self._printed.open("wb") as sink:
-            self._process = subprocess.Popen(words, stdout=sink, env=PLAIN, cwd=root)
-
-    def holds(self) -> bool:
-        return b"holds" in self._printed.read_bytes()
-
-    def end(self) -> None:
-        """Kills it."""
-        self._process.kill()
-        self._process.wait()
 
 
 class Circling(threading.Thread):

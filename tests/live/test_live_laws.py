@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sites.site_parts import warm_up
-from tests.control_laws.test_plugged_laws import LAWS
+from tests.control_laws.law_settings import LAWS
 from tests.energy_runs import FOLLOWER
 from tests.unit_arm import H50, hand, unit_text
 from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies

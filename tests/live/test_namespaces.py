@@ -13,33 +13,8 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
-from .namespaces import Machines, NoNamespaces, bridged, pairs, reaches, starred
-from .processes import Session, Stage, connections, executed_again, whole
-from .test_returning import FOLLOWS, GLIDE, JOINS, engaged_after_s, pause, ticks_to_hold
-
-SITES = ("m1", "m2", "s")
-ALL = (*SITES, "recorder")
-PORT = "tcp/0.0.0.0:7447"
-CLOCKS = {"m1": (0.0, 0.0), "m2": (3.0, 100.0), "s": (-2.0, -100.0), "recorder": (1.0, 50.0)}
-"""How far each clock is ahead, s, and by how much it runs faster, ppm."""
-
-
-class Apart(Session):
-    """Three sites and a recorder, each on its machine with its clock."""
-
-    def __init__(self, stage: Stage, apart: Machines, *options: str) -> None:
-        super().__init__(stage, "paper", SITES, *options)
-        self._apart, self.before = apart, {name: apart.on(name) for name in ALL}
-
-    def ways(self, name: str) -> list[str]:
-        """How the README says it: through a router, or by who listens where the others reach it."""
-        offset_s, drift_ppm = CLOCKS[name]
-        clock = ["--clock-offset-s", str(offset_s), "--clock-drift-ppm", str(drift_ppm)]
-        if name in self._apart.centre:
-            return [*clock, "--router", f"tcp/{self._apart.centre[name]}:7447"]
-        others = SITES if name == "recorder" else SITES[: SITES.index(name)]
-        listen = () if name == "recorder" else ("--insecure", "--listen", PORT)
-        return [*clock, *listen, *connections([f"tcp/{self._apart.address[other]}:7447" for other in others])]
+from .namespaces import ALL, CLOCKS, PORT, Apart, Machines, NoNamespaces, bridged, pairs, reaches, starred
+from .processes import JOINS, PAPER, Stage, engaged_after_s, executed_again, pause, ticks_to_hold, whole
 
 
 def clocks_as_injected(log: Log) -> None:
@@ -48,7 +23,7 @@ def clocks_as_injected(log: Log) -> None:
     for name, (offset_s, drift_ppm) in CLOCKS.items():
         assert clocks[name].offset_ns == offset_s * 1e9
         assert float(clocks[name].rate - 1) * 1e6 == pytest.approx(drift_ppm)
-    for site, peer in pairs(SITES):
+    for site, peer in pairs(PAPER):
         link = judged(log, site, peer)
         assert link.inside >= 0.999
         assert link.tick.size >= 0.5 * len(log[site])
@@ -141,7 +116,7 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
     fed = compare_with_virtual(log).fed
     assert fed.first is None
     assert fed.identical == fed.records == 39_000
-    for site, peer in pairs(SITES):
+    for site, peer in pairs(PAPER):
         used = [state.used[peer] for state in log[site].states]
         assert used == sorted(used)
     lost = [(event.member, event.about) for event in log.events if event.kind == "lost"]
@@ -154,23 +129,13 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
     assert counted.late["m1"] == sum(tick <= counted.tick for tick in late)
 
 
-def following(stage: Stage, apart: Machines, duration_s: int) -> Apart:
-    """A session under `glide`, in which every site follows its peers."""
-    session = Apart(stage, apart, "--duration", str(duration_s), *GLIDE)
-    session.all()
-    session.begun()
-    for name in SITES:
-        session.processes[name].prints(FOLLOWS)
-    return session
-
-
 @pytest.mark.long
 def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_when_killed(
     stage: Stage, apart: Machines
 ) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
     bridged(apart, ALL)
-    session = following(stage, apart, 40)
+    session = Apart.following(stage, apart, 40)
     apart.part("m1", "m2")
     pause(6.0)
     apart.mend("m1", "m2")
@@ -181,19 +146,19 @@ def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_wh
     session.site("m1", called="m1 again").prints(JOINS)
     session.ends_well()
     log = open_log(session.log)
-    assert {str(log[name].mode[-1]) for name in SITES} == {"run"}
+    assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
     assert max(engaged_after_s(log)) <= 2.0
     for name in ("m1", "m2"):
         held = np.count_nonzero(log[name].mode == "hold")
         assert held > 4000
     assert max(max(found) for found in ticks_to_hold(log).values()) <= 21
-    assert [log.missing(name) for name in SITES] == [0, 0, 0]
+    assert [log.missing(name) for name in PAPER] == [0, 0, 0]
     result = verify(log)
     assert result.passed
     assert result.differing == 0
     assert [site for site, _, _ in result.absences] == ["m1"]
     clocks = {**members(log), "m1": again(log, "m1")}  # of each the one at the end
-    begun_ns = {name: np.median(began_ns(log, name, clocks[name])) for name in SITES}
+    begun_ns = {name: np.median(began_ns(log, name, clocks[name])) for name in PAPER}
     assert max(begun_ns.values()) - min(begun_ns.values()) <= 1_000_000
 
 
@@ -205,7 +170,7 @@ def test_a_way_that_is_cut_in_one_direction_is_held_at_both_ends(stage: Stage, a
     its retransmission timer runs out; then m1 hears nothing either, and holds too.
     """
     bridged(apart, ALL)
-    session = following(stage, apart, 36)
+    session = Apart.following(stage, apart, 36)
     for cut_s in (2.5, 8.0):
         try:
             apart.deafen("m2", "m1")
@@ -226,7 +191,7 @@ def test_a_way_that_is_cut_in_one_direction_is_held_at_both_ends(stage: Stage, a
     assert max(max(found, default=0) for found in ticks_to_hold(log).values()) <= 21
     lost = {(event.member, event.about) for event in log.events if event.kind == "lost"}
     assert lost == {("m1", "m2"), ("m2", "m1")}
-    assert {str(log[name].mode[-1]) for name in SITES} == {"run"}
+    assert {str(log[name].mode[-1]) for name in PAPER} == {"run"}
 
 
 def began_ns(log: Log, name: str, clock: Member) -> list[int]:

@@ -8,7 +8,7 @@ import pytest
 from tests.log_editing import recorded
 from tests.recorder.play.logs import session_payloads
 from tests.sites.sessions import Session as Sites
-from tests.sites.test_leaving import gliding
+from tests.sites.sessions import gliding
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
 

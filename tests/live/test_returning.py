@@ -3,43 +3,14 @@
 import signal
 from collections.abc import Sequence
 
-import numpy as np
 import pytest
 
-from tests.faults.invariants import SILENT_TICKS, count_silence, stretches
+from tests.faults.invariants import SILENT_TICKS
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_log
-from trilat_net.net.clock import SystemClock
 
-from .processes import PAPER, Session, Stage
-
-GLIDE = (
-    *("--set", 'on_stale.action="glide"'),
-    *("--set", "on_stale.align_speed_rad_s=1.0"),
-    *("--set", "on_stale.align_limit_rad=3.0"),
-)
-JOINS, FOLLOWS = "joins the running session", " s, run, "
-
-
-def pause(time_s: float) -> None:
-    """Lets a session go on for a time."""
-    clock = SystemClock()
-    clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
-
-
-def ticks_to_hold(log: Log) -> dict[str, list[int]]:
-    """Of every hold of each site, how many ticks after its last sample in use it began."""
-    found: dict[str, list[int]] = {site: [] for site in log.sites}
-    for site, holds in found.items():
-        for stretch in stretches(log[site].states):
-            before = ""
-            for state, silent in count_silence(stretch):
-                assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (site, state.tick)
-                if state.mode == "hold" != before:
-                    holds.append(silent)
-                before = state.mode
-    return found
+from .processes import FOLLOWS, GLIDE, JOINS, PAPER, Session, Stage, engaged_after_s, pause, ticks_to_hold
 
 
 def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
@@ -66,18 +37,6 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
     assert [session.processes[name].code() for name in PAPER] == [130] * 3
     assert session.processes["recorder"].code() == 0, session.processes["recorder"]
     return session, open_log(session.log)
-
-
-def engaged_after_s(log: Log) -> list[float]:
-    """Of each start that joined, how long after its first tick it followed its peers, s."""
-    found = []
-    for site, starts in log.starts.items():
-        part = log[site]
-        for first, _ in starts:
-            engaged = (part.tick >= first) & (part.mode == "run")
-            assert engaged.any(), (site, first)
-            found.append(float(part.tick[np.argmax(engaged)] - first) / part.rate_hz)
-    return found
 
 
 @pytest.mark.long

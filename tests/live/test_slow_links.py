@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from trilat_net.log.log_reader import Log
 
-from .namespaces import Machines, NoNamespaces, bridged
-from .processes import PAPER, Session, Stage, executed_again, whole
-from .test_namespaces import ALL, Apart, following
-from .test_returning import pause, ticks_to_hold
+from .namespaces import ALL, Apart, Machines, NoNamespaces, bridged
+from .processes import PAPER, Session, Stage, executed_again, pause, ticks_to_hold, whole
 
 OPEN = {"netem": ("netem", "delay", "0ms"), "tbf": ("tbf", "rate", "1gbit", "burst", "1mb", "latency", "2s")}
 
@@ -48,7 +46,7 @@ def test_sites_hold_while_a_delay_is_longer_than_the_links_and_then_follow_again
     """All that m1 sends comes later and later, or 0.4 s later; then what waits comes at once."""
     slow = {"netem": ("netem", "delay", "400ms", "limit", "100000")}
     slow["tbf"] = ("tbf", "rate", "400kbit", "burst", "16kb", "latency", "2s")
-    session: Session = following(stage, apart, 24)
+    session: Session = Apart.following(stage, apart, 24)
     apart.shape("m1", *slow[queue])
     pause(3.0)
     apart.shape("m1", *OPEN[queue])

@@ -2,11 +2,17 @@
 
 import io
 from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgpack
 from mcap.reader import make_reader
 from mcap.writer import Writer
+
+from tests.log_editing import opened, recorded
+from trilat_net.log.accounting import Account
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
+from trilat_net.log.mcap_reader import McapReader
 
 
 class Message(NamedTuple):
@@ -95,3 +101,31 @@ def dealt(data: bytes, hands: Sequence[Collection[int]], **kwargs: object) -> li
         a_file(data, [every[place] for place in sorted(hand)], part=n + 1, **kwargs)  # type: ignore[arg-type]
         for n, hand in enumerate(hands)
     ]
+
+
+def split(folder: Path, *, refilled: range) -> list[Path]:
+    """A log in three parts, into which some records of `s` came later than others, out of its memory."""
+    data = recorded("paper")
+    scenario = opened(data).scenario
+    items = [item for item in McapReader(io.BytesIO(data), "log").messages() if item.topic]
+    kept_back = [i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled]
+    items = [item for item in items if item not in kept_back]
+    items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
+    accounts = {item.topic: Account() for item in items}
+
+    def told() -> dict[str, str]:
+        return {topic: account.as_text() for topic, account in accounts.items()}
+
+    place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
+    now_ns = 0
+    with LogParts(
+        place, lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part)
+    ) as log:
+        log.so_far = told
+        for item in items:
+            now_ns = max(now_ns, item.log_time_ns)
+            number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
+            accounts[item.topic].take(number)
+            log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
+        log.finish(told())
+    return sorted(folder.glob("run-*.mcap"))

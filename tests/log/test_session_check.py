@@ -14,15 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from tests.log.dealt import foreign
+from tests.log.dealt import foreign, split
 from tests.log.hostility import chunk
-from tests.log_editing import edited, opened, recorded, without
+from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
-from trilat_net.log.accounting import Account
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
-from trilat_net.log.mcap_reader import McapReader
 from trilat_net.log.mcap_records import MAGIC, RECORD_HEAD_BYTES, RecordFrame, RecordScanner, unpack_chunk
 from trilat_net.log.recover import recover_log
 from trilat_net.log.session_check import LogCheckResult, check_log
@@ -184,33 +181,6 @@ def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
     assert "sequence" in failed(judged(tmp_path, early))
     both = judged(tmp_path, early, late)
     assert "sequence" not in failed(both), both.findings
-
-
-def split(folder: Path, *, refilled: range) -> list[Path]:
-    """A log in three parts, into which some records of `s` came later than others, out of its memory."""
-    scenario = opened(WHOLE).scenario
-    items = [item for item in McapReader(io.BytesIO(WHOLE), "log").messages() if item.topic]
-    kept_back = [i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled]
-    items = [item for item in items if item not in kept_back]
-    items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
-    accounts = {item.topic: Account() for item in items}
-
-    def told() -> dict[str, str]:
-        return {topic: account.as_text() for topic, account in accounts.items()}
-
-    place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
-    now_ns = 0
-    with LogParts(
-        place, lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part)
-    ) as log:
-        log.so_far = told
-        for item in items:
-            now_ns = max(now_ns, item.log_time_ns)
-            number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
-            accounts[item.topic].take(number)
-            log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
-        log.finish(told())
-    return sorted(folder.glob("run-*.mcap"))
 
 
 def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from trilat_net.reporting.figures import arm_poses, joint_motion
 from trilat_net.reporting.style import arrange_joints
 from trilat_net.scenario import parse_scenario
 
-from .test_registry import misplaced
+from .drawn_words import misplaced
 
 SIX = six_joints(1.0, delay_ms=40.0)
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]

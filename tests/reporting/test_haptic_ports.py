@@ -3,7 +3,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from tests.theory.test_port_analysis import section_of
+from tests.theory.analysed_ports import section_of
 from trilat_net.reporting.figure_size import REPORT_SIZE, FigureSize, make_print_size
 from trilat_net.reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
 

@@ -2,15 +2,11 @@
 
 import re
 from functools import cache
-from itertools import combinations
 
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.transforms import Bbox
 
 import trilat_net
 from tests.analysis import logs
@@ -20,53 +16,11 @@ from trilat_net.reporting.figures import age_and_lateness, joint_motion, registr
 from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
 from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
 
+from .drawn_words import misplaced
+
 UNIT = re.compile(r"\((s|rad|rad/s|m|mm|N|N m|kg m|kg m²|J|ms|µs|count|%|1)\)$")
 WALLED = {"duration_s": 3.0, "rate_hz": 200, "link.delay_ms": 20}
 """Until the tip is in the wall."""
-
-
-SLACK_PT = 1.0
-"""By so much boxes may touch: they have room above small letters."""
-
-
-def words(figure: Figure) -> list[tuple[str, Bbox]]:
-    """Every text that is drawn and its box, pt; numbers of an axis that lie outside of it are not drawn."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    unseen = set()
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            scale = axis.get_transform().transform
-            low, high = sorted(scale(axis.get_view_interval()))
-            room = 1e-6 * (high - low)
-            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
-                if not low - room <= scale(tick.get_loc()) <= high + room:
-                    unseen |= {tick.label1, tick.label2}
-    found = []
-    for text in figure.findobj(Text):
-        if text.get_visible() and text.get_text().strip() and text not in unseen:
-            box = text.get_window_extent(renderer)
-            if box.width and box.height:
-                found.append((text.get_text(), Bbox(box.get_points() * 72.0 / figure.dpi)))
-    return found
-
-
-def misplaced(figure: Figure) -> list[str]:
-    """Words that are not wholly in the figure, and pairs of words that lie on each other."""
-    width, height = figure.get_size_inches() * 72.0
-    found = words(figure)
-    cut_off = [
-        f"{said!r} is cut off"
-        for said, box in found
-        if box.x0 < -SLACK_PT or box.y0 < -SLACK_PT or box.x1 > width + SLACK_PT or box.y1 > height + SLACK_PT
-    ]
-    on_each_other = [
-        f"{one!r} lies on {other!r}"
-        for (one, a), (other, b) in combinations(found, 2)
-        if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK_PT and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK_PT
-    ]
-    return cut_off + on_each_other
 
 
 @cache

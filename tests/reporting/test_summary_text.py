@@ -6,7 +6,7 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from tests.core.test_safeguards import stopped_log
+from tests.core.guarded_runs import stopped_log
 from trilat_net.analysis.link_summary import summarise_clock
 from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import LifeReason, find_alarm

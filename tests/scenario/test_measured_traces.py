@@ -1,21 +1,17 @@
 """Traces of what irtt, ping and others measured: their own numbers, as they state them."""
 
-import gzip
-import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.scenario.round_trips import RTT_NS, SENT_NS, irtt
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import TraceDelay
 from trilat_net.scenario.measured_traces import import_trace
 
-RTT_NS = (17291970, 16870863, 16064572, 16259053, 16597560)
-SENT_NS = (22211105, 1022856655, 2022029432, 3022256680, 4022643932)
 IRTT_MEAN_NS, IRTT_DEVIATION_NS = 16616803, 488290
 """Of five round trips that irtt measured, and its own statistics of them (README of clarkzjw/LENS)."""
 PING = """PING sat (2605:59c8:1000:962f::1) 56 data bytes
@@ -30,20 +26,6 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 1722584108506 1722584108539 33 329247.4 -73
 1722584108561 1722584119061 10500 329247.4 -73
 """
-
-
-def trip(number: int, lost: str = "false") -> dict[str, Any]:
-    times = {"client": {"send": {"wall": 1707277440772833721, "monotonic": SENT_NS[number]}}}
-    delay = {} if lost != "false" else {"rtt": RTT_NS[number], "send": 10486437967, "receive": -10470921269}
-    return {"seqno": number, "lost": lost, "timestamps": times, "delay": delay}
-
-
-def irtt(folder: Path, *lost: int, zipped: bool = False) -> Path:
-    trips = [trip(n, "true_up" if n in lost else "false") for n in range(5)]
-    text = json.dumps({"stats": {}, "round_trips": trips}).encode()
-    path = folder / ("run.json.gz" if zipped else "run.json")
-    path.write_bytes(gzip.compress(text) if zipped else text)
-    return path
 
 
 @pytest.mark.parametrize("zipped", [False, True])

@@ -23,12 +23,13 @@ from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.process import Interrupt
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, load_scenario
 
 from .relay import Killed, Relay, RelayClock
 
 SESSION = "t"
 RECORDER_BOOT = 77
+GLIDE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 50, "rate_hz": 200}
 Sink = Callable[[str, bytes], None]
 Stranger = Callable[[Bus, RelayClock], None]
 
@@ -218,3 +219,8 @@ def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
 def in_log(log: Log) -> dict[str, list[bytes]]:
     """Per site what every tick of a log computed."""
     return {name: [computed(state) for state in log[name].states] for name in log.sites}
+
+
+def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
+    """A shipped scenario under `glide`, at 200 Hz."""
+    return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})

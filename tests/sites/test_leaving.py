@@ -1,7 +1,6 @@
 """Sites that leave a running session, come back or come late: the others go on, and the log explains it."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +14,11 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.log.session_check import check_log
 from trilat_net.net import topics
-from trilat_net.scenario import Scenario, load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session
+from .sessions import SESSION, Session, gliding
 
 S = 1_000_000_000
-GLIDE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 50, "rate_hz": 200}
-
-
-def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
-    return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})
 
 
 def engaged_after_s(log: Log, site: str, tick: int) -> float:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.theory.delay_equations import inertia, theta_of
-from tests.virtual_runs import Run
+from tests.theory.delay_equations import DURATION_S, inertia, theta_of
+from tests.virtual_runs import Run, run
 
 Array = NDArray[np.float64]
 
@@ -81,3 +81,16 @@ def balance(run: Run, beta: Array) -> Balance:
         taken = taken + weight * cumulative(loss, h)
         given = given + weight * cumulative((r * -site.tau_x).sum(1), h)
     return Balance(np.asarray(V), np.asarray(taken), np.asarray(given))
+
+
+def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
+    """The balance of a shipped scenario."""
+    made = run(name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S})
+    return balance(made, left_null_vector(made.scenario))
+
+
+def order(name: str, scheme: str, rate_hz: int) -> float:
+    """Of the balance's error from half of a rate to that rate."""
+    return float(
+        np.log2(booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual)
+    )

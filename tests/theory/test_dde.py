@@ -3,35 +3,12 @@
 Eq. (6), (8)-(10), (13), (15) in continuous time; what is sampled must converge to them.
 """
 
-from functools import cache
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
-from tests.theory.delay_equations import DelayEquations, equations
+from tests.theory.delay_equations import TIMES_S, distance, equations, exact, order
 from tests.virtual_runs import sampled
 from trilat_net.scenario import load_scenario
-
-DURATION_S = 20.0
-TIMES_S = np.arange(0.01, DURATION_S, 0.01)
-
-
-@cache
-def exact(name: str) -> DelayEquations:
-    return equations(load_scenario(name)).solve(DURATION_S)
-
-
-@cache
-def distance(name: str, scheme: str, rate_hz: int) -> float:
-    """max abs(dq) over 20 s, every site and joint, a tick every 10 ms."""
-    made = sampled(load_scenario(name, {"scheme": scheme, "rate_hz": rate_hz}), TIMES_S)
-    return float(np.abs(made[..., :2] - exact(name).at(TIMES_S - 1.0 / rate_hz)[..., :2]).max())
-
-
-def order(name: str, scheme: str) -> list[float]:
-    errors = [distance(name, scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
-    return [float(np.log2(coarse / fine)) for coarse, fine in pairwise(errors)]
 
 
 def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:

@@ -3,23 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.theory.energy import Balance, balance, left_null_vector
+from tests.theory.energy import DURATION_S, balance, booked, left_null_vector, order
 from tests.virtual_runs import run
 
-DURATION_S = 20.0
 RATES = pytest.mark.parametrize("rate_hz", [1000, pytest.param(2000, marks=pytest.mark.long)])
-
-
-def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Balance:
-    made = run(name, {"scheme": scheme, "rate_hz": rate_hz, "duration_s": DURATION_S})
-    return balance(made, left_null_vector(made.scenario))
-
-
-def order(name: str, scheme: str, rate_hz: int) -> float:
-    """Of the balance's error from half of a rate to that rate."""
-    return float(
-        np.log2(booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual)
-    )
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("asymmetric", marks=pytest.mark.long)])

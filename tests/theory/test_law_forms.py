@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from tests.control_laws.test_positions_and_forces import PAIR, TABLE, VARIANTS, printed, two_sites
-from tests.transmission import balance, transmitted
-from tests.unit_arm import CLAMP, hand, unit_scenario
+from tests.transmission import PAIR, TABLE, VARIANTS, balance, printed, transmitted
+from tests.unit_arm import CLAMP, hand, two_sites, unit_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario

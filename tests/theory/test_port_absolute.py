@@ -5,15 +5,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from tests.theory.analysed_ports import criterion
 from tests.theory.networks import Complex, Network, Wire, pair
-from trilat_net.theory.frequency_search import Minima, build_frequency_grid, find_minima
+from trilat_net.theory.frequency_search import build_frequency_grid
 from trilat_net.theory.port_passivity import (
     MAX_LLEWELLYN,
     clamp_ports,
     find_best_weights,
     find_least_eigenvalue,
     llewellyn_parameter,
-    llewellyn_rounding,
     weight_response,
 )
 from trilat_net.theory.port_response import build_admittance
@@ -30,16 +30,6 @@ def drawn(seed: int, ports: int, count: int = 40) -> Complex:
     own = np.arange(ports)
     Y[:, own, own] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(size=(count, ports))
     return np.asarray(Y, dtype=np.complex128)
-
-
-def criterion(network: Network) -> Minima:
-    Y = build_admittance(network.loop)
-    return find_minima(
-        lambda w: llewellyn_parameter(Y(w)),
-        build_frequency_grid(1e-3, 100.0, 0.2),
-        level=1.0,
-        tolerance=lambda w: llewellyn_rounding(Y(w)),
-    )
 
 
 @settings(max_examples=20, deadline=None)

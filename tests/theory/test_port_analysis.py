@@ -1,22 +1,13 @@
 import math
-from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.theory.analysed_ports import POSE, section_of
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
-
-POSE = (-0.6, 1.8)
-
-
-@cache
-def section_of(name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None) -> PortAnalysis:
-    scenario = load_scenario(name, {key: [] if value == () else value for key, value in overrides})
-    return analyse_ports(scenario, find_equilibrium(scenario, POSE), of)
+from trilat_net.theory.port_analysis import analyse_ports
 
 
 @pytest.mark.parametrize("name", ["p_d_margin_two", "p_d_margin"])

@@ -8,8 +8,8 @@ import sympy as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.theory.analysed_ports import criterion
 from tests.theory.networks import Network, Wire
-from tests.theory.test_port_absolute import criterion
 from trilat_net.core.control import project_estimate
 from trilat_net.core.dominance import find_balancing_weights
 from trilat_net.laws.conditions import COMMON_MOTION_SHARE

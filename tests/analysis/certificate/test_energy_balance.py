@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.core.test_safeguards import adaptive_stop
+from tests.core.guarded_runs import adaptive_text, stopped_log
 from tests.theory.delay_equations import DelayEquations, equations, inertia
 from tests.theory.energy import balance as balance_by_hand
 from tests.theory.energy import left_null_vector
@@ -88,7 +88,7 @@ def test_what_a_limit_of_torque_rate_or_reference_takes_is_booked(key: str, limi
 
 def test_a_site_that_stops_and_goes_on_is_booked() -> None:
     """Its torque is not that of the law, and its estimates stand still."""
-    b = compute_energy_balance(compute_site_energies(adaptive_stop()))
+    b = compute_energy_balance(compute_site_energies(stopped_log(adaptive_text(), 3000)))
     assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
     assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale

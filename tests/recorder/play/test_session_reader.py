@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recorder.play.session_reader import PlaySelection, preload_messages
-from tests.golden import test_golden
 from trilat_net.errors import LogError, UsageError
 from trilat_net.execution.virtual import virtual_boot
 from trilat_net.log.log_layout import ChannelFilter
@@ -15,7 +14,7 @@ from trilat_net.log.log_layout import ChannelFilter
 from .logs import BOOT, event, loaded, payloads, write
 
 TmpFactory = pytest.TempPathFactory
-GOLDEN = Path(test_golden.__file__).parent
+GOLDEN = Path(__file__).parents[2] / "golden"
 LARGE = 1 << 28
 
 

@@ -1,0 +1,112 @@
+"""Two arms under the rule `glide`: their limits, orders at ticks, and what a log says of them."""
+
+import functools
+import io
+from typing import Any
+
+import numpy as np
+
+from trilat_net.analysis.aligned import RESTING_MODES
+from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.execution import virtual
+from trilat_net.execution.resumption import read_output
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.scenario import Scenario, parse_scenario, to_core_change
+from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.scenario.run_changes import make_site_order
+
+TEXT = """
+name = "glide"
+duration_s = {duration_s}
+rate_hz = {rate_hz}
+[arm]
+[control]
+law = "pd_d"
+K = 60.0
+Kd = 4.0
+d = 12.0
+[on_stale]
+action = "glide"
+align_speed_rad_s = {speed}
+align_limit_rad = {limit}
+[link]
+delay_ms = 100
+outages_s = {outages_s}
+[sites.m]
+q0_rad = [0.8, 0.3]
+[[sites.m.hands]]
+kind = "spring"
+to_rad = [-0.4, 0.9]
+move_start_s = 0.5
+move_end_s = 4.0
+stiffness_nm_rad = 80.0
+damping_nm_s_rad = 8.0
+[sites.s]
+role = "slave"
+q0_rad = [0.1, 0.4]
+[dominance]
+m = {{ s = 1.0 }}
+s = {{ m = 1.0 }}
+"""
+RATE_NM_S = 500.0
+LIMITS = {"tau_rate_limit_nm_s": RATE_NM_S, "qd_des_limit_rad_s": 6.0, "q_min_rad": -4.0, "q_max_rad": 4.0}
+KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "limit": 4.0}
+
+
+def adaptive_text() -> str:
+    """The scenario of the rule, with the paper's law."""
+    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
+    return text.replace('law = "pd_d"', 'law = "adaptive"')
+
+
+def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
+    """The scenario of the rule, with limits of all sites or of one."""
+    overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
+    return allow_own_laws(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
+
+
+def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:
+    """A virtual run in which sites are given orders at ticks."""
+
+    def change(site: str, tick: int, order: str) -> CoreChange:
+        t_ns = tick_ns(tick, scenario.sites[site].rate_hz)
+        made = make_site_order(scenario, site, order, t_ns, ticks)
+        return to_core_change(scenario, made)
+
+    commands = {
+        site: {tick: [change(site, tick, order)] for tick, order in of_site.items()}
+        for site, of_site in orders.items()
+    }
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream, commands=commands)
+    stream.seek(0)
+    return open_log(stream)
+
+
+def reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
+    """The modes of a site, each with its reason, as they followed each other."""
+    found: list[tuple[str, LifeReason]] = []
+    for state in log[site].states:
+        reason = find_life_reason(read_output(state, log[site].peers))
+        if not found or found[-1] != (state.mode, reason):
+            found.append((state.mode, reason))
+    return found
+
+
+@functools.cache
+def stopped_log(text: str = TEXT, enabled: int = 3500) -> Log:
+    """The slave is stopped at 2 s, while it moves, and enabled at a tick."""
+    return ordered(guarded(text=text), {"s": {2000: "stop", enabled: "enable"}})
+
+
+def largest_step(log: Log, site: str, first: int = 0) -> float:
+    """The largest change of the torque of a joint from tick to tick; before tick 0 there is none.
+
+    Less what brakes an arm that comes to rest, B |qd| against its motion.
+    """
+    part = log[site]
+    steps = np.diff(np.vstack([np.zeros_like(part.tau[:1]), part.tau]), axis=0)
+    resting = np.isin(part.mode, RESTING_MODES)[:, None]
+    brake = np.abs(part.qd) * resting * np.array(log.scenario.setup(site).rest.damping)
+    against = np.where(steps * part.qd < 0.0, brake, 0.0)
+    return float((np.abs(steps) - against)[first:].max())

@@ -1,0 +1,32 @@
+"""Ports of shipped scenarios and of hand-made networks, analysed."""
+
+from functools import cache
+from typing import Any
+
+from tests.theory.networks import Network
+from trilat_net.scenario import load_scenario
+from trilat_net.theory.equilibrium import find_equilibrium
+from trilat_net.theory.frequency_search import Minima, build_frequency_grid, find_minima
+from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
+from trilat_net.theory.port_passivity import llewellyn_parameter, llewellyn_rounding
+from trilat_net.theory.port_response import build_admittance
+
+POSE = (-0.6, 1.8)
+
+
+@cache
+def section_of(name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None) -> PortAnalysis:
+    """The analysis of the ports of a shipped scenario about POSE; () is an empty list."""
+    scenario = load_scenario(name, {key: [] if value == () else value for key, value in overrides})
+    return analyse_ports(scenario, find_equilibrium(scenario, POSE), of)
+
+
+def criterion(network: Network) -> Minima:
+    """Where the two ports of a network fail Llewellyn's criterion."""
+    Y = build_admittance(network.loop)
+    return find_minima(
+        lambda w: llewellyn_parameter(Y(w)),
+        build_frequency_grid(1e-3, 100.0, 0.2),
+        level=1.0,
+        tolerance=lambda w: llewellyn_rounding(Y(w)),
+    )
