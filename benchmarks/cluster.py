@@ -16,7 +16,7 @@ from pathlib import Path
 from trilat_net.process import worker_pool
 from trilat_net.studies.executor import open_worker_pool, run_batch
 from trilat_net.studies.sweep import plan_sweep
-from trilat_net.studies.sweep.sweep_run import CellTask, run_cell
+from trilat_net.studies.sweep.sweep_run import CellItem, run_cell
 
 WORKERS = 2
 CELLS = 2000
@@ -54,7 +54,7 @@ def started_cluster(folder: Path) -> Iterator[str]:
             process.wait()
 
 
-def pool_cells_per_s(tasks: list[CellTask], on: str | None) -> float:
+def pool_cells_per_s(tasks: list[CellItem], on: str | None) -> float:
     with open_worker_pool(None if on else WORKERS, on) as pool:
         pool.map(run_cell, tasks[:WARMED])
         begun = time.perf_counter()
@@ -62,7 +62,7 @@ def pool_cells_per_s(tasks: list[CellTask], on: str | None) -> float:
         return len(tasks) / (time.perf_counter() - begun)
 
 
-def cluster_cells_per_s(tasks: list[CellTask]) -> float:
+def cluster_cells_per_s(tasks: list[CellItem]) -> float:
     with tempfile.TemporaryDirectory() as folder, started_cluster(Path(folder)) as address:
         while True:
             with open_worker_pool(None, address) as pool:
@@ -71,7 +71,7 @@ def cluster_cells_per_s(tasks: list[CellTask]) -> float:
         return pool_cells_per_s(tasks, address)
 
 
-def plain_cells_per_s(tasks: list[CellTask]) -> float:
+def plain_cells_per_s(tasks: list[CellItem]) -> float:
     """Every process has its share of the cells from the start."""
     with worker_pool(WORKERS) as executor:
         for share in (tasks[:WARMED], tasks):

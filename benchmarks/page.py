@@ -25,7 +25,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import trilat_net
-from trilat_net.net.arm_port import Hand
+from trilat_net.net.arm_client import Hand
 
 RUN_S, PAIRS, MOVES = 10.0, 5, 60
 POINTER_P50_MS, POINTER_P95_MS, LATENESS_RATIO, SERVER_PERCENT = 60.0, 120.0, 1.3, 30.0

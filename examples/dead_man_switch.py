@@ -22,7 +22,7 @@ PERIOD_S = 0.02
 
 
 def hold(
-    switch: tn.EnablePort, read: Callable[[], bytes | None], now_s: Callable[[], float], gap_s: float
+    switch: tn.SwitchClient, read: Callable[[], bytes | None], now_s: Callable[[], float], gap_s: float
 ) -> None:
     """Holds a switch while something comes in, until its session or its input ends.
 
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--gap-s", type=float, default=0.6, help="let go once nothing came for so long")
     options = parser.parse_args()
     connect = (options.session, options.site, options.connect, options.keys)
-    with tn.EnablePort.connected(*connect) as switch, single_keys():
+    with tn.SwitchClient.connected(*connect) as switch, single_keys():
         hold(switch, read_input, time.monotonic, options.gap_s)
 
 

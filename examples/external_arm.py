@@ -66,11 +66,11 @@ def main() -> None:
     scenario = tn.load_scenario(options.scenario)
     robot = Robot(scenario, options.site)
     session = options.session or scenario.name
-    with tn.ArmPort.connected(session, options.site, [options.connect]) as port:
+    with tn.ArmClient.connected(session, options.site, [options.connect]) as client:
         next_s = time.monotonic()
-        while not port.over:
-            port.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())
-            robot.apply(port.torque())
+        while not client.over:
+            client.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())
+            robot.apply(client.torque())
             next_s = max(next_s + PERIOD_S, time.monotonic())  # late periods are not made up for, see `apply`
             time.sleep(max(0.0, next_s - time.monotonic()))
     print(f"over: the arm is at {', '.join(f'{q:.3f}' for q in robot.q)} rad")

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from trilat_net.errors import WireError
 from trilat_net.net import topics
-from trilat_net.net.arm_port import SiteSender, make_hand_sender
+from trilat_net.net.arm_client import SiteSender, make_hand_sender
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.clock import Clock
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage

@@ -17,7 +17,7 @@ from trilat_net.core.vectors import Vector
 from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.access_rules import OPERATOR
-from trilat_net.net.arm_port import Hand
+from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection

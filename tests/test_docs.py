@@ -19,7 +19,7 @@ from trilat_net.analysis.metrics import measured_impedance, motion_metrics, stat
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
 from trilat_net.execution import difference, twins
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
-from trilat_net.net import arm_port, offset, requests, session, timing, zenoh_config
+from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_plan, bench_results, bench_run, bench_tasks
@@ -79,7 +79,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("external-arm.md", "more than 20 ticks", 20, session_life.HELD_OVERRUN_TICKS),
     ("external-arm.md", "more than 200", 200, session_life.FAULT_OVERRUN_TICKS),
     ("external-arm.md", "at most 64 wait", 64, external_arm.MEASUREMENTS_KEPT),
-    ("external-arm.md", "older than 0.1 s", 0.1, arm_port.FRESH_NS / 1e9),
+    ("external-arm.md", "older than 0.1 s", 0.1, arm_client.FRESH_NS / 1e9),
     ("live-hands.md", "silent for 200 ms lets go", 200.0, live_hand.SILENCE_NS / 1e6),
     ("live-hands.md", "from 0 to 1 within 100 ms", 100.0, live_hand.GRIP_NS / 1e6),
     ("live-hands.md", "two, at most 50 ms", 50.0, live_hand.GLIDE_NS / 1e6),

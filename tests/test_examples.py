@@ -19,7 +19,7 @@ from sites.running_session import RunningSession, open_hand
 from tests.log_editing import recorded
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
-from trilat_net.net.arm_port import EnablePort
+from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
@@ -160,7 +160,7 @@ def test_a_switch_is_let_go_at_once_when_the_program_before_it_ends(monkeypatch:
     os.write(ends[1], b"pressed\n")
     os.close(ends[1])
     switch = PressedSwitch(1000)
-    monkeypatch.setattr(EnablePort, "connected", lambda *_: nullcontext(switch))
+    monkeypatch.setattr(SwitchClient, "connected", lambda *_: nullcontext(switch))
     monkeypatch.setattr(sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"])
     with os.fdopen(ends[0]) as there:
         monkeypatch.setattr(sys, "stdin", there)

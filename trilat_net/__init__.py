@@ -47,8 +47,8 @@ if _TYPE_CHECKING:
     from .log.log_reader import open_log as open_log
     from .log.log_signature import create_signing_keys as create_signing_keys
     from .log.log_signature import sign_log as sign_log
-    from .net.arm_port import ArmPort as ArmPort
-    from .net.arm_port import EnablePort as EnablePort
+    from .net.arm_client import ArmClient as ArmClient
+    from .net.arm_client import SwitchClient as SwitchClient
     from .net.member_keys import create_keys as create_keys
     from .net.member_keys import read_member_keys as read_member_keys
     from .reporting.figures.registry import figure as figure
@@ -78,7 +78,7 @@ _NAMES = {
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
     "trilat_net.log.log_signature": "create_signing_keys sign_log",
-    "trilat_net.net.arm_port": "ArmPort EnablePort",
+    "trilat_net.net.arm_client": "ArmClient SwitchClient",
     "trilat_net.net.member_keys": "create_keys read_member_keys",
     "trilat_net.reporting.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",

@@ -38,8 +38,8 @@ from trilat_net.core.vectors import Array
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
-from trilat_net.log.digest_chain import ChainState, Integrity
 from trilat_net.log.log_reader import Log
+from trilat_net.log.running_digest import DigestState, Integrity
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.theory.end_pose import find_end_pose_roots
@@ -597,7 +597,7 @@ def say_of_run(scenario: Scenario) -> str:
     run = RunInMemory(scenario)
     no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")
     ticks = {site: scenario.ticks(site) for site in scenario.names}
-    whole = Evidence(Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(ChainState.INTACT, ""))
+    whole = Evidence(Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(DigestState.INTACT, ""))
     roots = find_end_pose_roots(run)  # type: ignore[arg-type]
     end = run.find_end()
     twins = measure_virtual_twins(scenario, end, scenario.duration_s)

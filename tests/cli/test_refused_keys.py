@@ -18,7 +18,7 @@ from sites.running_session import hand, session
 from tests.cli.running import COMMAND, PLAIN, trilat
 from trilat_net.errors import LogRefused, TrilatError, UsageError
 from trilat_net.net import member_keys
-from trilat_net.net.arm_port import ArmPort, EnablePort
+from trilat_net.net.arm_client import ArmClient, SwitchClient
 from trilat_net.net.member_keys import CERTIFICATE, MEMBERS, PRIVATE_KEY, create_keys, read_member_keys
 
 MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router")
@@ -82,8 +82,8 @@ FROM_PYTHON = [
     (lambda keys: session("paper", keys=keys).enable(), "m1", "operator"),
     (lambda keys: session("paper", keys=keys).end(), "recorder", "operator"),
     (lambda keys: session("paper", keys=keys).set_link("m1->s", delay_ms=1), "s", "operator"),
-    (lambda keys: ArmPort.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "operator", "s"),
-    (lambda keys: EnablePort.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "s", "operator"),
+    (lambda keys: ArmClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "operator", "s"),
+    (lambda keys: SwitchClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "s", "operator"),
 ]
 
 

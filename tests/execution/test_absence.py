@@ -19,8 +19,8 @@ from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
-from trilat_net.log.digest_chain import ChainState
 from trilat_net.log.log_reader import judge_integrity, open_log
+from trilat_net.log.running_digest import DigestState
 from trilat_net.net.messages import Event
 
 LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}
@@ -51,10 +51,10 @@ def is_refused(data: bytes, *, chained: bool) -> bool:
 def test_what_is_put_together_unchanged_is_the_same_file() -> None:
     assert taken_apart(run()).bytes() == run()
     log = opened(run())
-    assert judge_integrity(log).state is ChainState.INTACT
+    assert judge_integrity(log).state is DigestState.INTACT
     assert run_log_checks(log, virtual=True).passed
     old = opened(pieces(chained=False).bytes())
-    assert judge_integrity(old).state is ChainState.ABSENT
+    assert judge_integrity(old).state is DigestState.ABSENT
     assert run_log_checks(old, virtual=True).passed
 
 
@@ -183,7 +183,7 @@ def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
     taken.messages = [m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
     found = judge_integrity(opened(taken.bytes()))
-    assert found.state is ChainState.CHANGED
+    assert found.state is DigestState.CHANGED
     assert "taken out or put in" in found.text
 
 
@@ -208,7 +208,7 @@ def test_a_torn_log_passes_no_more_than_is_asked_for() -> None:
     assert verify(log, min_coverage=share).passed
     assert not verify(log, min_coverage=share + 1e-6).passed
     whole = recorded("paper")
-    assert judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is ChainState.OPEN
+    assert judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is DigestState.OPEN
 
 
 def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:

@@ -32,7 +32,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.arm_port import FRESH_NS, ArmPort, EnablePort
+from trilat_net.net.arm_client import FRESH_NS, ArmClient, SwitchClient
 from trilat_net.net.bus import Bus, StampingRing
 from trilat_net.net.messages import VERSION, Event
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
@@ -84,7 +84,7 @@ def driving(
 
     def drive(bus: Bus, clock: RelayClock) -> None:
         arm = Pendulum(start)
-        with ArmPort(bus, clock, SESSION, "s") as port:
+        with ArmClient(bus, clock, SESSION, "s") as port:
             next_ns = clock.monotonic_ns()
             while not port.over and next_ns < until_ns:
                 felt = [math.sin(7.0 * q) for q in arm.q] if senses else []
@@ -190,7 +190,7 @@ def braked(
 ) -> None:
     """The program of an arm with brakes, every millisecond."""
     arm = arm or Pendulum((0.3, -0.1))
-    with ArmPort(bus, clock, SESSION, "s") as port:
+    with ArmClient(bus, clock, SESSION, "s") as port:
         next_ns = clock.monotonic_ns()
         while not port.over:
             port.send(arm.q, arm.qd)
@@ -240,7 +240,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
     told: list[tuple[bool, str]] = []
 
     def hold(bus: Bus, clock: RelayClock) -> None:
-        with EnablePort(bus, clock, SESSION, "s") as switch:
+        with SwitchClient(bus, clock, SESSION, "s") as switch:
             while switch.record is None:
                 clock.sleep_until(clock.monotonic_ns() + PERIOD_NS)
             begun_ns = clock.monotonic_ns() - switch.record.t_ns
@@ -401,7 +401,7 @@ def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: P
     session, ends = session_of(tmp_path, driving([], []))
 
     def shout(bus: Bus, clock: RelayClock) -> None:
-        other = ArmPort(bus, clock, SESSION, "s")
+        other = ArmClient(bus, clock, SESSION, "s")
         publish = bus.publisher(topics.key(SESSION, "s", topics.MEASURED))
         for _ in range(50):
             other.send([9.0, 9.0], [0.0, 0.0])
@@ -555,7 +555,7 @@ def test_a_glitch_of_an_encoder_is_no_measurement_and_repeated_it_is_silence() -
 def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
     network, clock = LocalNetwork(), ManualClock()
     site = network.join()
-    port = ArmPort(network.join(), clock, "t", "s")
+    port = ArmClient(network.join(), clock, "t", "s")
     assert port.torque() is None
     zeros = dict.fromkeys(("tick", "t_ns", "rx_crc", "late_us", "busy_us"), 0)
     vectors = {key: [0.0, 0.0] for key in ("q", "qd", "q_des", "qd_des", "tau_x")}
@@ -596,7 +596,7 @@ def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
 
 def test_a_site_that_is_gone_is_over() -> None:
     network = LocalNetwork()
-    port = ArmPort(network.join(), ManualClock(), "t", "s")
+    port = ArmClient(network.join(), ManualClock(), "t", "s")
     site = network.join()
     assert not port.over
     site.announce("trilat/t/s/alive/5")

@@ -18,7 +18,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
-from trilat_net.net.arm_port import Hand
+from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import encode

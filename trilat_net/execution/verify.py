@@ -23,9 +23,9 @@ from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput
 from ..errors import LawFailed, ScenarioError
 from ..log.accounting import MIN_COVERAGE, Coverage
-from ..log.digest_chain import Integrity
 from ..log.log_reader import Log, judge_integrity, open_log
 from ..log.mcap_reader import Progress
+from ..log.running_digest import Integrity
 from ..log.site_log import SiteLog
 from ..net.messages import State
 from ..scenario import Scenario, parse_core_change

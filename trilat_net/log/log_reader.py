@@ -50,10 +50,10 @@ from .data_tables import (
     to_data_frame,
     to_pandas_frame,
 )
-from .digest_chain import ChainState, Integrity
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
+from .running_digest import DigestState, Integrity
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
@@ -540,7 +540,7 @@ def judge_integrity(log: Log) -> Integrity:
     if log.chain.passed:
         for site in log.sites:
             if seam := _find_unexplained(log, site):
-                return Integrity(ChainState.CHANGED, seam)
+                return Integrity(DigestState.CHANGED, seam)
     return log.chain
 
 
@@ -561,7 +561,7 @@ def _find_unexplained(log: Log, site: str) -> str:
         return f"records of {site} were taken out or put in: its account says {told}, the file has {found}"
     inner = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
     inner -= min(inner, log.absent_ticks(site))
-    if not inner or log.chain.state is ChainState.INTACT:
+    if not inner or log.chain.state is DigestState.INTACT:
         return ""
     counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
     if inner <= max([stated.get("missing", 0), *counts]):

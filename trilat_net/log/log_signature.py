@@ -19,9 +19,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from ..errors import LogError, UsageError
 from ..files import open_regular, refuse_existing, write_whole
-from .digest_chain import CHAIN, ChainState, Integrity
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
+from .running_digest import DIGESTS, DigestState, Integrity
 
 SUFFIX = ".sig"
 """Ending of a signature's file, behind the whole name of the log."""
@@ -89,10 +89,10 @@ def sign_log(
     made = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(made, force=force)
     integrity, chain = _read_chain(path, progress)
-    if integrity.state is not ChainState.INTACT:
+    if integrity.state is not DigestState.INTACT:
         advice = {
-            ChainState.OPEN: f"; make it whole first with: trilat log recover {path}",
-            ChainState.ABSENT: f"; trilat log recover {path} makes a copy with one",
+            DigestState.OPEN: f"; make it whole first with: trilat log recover {path}",
+            DigestState.ABSENT: f"; trilat log recover {path} makes a copy with one",
         }
         raise LogError(f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}")
     raw = key.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
@@ -139,7 +139,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     integrity, chain = _read_chain(path, progress)
     if chain != stated.chain:
         return f"what was signed is another content ({stated.chain.get('messages', '?')} messages)"
-    return "" if integrity.state is ChainState.INTACT else integrity.text
+    return "" if integrity.state is DigestState.INTACT else integrity.text
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
@@ -155,10 +155,10 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
             deque(reader.messages(), maxlen=0)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
-    integrity = reader.judge_chain()
-    if integrity.state is ChainState.INTACT and not reader.complete:
-        integrity = Integrity(ChainState.OPEN, "the end of the file is missing")
-    return integrity, reader.metadata.get(CHAIN, {})
+    integrity = reader.judge_digest()
+    if integrity.state is DigestState.INTACT and not reader.complete:
+        integrity = Integrity(DigestState.OPEN, "the end of the file is missing")
+    return integrity, reader.metadata.get(DIGESTS, {})
 
 
 def _load_private_key(path: Path) -> Ed25519PrivateKey:

@@ -19,11 +19,11 @@ from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
 from ..scenario import Scenario
 from . import log_layout
-from .digest_chain import ALGORITHM, CHAIN_KEY, PREVIOUS_DIGEST_KEY
 from .log_file import LogFile
 from .mcap_writer import McapWriter, Sink
 from .ros2 import cdr
 from .ros2.viz_channels import TakeMessage, VizChannels
+from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 
 Decoded = State | TickRecord | LinkStats | Event | None
 """A message as the channels for viewers take it; None where there are none."""
@@ -82,7 +82,7 @@ class LogWriter:
             "seed": str(scenario.seed),
             "sites": " ".join(scenario.names),
             "epoch_unix_ns": str(epoch_unix_ns),
-            CHAIN_KEY: ALGORITHM,
+            DIGESTS_KEY: ALGORITHM,
         }
         about |= {**log_layout.collect_provenance(), **choice.facts(), **(facts or {})}
         with self._refusing():
@@ -222,7 +222,7 @@ class LogWriter:
                     self._views.finish(self._last_log_ns)
             finally:
                 self._file.add_metadata(log_layout.ACCOUNTS, taken)
-                self.records_digest = self._file.close_chain()["records"]
+                self.records_digest = self._file.close_digest()["records"]
                 self._file.finish()
 
     @contextmanager

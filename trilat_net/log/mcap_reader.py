@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from ..errors import LogError
 from ..net import topics
 from . import mcap_records
-from .digest_chain import CHAIN, DigestChain, Integrity
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
+from .running_digest import DIGESTS, Integrity, RunningDigest
 
 _READ = {
     *mcap_records.DEFINITIONS,
@@ -121,7 +121,7 @@ class McapReader:
         self.packed_bytes = self.unpacked_bytes = 0
         self.offset = 0
         self.complete = False
-        self._chain = DigestChain()
+        self._chain = RunningDigest()
         self.scanner = mcap_records.RecordScanner(stream)
         self.size = self.scanner.size
         self._source = name
@@ -195,7 +195,7 @@ class McapReader:
             case Opcode.METADATA:
                 entry = mcap_records.parse_record(frame.opcode, content)
                 self.metadata[entry.name] = entry.metadata
-                if entry.name == CHAIN:
+                if entry.name == DIGESTS:
                     return b""
             case Opcode.ATTACHMENT:
                 attachment = mcap_records.parse_record(frame.opcode, content)
@@ -244,7 +244,7 @@ class McapReader:
         self._chain.add_records(view[chained:], messages)
         self._take_memory(memory, frame)
 
-    def judge_chain(self) -> Integrity:
+    def judge_digest(self) -> Integrity:
         """Returns whether the file, once it was read, agrees with its digest chain."""
         return self._chain.judge(self.metadata, finished=self.complete, damaged=bool(self.damaged))
 
@@ -375,6 +375,6 @@ def read_contents(
         raise LogError(f"{problem}; {why}" if why else problem)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
-    text, chain = reader.attachments[SCENARIO], reader.judge_chain()
+    text, chain = reader.attachments[SCENARIO], reader.judge_digest()
     ended = reader.complete
     return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)

@@ -16,8 +16,8 @@ from typing import Protocol
 import zstandard
 from mcap.opcode import Opcode
 
-from .digest_chain import CHAIN, DigestChain
 from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
+from .running_digest import DIGESTS, RunningDigest
 
 CHUNK_BYTES = 1 << 20
 
@@ -91,7 +91,7 @@ class McapWriter:
         self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
         self._records: Counter[Opcode] = Counter()  # in the summary, by kind
-        self._chain = DigestChain()
+        self._chain = RunningDigest()
         header = pack_text(profile) + pack_text(library)
         self._chain.add_entry(Opcode.HEADER, header)
         self._put(MAGIC + pack_record(Opcode.HEADER, header))
@@ -167,7 +167,7 @@ class McapWriter:
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Writes a metadata record, before the open chunk."""
         content = pack_text(name) + pack_text_map(data)
-        if name != CHAIN:
+        if name != DIGESTS:
             self._chain.add_entry(Opcode.METADATA, content)
         record = pack_record(Opcode.METADATA, content)
         index = struct.pack("<QQ", self._put(record), len(record)) + pack_text(name)
@@ -195,12 +195,12 @@ class McapWriter:
             self._reserve(self.owed)
         self._stream.flush()
 
-    def close_chain(self) -> dict[str, str]:
+    def close_digest(self) -> dict[str, str]:
         """Writes the digests of all that was added, and returns them; only `finish` may follow."""
         if self._open:
             self._close_chunk()
         facts = self._chain.facts()
-        self.add_metadata(CHAIN, facts)
+        self.add_metadata(DIGESTS, facts)
         return facts
 
     def _close_chunk(self) -> None:

@@ -16,10 +16,10 @@ from ..errors import LogError, WireError
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats
 from ..net.wire import decode
-from .digest_chain import CHAIN, PREVIOUS_DIGEST_KEY, ChainState
 from .log_layout import ACCOUNTS, PART
 from .mcap_reader import ChannelMessages, LogContents
 from .record_columns import decode_ticks
+from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
@@ -53,17 +53,17 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
         whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
         last.ended,
         [damage for part in ordered for damage in part.damaged],
-        max((part.chain for part in parts), key=lambda chain: list(ChainState).index(chain.state)),
+        max((part.chain for part in parts), key=lambda chain: list(DigestState).index(chain.state)),
     )
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
     """Refuses a part that follows another file than the one that is given as the part before it."""
-    finished = {_part_index(part): part for part in parts if CHAIN in part.metadata}
+    finished = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
     for part in parts:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
         before = finished.get(_part_index(part) - 1)
-        if stated and before is not None and before.metadata[CHAIN].get("records") != stated:
+        if stated and before is not None and before.metadata[DIGESTS].get("records") != stated:
             raise LogError(f"{part.source}: does not follow {before.source}: that file was another one")
 
 

@@ -24,12 +24,12 @@ from ..net import topics
 from ..results import Result
 from . import mcap_records
 from .accounting import Coverage, open_session_accounts, parse_counts
-from .digest_chain import CHAIN, RECOVERED, ChainState
 from .log_file import LogFile
 from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
 from .mcap_reader import McapReader, Progress
 from .mcap_records import UnreadableRecord
 from .mcap_writer import McapWriter
+from .running_digest import DIGESTS, RECOVERED, DigestState
 
 MAX_LISTED_LOSSES = 20
 """Losses that are listed there one by one."""
@@ -71,7 +71,7 @@ class Recovery(Result):
     lost_bytes: int = 0
     missing: list[str] = field(default_factory=list)
     coverage: Coverage = field(default_factory=lambda: Coverage({}, {}))
-    chain: ChainState | str = ""
+    chain: DigestState | str = ""
 
     @property
     def lossless(self) -> bool:
@@ -298,7 +298,7 @@ class _FileCopy:
         elif opcode == Opcode.METADATA:
             entry = mcap_records.parse_record(opcode, content)
             ours = self._accounts is not None
-            if entry.name != RECOVERED and not (ours and entry.name in (ACCOUNTS, CHAIN)):
+            if entry.name != RECOVERED and not (ours and entry.name in (ACCOUNTS, DIGESTS)):
                 self._out.add_metadata(entry.name, entry.metadata)
         elif opcode == Opcode.ATTACHMENT:
             one = mcap_records.parse_record(opcode, content)
@@ -397,7 +397,7 @@ class _FileCopy:
         result.finished = self._scanner.finished
         result.messages, result.duration_s = self._out.messages, self._out.duration_s
         if SESSION in self._survey.metadata:
-            result.chain = self._reader.judge_chain().state if self._scanner.begins else ChainState.OPEN
+            result.chain = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
         if accounts is not None:
             result.missing = list(accounts.missing())
             result.coverage = accounts.coverage()
@@ -408,12 +408,12 @@ class _FileCopy:
                 for topic, text in accounts.texts().items()
                 if topic.endswith(f"/{topics.STATE}")
             ):
-                result.chain = ChainState.CHANGED
+                result.chain = DigestState.CHANGED
             counts = {name: text for name, text in before.items() if not name.startswith("/")}
             self._out.add_metadata(ACCOUNTS, {**accounts.texts(), **counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
-            self._out.close_chain()
+            self._out.close_digest()
         self._out.finish()
 
 

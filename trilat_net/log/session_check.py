@@ -346,7 +346,7 @@ class SessionCheck:
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
-        chain = reader.judge_chain()
+        chain = reader.judge_digest()
         self._chain_text = chain.text
         if not chain.passed:
             self._findings["chain"].add(file, None, self._chain_text)

@@ -36,7 +36,7 @@ from trilat_net.studies.bench.bench_results import (
     encode_places,
     encode_runs,
 )
-from trilat_net.studies.bench.bench_run import BenchRunTask, find_least_energy, run_bench_task
+from trilat_net.studies.bench.bench_run import BenchRunItem, find_least_energy, run_bench_task
 from trilat_net.studies.bench.bench_tasks import (
     LINKS,
     SHORTER_REACH,
@@ -95,7 +95,7 @@ def test_seeds_are_other_runs_where_anything_is_drawn_and_the_same_twice(whole: 
     assert (still.random, first.random) == (False, True)
     assert first.error_rad != second.error_rad
     lossy = whole.plan.cells[1]
-    assert run_bench_task(BenchRunTask(lossy, 2)) == second
+    assert run_bench_task(BenchRunItem(lossy, 2)) == second
 
 
 def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
@@ -135,7 +135,7 @@ def test_the_stiffness_at_the_hand_is_that_of_statics() -> None:
         tip, jacobian = reach(q)
         ends.append((tip[0], np.linalg.solve(jacobian.T, 50.0 * (np.array(target) - q))[0]))
     (near_m, near_n), (far_m, far_n) = ends
-    found = run_bench_task(BenchRunTask(cell, 1)).stiffness_n_m
+    found = run_bench_task(BenchRunItem(cell, 1)).stiffness_n_m
     assert found == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-3)
 
 
@@ -152,7 +152,7 @@ def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
 
 def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
-    run = run_bench_task(BenchRunTask(with_gains(cell, K=2.0, d=20.0), 1))
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
     assert run.wall_n is not None
     assert run.wall_n < LEAST_CONTACT_N
     assert run.stiffness_n_m is None
@@ -163,10 +163,10 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
 
 def test_what_is_not_stable_is_so_in_a_run_of_twice_the_length() -> None:
     (cell,) = asked(links=["rtt272"]).cells
-    run = run_bench_task(BenchRunTask(with_gains(cell, K=60.0, d=0.5), 1))
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=0.5), 1))
     assert run.stability is Stability.NOT_STABLE
     assert run.behaviour is EndBehaviour.DIVERGED or run.length_s >= 40.0
-    assert run_bench_task(BenchRunTask(with_gains(cell, K=10.0, d=4.0), 1)).stability is Stability.STABLE
+    assert run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability is Stability.STABLE
 
 
 def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
@@ -235,7 +235,7 @@ def test_a_run_lasts_for_forty_round_trips() -> None:
 def test_a_shared_slave_errs_by_its_distance_from_the_mean_by_dominance() -> None:
     """After the handover the second user has three quarters; the error is of the present shares."""
     plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
-    run = run_bench_task(BenchRunTask(plan.cells[0], 1))
+    run = run_bench_task(BenchRunItem(plan.cells[0], 1))
     log = trilat_net.simulate(plan.cells[0].build(1).scenario)
     t_s, (m1, m2, s) = log["s"].t_s, (log[name].q for name in ("m1", "m2", "s"))
     a = np.interp(t_s, [7.0, 9.0], [0.75, 0.25])[:, None]

@@ -15,7 +15,7 @@ from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.studies.sweep import sweep_cell
 from trilat_net.studies.sweep.sweep_cell import apply_diff, diff_lines
-from trilat_net.studies.sweep.sweep_run import CellTask, build_sim_command, run_cell
+from trilat_net.studies.sweep.sweep_run import CellItem, build_sim_command, run_cell
 
 
 @pytest.fixture
@@ -27,18 +27,18 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 
 def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
     plan = asked(tmp_path, "link.loss=0.1", seeds=2)
-    entry = run_cell(CellTask(plan, plan.cell(5), 2))
+    entry = run_cell(CellItem(plan, plan.cell(5), 2))
     (text,) = judge.texts
     assert apply_diff(entry.scenario, plan.base.text) == text
     assert entry.outcome == judge(text, plan.longest_s)
     assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
     same = asked(tmp_path)
-    assert not run_cell(CellTask(same, same.cell(5), 1)).random
+    assert not run_cell(CellItem(same, same.cell(5), 1)).random
 
 
 def test_the_command_of_a_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
     plan = asked(tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"])
-    run_cell(CellTask(plan, plan.cell(1), 1))
+    run_cell(CellItem(plan, plan.cell(1), 1))
     words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
     assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
     assert words[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
@@ -50,7 +50,7 @@ def test_the_command_of_a_cell_runs_its_scenario_for_so_long(tmp_path: Path, jud
 @pytest.mark.usefixtures("judge")
 def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
     plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
-    task = CellTask(plan, plan.cell(3), 1)
+    task = CellItem(plan, plan.cell(3), 1)
     sent = pickle.loads(pickle.dumps(task))
     assert run_cell(sent) == run_cell(task)
     assert parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
@@ -60,7 +60,7 @@ def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
     plan = asked(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
     with pytest.raises(ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"):
-        run_cell(CellTask(plan, cell, 1))
+        run_cell(CellItem(plan, cell, 1))
 
 
 texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)

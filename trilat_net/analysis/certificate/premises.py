@@ -15,8 +15,8 @@ import numpy as np
 
 from ...core.vectors import Array
 from ...log.accounting import Coverage
-from ...log.digest_chain import Integrity
 from ...log.log_reader import Log, judge_integrity
+from ...log.running_digest import Integrity
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import list_losses

@@ -46,7 +46,7 @@ TIME_CONSTANTS = 6.0
 """A run lasts for so many of its slowest time constants, but for no longer than `LONGEST_S`."""
 
 
-class BenchRunTask(NamedTuple):
+class BenchRunItem(NamedTuple):
     """One run to be made: picklable, with all that a worker needs; `to_s` as that of a run."""
 
     cell: BenchCell
@@ -68,7 +68,7 @@ class _JudgedRun(NamedTuple):
     text: str
 
 
-def run_bench_task(task: BenchRunTask) -> BenchRun:
+def run_bench_task(task: BenchRunItem) -> BenchRun:
     """Makes one run, in whatever process."""
     cell, scenario = task.cell, task.cell.build(task.seed).scenario
     twins = TWINS if task.seed == cell.seeds[0] else 1
@@ -176,7 +176,7 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
     return float(last_s) if last_s <= records[SLAVE].t_ns[-1] / NS_PER_S - REST_S else None
 
 
-def _find_stiffness(task: BenchRunTask, far: _JudgedRun) -> float | None:
+def _find_stiffness(task: BenchRunItem, far: _JudgedRun) -> float | None:
     """Returns by how much more the user has to push to get so much further, along the wall's normal, N/m."""
     built = task.cell.build(task.seed)
     short = load_tuning_scenario(built.source, (*built.overrides, *name_settings(SHORTER_REACH)))
@@ -264,7 +264,7 @@ def run_bench(
     """
     plan = folder.plan
     with folder.journal() as journal:
-        asked = [BenchRunTask(cell, seed) for cell in plan.cells for seed in cell.seeds]
+        asked = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
         for again in (False, True)[: 1 + confirm]:
             if again:
                 found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]

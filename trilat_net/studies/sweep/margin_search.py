@@ -133,7 +133,7 @@ class SearchRange(NamedTuple):
     tolerance: float
 
 
-class MarginTask(NamedTuple):
+class MarginItem(NamedTuple):
     """A grid point to be searched: picklable, and all that a process needs."""
 
     plan: SweepPlan
@@ -208,13 +208,13 @@ def search_margins(
         end = plan.cell(number)
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
         seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
-        searches += [MarginTask(plan, cell, seed, within) for seed in seeds]
+        searches += [MarginItem(plan, cell, seed, within) for seed in seeds]
     laws = list_imported_laws([plan.base])
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(search_margin_task, searches, progress)
 
 
-def search_margin_task(task: MarginTask) -> GridPointMargin:
+def search_margin_task(task: MarginItem) -> GridPointMargin:
     """Searches one grid point, and asks theory for the same.
 
     Raises:

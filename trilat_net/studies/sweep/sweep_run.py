@@ -519,7 +519,7 @@ class FinishedSweep(NamedTuple):
     jobs: int
 
 
-class CellTask(NamedTuple):
+class CellItem(NamedTuple):
     """One run of a cell, to be made: picklable, with all that a worker needs."""
 
     plan: SweepPlan
@@ -530,7 +530,7 @@ class CellTask(NamedTuple):
         return f"cell {self.cell.number} ({', '.join(self.cell.overrides)}), seed {self.seed}"
 
 
-def run_cell(task: CellTask) -> CellRun:
+def run_cell(task: CellItem) -> CellRun:
     """Runs one task, in whatever process.
 
     Raises:
@@ -560,7 +560,7 @@ def estimate_sweep(
     known = set(done)
     places = dict.fromkeys(n * (plan.cells - 1) // (_PROBES - 1) for n in range(_PROBES))
     seed = plan.seeds[0]
-    probes = [CellTask(plan, plan.cell(n), seed) for n in places if (n, seed) not in known]
+    probes = [CellItem(plan, plan.cell(n), seed) for n in places if (n, seed) not in known]
     if not probes:
         return DurationEstimate(plan.cells * len(plan.seeds) - len(known), 0.0, [])
     brief_s = min(1.0, plan.base.duration_s)
@@ -656,7 +656,7 @@ def _run_cells(
     first, *others = plan.seeds
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
-        tasks = (CellTask(plan, plan.cell(n), seed) for n, seed in runs if (n, seed) not in journal.done)
+        tasks = (CellItem(plan, plan.cell(n), seed) for n, seed in runs if (n, seed) not in journal.done)
         journal.complete(pool, run_cell, tasks, len(journal.done), count, progress)
 
     make(((number, first) for number in range(plan.cells)), plan.cells)

@@ -398,7 +398,7 @@ class TuningScenario(NamedTuple):
         return format_command("sim", self.source, *set_options(self.overrides))
 
 
-class CandidateTask(NamedTuple):
+class CandidateItem(NamedTuple):
     """One candidate to be run.
 
     Attributes:
@@ -413,13 +413,13 @@ class CandidateTask(NamedTuple):
         return self.name
 
 
-def build_candidate_task(seeds: Sequence[TuningScenario]) -> CandidateTask:
+def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
     """Returns what has to be run to measure one candidate, given with every seed."""
     name = ", ".join(seeds[0].overrides) or seeds[0].source
-    return CandidateTask(tuple(one.texts for one in seeds), name)
+    return CandidateItem(tuple(one.texts for one in seeds), name)
 
 
-def measure_candidate_task(task: CandidateTask) -> CandidateScore:
+def measure_candidate_task(task: CandidateItem) -> CandidateScore:
     """Runs one task, in whatever process."""
     return average_scores([measure_candidate(*run) for run in task.runs])
 

@@ -33,7 +33,7 @@ from .candidate import (
     CandidateClass,
     CandidateScore,
     TuningScenario,
-    build_candidate_task,
+    build_candidate_item,
     build_twin,
     check_comparable,
     load_tuning_scenario,
@@ -270,14 +270,14 @@ class TuningPlan(NamedTuple):
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
                 tasks = [
-                    build_candidate_task(
+                    build_candidate_item(
                         [base.with_gains(search.space, self.knowledge, one) for base in bases]
                     )
                     for search, batch in zip(searches, asked, strict=True)
                     for one in batch
                 ]
                 if number == 0:
-                    tasks += [build_candidate_task([of[name] for of in printed]) for name in printed[0]]
+                    tasks += [build_candidate_item([of[name] for of in printed]) for name in printed[0]]
                 scores = iter(pool.map(measure_candidate_task, tasks, show))
                 done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):

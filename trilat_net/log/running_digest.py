@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from .log_layout import SESSION
 
-CHAIN = "trilat.chain"
+DIGESTS = "trilat.chain"
 """Metadata at the end of a log: the digests of all that precedes."""
-CHAIN_KEY = "digest_chain"
+DIGESTS_KEY = "digest_chain"
 """Entry of the session's metadata that announces the chain, by its algorithm."""
 ALGORITHM = "sha256"
 RECOVERED = "trilat.recovered"
@@ -23,7 +23,7 @@ PREVIOUS_DIGEST_KEY = "previous_records"
 """Entry of a part's metadata: the digest of the messages of the part before it."""
 
 
-class ChainState(StrEnum):
+class DigestState(StrEnum):
     """Agreement of a file with its digest chain, best first."""
 
     INTACT = "intact"
@@ -35,16 +35,16 @@ class ChainState(StrEnum):
 class Integrity(NamedTuple):
     """Whether a log is as it was made, and a sentence for it."""
 
-    state: ChainState
+    state: DigestState
     text: str
 
     @property
     def passed(self) -> bool:
         """False if something was changed, or if records are missing that were there."""
-        return self.state is not ChainState.CHANGED
+        return self.state is not DigestState.CHANGED
 
 
-class DigestChain:
+class RunningDigest:
     """The digests of one file while it is written or read.
 
     Attributes:
@@ -79,25 +79,25 @@ class DigestChain:
             finished: True if it was finished.
             damaged: True if a part of it cannot be read.
         """
-        stated, recovered = metadata.get(CHAIN), metadata.get(RECOVERED, {})
-        if recovered.get("chain") == ChainState.CHANGED:
-            return Integrity(ChainState.CHANGED, "recovered from a file that had been changed")
+        stated, recovered = metadata.get(DIGESTS), metadata.get(RECOVERED, {})
+        if recovered.get("chain") == DigestState.CHANGED:
+            return Integrity(DigestState.CHANGED, "recovered from a file that had been changed")
         if stated is None:
-            if CHAIN_KEY not in metadata.get(SESSION, {}):
-                return Integrity(ChainState.ABSENT, "no digest chain: an older program made it")
+            if DIGESTS_KEY not in metadata.get(SESSION, {}):
+                return Integrity(DigestState.ABSENT, "no digest chain: an older program made it")
             if not finished:
                 why = "its digest chain is not closed: the file was not finished"
-                return Integrity(ChainState.OPEN, why)
-            return Integrity(ChainState.CHANGED, "its digest chain was removed")
+                return Integrity(DigestState.OPEN, why)
+            return Integrity(DigestState.CHANGED, "its digest chain was removed")
         found = self.facts()
         if found == dict(stated):
             since = f", since it was recovered from {recovered['from']}" if "from" in recovered else ""
             agrees = f"the digest chain agrees over {self.messages} messages and all metadata{since}"
-            return Integrity(ChainState.INTACT, agrees)
+            return Integrity(DigestState.INTACT, agrees)
         if damaged and stated.get("about") == found["about"] and stated.get("messages") != found["messages"]:
-            return Integrity(ChainState.OPEN, "its digest chain cannot be compared: the file is damaged")
+            return Integrity(DigestState.OPEN, "its digest chain cannot be compared: the file is damaged")
         differ = [name for key, name in _COVERED.items() if stated.get(key) != found[key]]
-        return Integrity(ChainState.CHANGED, f"changed since it was made: {' and '.join(differ)}")
+        return Integrity(DigestState.CHANGED, f"changed since it was made: {' and '.join(differ)}")
 
 
 _COVERED = {

@@ -1,4 +1,4 @@
-"""Ports at an arm: of an external arm's program (`plant = "external"`), of its dead-man switch, of a hand.
+"""Clients of a site: programs of an external arm (`plant = "external"`), of its dead-man switch, of a hand.
 
 Invariant: the arm sends its position as often as it likes; the torque to apply stands in the record that the
 site publishes at every tick, so the arm receives exactly what the log holds. Without a valid torque,
@@ -8,10 +8,10 @@ stranger's, and changes nothing. A hand that lives is heard, also where it rests
 message. One whose process is gone, or hangs, is silent, and the site lets go. What acts on the arm, and what
 a hand feels, are what the site's records say.
 
-    with ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:
-        while not port.over:
-            port.send(*robot.joints())
-            tau = port.torque()
+    with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
+        while not client.over:
+            client.send(*robot.joints())
+            tau = client.torque()
             robot.brake() if tau is None else robot.apply(tau)
             robot.wait()
 """
@@ -79,7 +79,7 @@ class SiteSender:
         self._publish(encode(message))
 
 
-class SitePort:
+class SiteClient:
     """The connection of a program to one site; a context, which closes it."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
@@ -142,7 +142,7 @@ class SitePort:
             self._gone = self._gone or (self._present and not alive)
 
 
-class OutsidePort(SitePort):
+class OutsideClient(SiteClient):
     """The connection of a program that sends to a site, under one of its keys; a context, which closes it."""
 
     channel = ""
@@ -158,7 +158,7 @@ class OutsidePort(SitePort):
     def connected(
         cls, session: str, site: str, connect: Sequence[str], keys: str | Path | None = None
     ) -> Self:
-        """Returns a port that reaches a site over Zenoh.
+        """Returns a client that reaches a site over Zenoh.
 
         Args:
             session: the session's name, by default the scenario's.
@@ -173,10 +173,10 @@ class OutsidePort(SitePort):
         return cls(reached.require(cls.member or site).open(), SystemClock(), session, site)
 
 
-class EnablePort(OutsidePort):
+class SwitchClient(OutsideClient):
     """The dead-man switch of an arm: what its program says for as long as somebody holds it.
 
-    >>> with tn.EnablePort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:  # doctest: +SKIP
+    >>> with tn.SwitchClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:  # doctest: +SKIP
     ...     while not switch.over:
     ...         switch.send(held=button.is_pressed())  # at least every 100 ms
     ...         time.sleep(0.02)
@@ -189,12 +189,12 @@ class EnablePort(OutsidePort):
         self._sender.send(ArmEnable, held=held)
 
 
-class ArmPort(OutsidePort):
+class ArmClient(OutsideClient):
     """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one.
 
-    >>> with tn.ArmPort.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as port:  # doctest: +SKIP
-    ...     port.send(robot.q, robot.qd)
-    ...     tau = port.torque()
+    >>> with tn.ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:  # doctest: +SKIP
+    ...     client.send(robot.q, robot.qd)
+    ...     tau = client.torque()
     """
 
     channel = topics.MEASURED
@@ -235,7 +235,7 @@ def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSen
     return SiteSender(bus, clock, session, site, topics.HAND, new_boot() % (2**32 - 1) + 1)
 
 
-class Hand(SitePort):
+class Hand(SiteClient):
     """Somebody at one arm; a context, which lets go at its end.
 
     Args:
