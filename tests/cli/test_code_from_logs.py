@@ -4,6 +4,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -95,14 +96,16 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The folder of a log, in which commands run; nothing is allowed, and nothing remembered."""
     shutil.copy(logs / "run.mcap", tmp_path)
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
     monkeypatch.chdir(tmp_path)
+    before = dict(allowed_laws)
     allowed_laws.clear()
-    return tmp_path
+    yield tmp_path
+    allowed_laws.update(before)  # logs that other tests keep name laws
 
 
 def _marks(words: list[str], law: str) -> tuple[Any, ...]:
