@@ -51,7 +51,8 @@ def test_waves_through_200_ms(stage: Stage) -> None:
 
 def test_passivity_control_through_50_ms(stage: Stage) -> None:
     link = {"model": "constant", "delay_ms": 50.0}
-    log = on_unit_arms(stage, {"law": "tdpa", **PUBLISHED}, FOLLOWER, link=link)
+    leads = {"law": "tdpa", **PUBLISHED, "K": 0.0, "B": 0.0}
+    log = on_unit_arms(stage, leads, FOLLOWER, link=link)
     assert log["m"].q[-1, 0] == pytest.approx(0.3, abs=5e-5)
     assert log["s"].q[-1, 0] == pytest.approx(0.2864, abs=5e-5)
     least = min(
