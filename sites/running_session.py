@@ -114,7 +114,7 @@ class RunningSession:
         ...     [record.q_des for record in take()]
         """
         with self._reach(operates=False) as bus:
-            rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or "*"]
+            rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or ("*",)]
 
             def take() -> list[State]:
                 payloads = (message[1] for ring in rings for message in iter(ring.poll, None))

@@ -1,12 +1,10 @@
 """A control law is one file: whoever knows laws knows one that was put beside the others."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.dropped_files import look
 from trilat_net.laws.interface import name_of_class
 from trilat_net.scenario.laws import BUILT_IN
 
@@ -59,10 +57,7 @@ print(json.dumps({
 
 def test_a_file_beside_the_others_is_a_law_everywhere(tmp_path: Path) -> None:
     (tmp_path / "soft_spring.py").write_text(LAW)
-    command = [sys.executable, "-c", LOOK, str(tmp_path)]
-    out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert out.returncode == 0, out.stderr
-    found = json.loads(out.stdout.splitlines()[-1])
+    found = look(LOOK, tmp_path)
     assert found["control"] == [9.0, 9.0]
     assert any("condition of soft_spring" in line and "K = 9 at s" in line for line in found["check"])
     assert found["identical"]

@@ -1,13 +1,11 @@
 """A metric is one file: whoever shows, compares or expects metrics knows one put beside the others."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import trilat_net
+from tests.dropped_files import look
 from trilat_net.analysis.metrics.measures import Quantity, list_measures, measures
 from trilat_net.analysis.run_view import RunView
 
@@ -42,10 +40,7 @@ print(json.dumps({
 
 def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None:
     (tmp_path / "haste.py").write_text(METRIC)
-    command = [sys.executable, "-c", LOOK, str(tmp_path)]
-    out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert out.returncode == 0, out.stderr
-    found = json.loads(out.stdout.splitlines()[-1])
+    found = look(LOOK, tmp_path)
     assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
     assert "mean |qd|" in found["text"]
     assert "haste_rad_s" in found["frame"]

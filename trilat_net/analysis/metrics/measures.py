@@ -123,7 +123,7 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
     def declare(measure: Measuring) -> Measuring:
         known = {one.key: other for other in _MEASURES for one in other.quantities}
         for one in quantities:
-            if (other := known.get(one.key)) and other.measure.__module__ != measure.__module__:
+            if other := known.get(one.key):
                 homes = f"{other.measure.__module__} and {measure.__module__}"
                 raise ValueError(f"metric {one.key} has two definitions, in {homes}")
         told = tuple(one._replace(of=of, group=group) for one in quantities)

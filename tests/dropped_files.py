@@ -1,0 +1,15 @@
+"""What a program sees in a process of its own that is given a folder with a file to be found there."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def look(program: str, folder: Path) -> Any:
+    """The JSON that a program prints in its last line."""
+    command = [sys.executable, "-c", program, str(folder)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
+    assert out.returncode == 0, out.stderr
+    return json.loads(out.stdout.splitlines()[-1])
