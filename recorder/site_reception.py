@@ -13,9 +13,9 @@ from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
-from trilat_net.net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
+from trilat_net.net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from trilat_net.net.wire import decode
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks

@@ -9,9 +9,9 @@ from array import array
 from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
-from trilat_net.net.message_numbers import STATS_PER_SECOND, count_messages, skipped_numbers
 from trilat_net.net.pinging import answer_backfill
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
+from trilat_net.net.topics import STATS_PER_SECOND, count_messages, skipped_numbers
 
 KEPT_S = 60
 RECORDS_KEPT = 120_000

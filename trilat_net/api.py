@@ -135,11 +135,9 @@ def export(log: AnyLog, to: str, out: str | Path, *, force: bool = False) -> Pat
     Raises:
         UsageError: there is no such format, a package is missing, or the place is taken.
     """
-    from .reporting.export import Exporter, ExportFormat
+    from .reporting.export import Exporter
 
-    if to not in list(ExportFormat):
-        raise UsageError(f"an export is to one of {', '.join(ExportFormat)}, not {to!r}")
-    Exporter(ExportFormat(to), Path(out), force=force).export(_open(log))
+    Exporter(to, Path(out), force=force).export(_open(log))
     return Path(out)
 
 

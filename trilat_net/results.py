@@ -1,9 +1,11 @@
 """What a command found, as an object: in a line, as the text that the command prints, as a table, as JSON.
 
 Invariant: a result holds values alone. Its text has one home, in `reporting`, which is imported when it is
-asked for: so a room that computes knows nothing of what is for eyes.
+asked for: so a room that computes knows nothing of what is for eyes. JSON has no words for NaN and infinity;
+a quantity that is not known is null.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -50,3 +52,11 @@ class Result:
 
 def _texts() -> Any:
     return import_module(f"{__package__}.reporting.result_text")
+
+
+JsonObject = dict[str, Any]
+
+
+def finite_or_none(value: float) -> float | None:
+    """Returns a number for JSON; None for NaN and infinity."""
+    return value if math.isfinite(value) else None

@@ -28,7 +28,7 @@ from trilat_net.log.log_layout import (
 )
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
-from trilat_net.net.message_numbers import number_message
+from trilat_net.net.topics import number_message
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage

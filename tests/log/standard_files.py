@@ -11,7 +11,7 @@ from trilat_net.log.mcap_writer import Sink
 from trilat_net.log.recover import recover_log
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
-from trilat_net.reporting.export import export_ros2
+from trilat_net.reporting.exports.ros2 import export_ros2
 from trilat_net.scenario import load_scenario
 
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -19,7 +19,7 @@ from tests.analysis import logs
 from tests.log_editing import opened, recorded
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
-from trilat_net.reporting.export import Exporter, ExportFormat
+from trilat_net.reporting.export import Exporter
 from trilat_net.scenario import parse_scenario
 
 
@@ -52,7 +52,7 @@ def expected() -> dict[str, dict[str, list[Any]]]:
 
 def exported(form: str, folder: Path) -> Path:
     path = folder / f"out-{form}"
-    Exporter(ExportFormat(form), path).export(log())
+    Exporter(form, path).export(log())
     assert [entry.name for entry in folder.iterdir()] == [path.name]
     return path
 

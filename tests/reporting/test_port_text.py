@@ -1,7 +1,7 @@
 import json
 
 from tests.theory.analysed_ports import section_of
-from trilat_net.reporting.port_text import describe_ports
+from trilat_net.reporting.linear_text import describe_ports
 from trilat_net.theory.port_analysis import ports_to_json
 
 

@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 
 from tests.log_editing import edited, opened, recorded
 from trilat_net.errors import LogError
-from trilat_net.reporting.export import export_ros2
+from trilat_net.reporting.exports.ros2 import export_ros2
 
 
 def test_all_messages_stand_in_the_order_in_which_they_came_and_virtual_time_has_no_clocks(

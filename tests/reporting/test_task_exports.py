@@ -18,7 +18,7 @@ from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.data_tables import to_data_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
-from trilat_net.reporting.export import Exporter, ExportFormat
+from trilat_net.reporting.export import Exporter
 from trilat_net.reporting.rerun_viewer import ViewerOptions, open_rerun
 from trilat_net.scenario import parse_scenario
 
@@ -39,7 +39,7 @@ def log() -> Log:
 
 def exported(form: str, folder: Path) -> Path:
     path = folder / ("out.mcap" if form == "ros2" else f"out.{form}")
-    Exporter(ExportFormat(form), path).export(log())
+    Exporter(form, path).export(log())
     return path
 
 

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.reporting.figures.root_map import draw_root_map
+from trilat_net.reporting.figures.linear_figures import draw_root_map
 from trilat_net.reporting.linear_text import (
     describe_delay_margin,
     describe_effective_delays,

@@ -25,7 +25,7 @@ from trilat_net.core.exogenous import TorqueKind, TorqueSource, put_torque_on_ch
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.reporting.port_text import describe_ports
+from trilat_net.reporting.linear_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 from trilat_net.studies.sweep.stability_map import evaluate_criterion

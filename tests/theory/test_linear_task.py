@@ -11,7 +11,7 @@ from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.reporting.port_text import describe_ports
+from trilat_net.reporting.linear_text import describe_ports
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part

@@ -26,9 +26,8 @@ from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
 from ..log.site_log import SiteLog
 from ..net import topics
-from ..net.message_numbers import ticks_per_stats
-from ..results import Result
-from .json_values import JsonObject
+from ..net.topics import ticks_per_stats
+from ..results import JsonObject, Result
 from .link_summary import ONE_WAY_SCHEMA_VERSION, sample_ages_ns, summarise_clock
 
 MOST_LISTED_GAPS = 1000

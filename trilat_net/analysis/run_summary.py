@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..log.log_reader import Log
+from ..results import JsonObject, finite_or_none
 from ..scenario.expect import END_WINDOW_S
 from . import file_overview
-from .json_values import JsonObject, finite_or_none
 from .link_summary import LinkSummary, ValueStatistics, summarise_clock, summarise_links
 from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_of_all_s, settling_time_s
 from .timeline import find_mode_intervals, list_changes

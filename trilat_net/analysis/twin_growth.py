@@ -36,10 +36,9 @@ from ..execution.twins import (
     run_virtual_twins,
 )
 from ..log.log_reader import Log, open_log
-from ..results import Result
+from ..results import Result, finite_or_none
 from ..scenario import Scenario
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
-from .json_values import finite_or_none
 from .run_end import EndBehaviour, RunEnd, Stability, find_coupled_sites
 from .site_signals import SETTLED_ERROR_RAD
 

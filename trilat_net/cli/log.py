@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from ..reporting import terminal_output as terminal
+from ..reporting.exports import list_export_formats
 from . import options
 
 _LOSSY_EXIT_CODE = 3
@@ -96,16 +97,13 @@ def log_recover_command(
         raise typer.Exit(_LOSSY_EXIT_CODE)
 
 
-_FORMATS = ("ros2", "parquet", "csv", "npz", "mat")
-
-
 def log_export_command(
     files: options.LogsArgument,
     form: Annotated[
         str,
         options.value(
             "--to",
-            "|".join(_FORMATS),
+            "|".join(list_export_formats()),
             "ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file "
             "per site and kind; npz, mat: one file with an array per column.",
         ),
@@ -118,22 +116,17 @@ def log_export_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Exports a log to files for other tools: names end in their units, numbers are exact."""
-    from ..errors import UsageError
-    from ..reporting.export import Exporter, ExportFormat, default_export_path
+    from ..reporting.export import Exporter
 
-    if form not in _FORMATS:
-        raise UsageError(f"--to is one of {', '.join(_FORMATS)}, not {form!r}")
-    chosen = ExportFormat(form)
+    exporter = Exporter(form, output, force=force, log=files[0])
     log = terminal.open_with_progress(*files)
-    path = output if output is not None else default_export_path(chosen, files[0])
-    exporter = Exporter(chosen, path, force=force)
-    with terminal.progress_bar(f"writing {path}") as progress:
+    with terminal.progress_bar(f"writing {exporter.path}") as progress:
         exporter.export(log, progress)
     records = {site: len(log[site]) for site in log.sites}
     if as_json:
-        terminal.print_json({"file": str(path), "format": form, "records": records})
+        terminal.print_json({"file": str(exporter.path), "format": form, "records": records})
     else:
-        terminal.print_text(f"{path}: {sum(records.values())} records of {', '.join(records)}")
+        terminal.print_text(f"{exporter.path}: {sum(records.values())} records of {', '.join(records)}")
 
 
 def log_view_command(

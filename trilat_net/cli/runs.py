@@ -372,8 +372,7 @@ def _pose(text: str | None) -> tuple[float, ...] | None:
 
 
 def _draw(found: "LinearAnalysis", what: LinearFigure) -> "Figure":
-    from ..reporting.figures.haptic_ports import draw_port_impedance, draw_port_passivity
-    from ..reporting.figures.root_map import draw_root_map
+    from ..reporting.figures.linear_figures import draw_port_impedance, draw_port_passivity, draw_root_map
 
     if found.ports is None or what is LinearFigure.ROOTS:
         return draw_root_map(found)

@@ -14,8 +14,8 @@ from ..log.accounting import Account
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
 from ..log.log_writer import LogWriter
 from ..net import topics
-from ..net.message_numbers import number_message, skipped_numbers
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
+from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
 from ..scenario import Scenario
 from ..scenario.run_changes import count_skipped_ticks

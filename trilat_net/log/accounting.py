@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from ..errors import ScenarioError, WireError
 from ..net import topics
-from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.messages import READABLE, Event
+from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
 from ..scenario import parse_embedded
 from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS

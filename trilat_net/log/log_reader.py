@@ -30,8 +30,8 @@ from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import LogError, ScenarioError, UnknownName, WireError
 from ..files import open_regular
 from ..net import topics
-from ..net.message_numbers import count_under_way
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
+from ..net.topics import count_under_way
 from ..net.wire import decode
 from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded

@@ -18,7 +18,7 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import messages, topics
-from ..net.message_numbers import count_messages, count_under_way, number_message, skipped_numbers
+from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks

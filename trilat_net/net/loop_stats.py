@@ -6,8 +6,8 @@ from typing import Any
 
 from ..core.site_step import Site
 from ..core.ticks import NS_PER_S, TickRecord
-from .message_numbers import ticks_per_stats
 from .messages import VERSION, LinkStats
+from .topics import ticks_per_stats
 
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
 

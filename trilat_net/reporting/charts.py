@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from ..analysis import site_signals
 from ..analysis.arm_rows import joint_positions_m
-from ..analysis.json_values import JsonObject
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
 from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
+from ..results import JsonObject
 from . import style
 from .figures import age_and_lateness, arm_poses
 from .palette import DARK_SITE_COLOURS, list_site_colours

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from ..analysis.file_overview import FileOverview
-from ..analysis.json_values import JsonObject
+from ..results import JsonObject
 from .result_text import Block, MarkedText
 from .terminal_output import sanitize
 from .text_table import TextTable

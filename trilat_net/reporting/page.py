@@ -17,7 +17,6 @@ from string import Template
 from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
-from ..analysis.json_values import JsonObject
 from ..analysis.run_summary import summarise_run
 from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
@@ -25,13 +24,14 @@ from ..analysis.twin_growth import PushedTwins
 from ..files import make_folder, write_whole
 from ..log.findings import Finding
 from ..log.log_reader import Log
+from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
 from . import charts
 from .certificate_text import describe_certificate, list_energies
 from .figures.age_and_lateness import explain_missing_loop_times
 from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
-from .figures.registry import explain_absent_operator
+from .figures.joint_motion import explain_absent_operator
 from .figures.twin_differences import draw_twins
 from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 from .style import typeset

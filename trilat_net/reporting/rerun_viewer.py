@@ -25,7 +25,7 @@ from ..log.log_reader import Log
 from ..log.ros2.cdr import JOINT_STATE, TRANSFORMS
 from ..log.ros2.robot_model import WORLD
 from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, SENT_PREFIX, Ros2Channel, read_ros2_channels
-from .export import export_ros2
+from .exports.ros2 import export_ros2
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
 """Runs a command with an environment, and returns its exit code."""

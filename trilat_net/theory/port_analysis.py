@@ -3,6 +3,12 @@
 Invariant: operators and environments are off, and their torque at the equilibrium stays as a constant, so
 that a held pose can be analysed too. An unstable loop has no steady oscillations: nothing but its
 instability counts. Every result holds for the analysed band.
+
+Sites that follow in task space have ports at their end effectors, along the followed axes: the same loop in
+other coordinates. With J the Jacobian of a site's followed axes at rest and N a basis of the joint motions
+that leave them alone, x = J q and z = N' q stand in place of q, so that a force F on the end effector is the
+torque J' F and its velocity is x'. A port is numbered as its coordinate, 1 to 3 a place, 4 to 6 turns, and
+its position's state is called "q" with that number, as a joint's is.
 """
 
 from collections.abc import Mapping
@@ -12,13 +18,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
 
-from ..analysis.json_values import finite_or_none
 from ..analysis.lyapunov_weights import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
-from ..core.site_setup import Law
+from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
+from ..results import finite_or_none
 from ..scenario import Scenario
+from ..scenario.arms import TASK_AXES
 from . import frequency_search, port_response
 from .characteristic_roots import compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
@@ -33,7 +41,7 @@ from .port_passivity import (
     llewellyn_rounding,
 )
 from .port_transparency import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
-from .task_ports import list_followed_axes, name_ports, use_end_effector_ports
+from .site_dynamics import follow_peers, lay_out_arguments, place_arm
 from .textbook_task import PLACE_COORDINATES
 
 
@@ -330,3 +338,57 @@ def _transparency_to_json(one: Transparency) -> dict[str, Any]:
         "ratio_db": one.ratio_db,
         "difference_nm_s_rad": one.difference_nm_s_rad,
     }
+
+
+def list_followed_axes(site: SiteSetup) -> list[int]:
+    """Returns the coordinates that a site follows, from 1 on: of joint space all joints."""
+    if site.chain is None or site.chain.task is None:
+        return list(range(1, site.layout.joints + 1))
+    return [n for n, on in enumerate(site.chain.task.axes, 1) if on]
+
+
+def name_ports(conditions: OperatingConditions) -> dict[int, str]:
+    """Returns what the ports of each number are called: the axes of a task, or {} for the joints."""
+    if not conditions.sites[0].layout.task:
+        return {}
+    followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
+    return {n: TASK_AXES[n - 1] for n in followed}
+
+
+def use_end_effector_ports(
+    conditions: OperatingConditions, rest: Equilibrium, loop: LinearLoop
+) -> LinearLoop:
+    """Returns a loop with ports at the end effectors, if its sites follow with them; else the loop."""
+    if not conditions.sites[0].layout.task:
+        return loop
+    blocks, inverses, names, ports = [], [], [], []
+    for site, x in zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True):
+        at, followed = lay_out_arguments(site), list_followed_axes(site)
+        whole = follow_peers(site, place_arm(site, x[at.q]), x).J
+        assert whole is not None
+        J: Array = whole[[n - 1 for n in followed]]
+        free = null_space(J)
+        T, inverse = np.vstack([J, free.T]), np.hstack([np.linalg.pinv(J), free])
+        estimates = [name for name in loop.names if name.startswith(f"{site.name}.")][2 * at.joints :]
+        rest_of_site = np.eye(len(estimates))
+        blocks.append(block_diag(T, T, rest_of_site))
+        inverses.append(block_diag(inverse, inverse, rest_of_site))
+        free_names = [f"free{n + 1}" for n in range(free.shape[1])]
+        for kind, slow in (("q", ""), ("qd", "d")):
+            names += [f"{site.name}.{kind}{n}" for n in followed]
+            names += [f"{site.name}.{name}{slow}" for name in free_names]
+        names += estimates
+        ports.append(J)
+    change, back, J = block_diag(*blocks), block_diag(*inverses), block_diag(*ports)
+    numbers = [(site.name, n) for site in conditions.sites for n in list_followed_axes(site)]
+    inputs, outputs = (tuple(f"{site}.{kind}{n}" for site, n in numbers) for kind in ("tau", "qd"))
+    delayed = tuple(term._replace(A=change @ term.A @ back, B=change @ term.B @ J.T) for term in loop.delayed)
+    return loop._replace(
+        names=tuple(names),
+        inputs=inputs,
+        outputs=outputs,
+        A=change @ loop.A @ back,
+        B=change @ loop.B @ J.T,
+        C=J @ loop.C @ back,
+        delayed=delayed,
+    )

@@ -15,9 +15,9 @@ from ...core.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
 from ...core.site_setup import Scheme, StaleAction
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...results import JsonObject
 from ...scenario.imported_law import ImportedLaw
 from ..arm_rows import build_arm_rows
-from ..json_values import JsonObject
 from .premises import Premise
 
 LEAST_ENERGY_J = -1e-9

@@ -17,8 +17,7 @@ import numpy as np
 from ...core.vectors import Array
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
-from ...results import Result
-from ..json_values import JsonObject, finite_or_none
+from ...results import JsonObject, Result, finite_or_none
 from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from ..twin_growth import TwinGrowth, TwinVerdict, judge_end_by_twins

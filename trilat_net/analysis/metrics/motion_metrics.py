@@ -14,13 +14,13 @@ import numpy as np
 from ...core.site_setup import Law
 from ...core.vectors import Array
 from ...log.site_log import find_task_errors
+from ...results import JsonObject
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
 from ..aligned import AlignedRecords, Bools, find_latest_rows
 from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
 from ..base_parameters import find_base_parameters, find_consistent_links
-from ..json_values import JsonObject
 from ..run_view import RunView
 from ..torque_sources import wall_depth, wall_force
 from .measures import (

@@ -19,6 +19,7 @@ from ...log.log_reader import Log
 from ...log.record_columns import Ints
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
 
 _POINTS = 400
 _TALL = 6.0
@@ -38,6 +39,7 @@ class DelayDistribution(NamedTuple):
     age_ms: Array
 
 
+@draws("sample_age", "age of the samples in use, per link", in_report=True)
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
     lines = {link: stated_delay_line(log, states) for link, states in _stated_models(log).items()}
@@ -70,6 +72,17 @@ def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
+def has_varying_delay(log: Log) -> bool:
+    """True if some link is stated as more than one constant delay."""
+    return not all(map(has_one_constant_delay, _stated_models(log).values()))
+
+
+@draws(
+    "delay_distributions",
+    "distributions of delays and ages",
+    unless(has_varying_delay, "every link is stated as one constant delay"),
+    in_report=True,
+)
 def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the distributions of delay and age on every link: a row per receiver.
 
@@ -96,11 +109,6 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
         entries = [(f"age, {text}", options) for text, options in _senders(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
-
-
-def has_varying_delay(log: Log) -> bool:
-    """True if some link is stated as more than one constant delay."""
-    return not all(map(has_one_constant_delay, _stated_models(log).values()))
 
 
 def _stated_models(log: Log) -> dict[str, list[StatedModel]]:
@@ -204,6 +212,7 @@ def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
     return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
 
 
+@draws("loop_timing", "lateness and computing time of the loops", explain_missing_loop_times, in_report=True)
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
     edges = loop_time_bin_edges(log)

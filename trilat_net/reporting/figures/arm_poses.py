@@ -21,6 +21,7 @@ from ...log.log_reader import Log
 from ...scenario.arms import ArmModel
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from .figure_entry import draws
 
 INSTANTS = 6
 _NARROW_INSTANTS = 3
@@ -107,6 +108,7 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     return float(left), float(right), float(bottom), float(top)
 
 
+@draws("arms", "the arms at a few instants", in_report=True)
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[float] | None = None) -> Figure:
     """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
 

@@ -13,13 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ...analysis.certificate.energy_balance import EnergyBalance
-from ...analysis.certificate.observed_energy import ObservedEnergy
-from ...analysis.certificate.premises import find_unjudged_spans
-from ...analysis.certificate.stability_certificate import Certificate
+from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
+from ...analysis.certificate.premises import check_scenario_premises, find_unjudged_spans
+from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
 
 _PARTS = {
     "kinetic": "r'Mr / 2",
@@ -69,6 +70,16 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
     return plot.figure
 
 
+def _no_functional(log: Log) -> str:
+    law = check_scenario_premises(log.scenario)[0]
+    return "" if law.holds else law.text
+
+
+@draws("certificate", "V, its parts, who changed it, the energy balance", _no_functional, in_report=True)
+def _draw_certificate(log: Log, form: FigureSize) -> Figure:
+    return draw_functional(log, certify(log), form)
+
+
 def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the energies that the laws declare: lines and what is known of them, stores, arms' work, J.
 
@@ -92,6 +103,23 @@ def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = 
         dashed = ("taken by the law", {"color": style.REFERENCE, "linestyle": style.DASHES[1]})
         plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), dashed])
     return plot.figure
+
+
+def _observed_energy(log: Log) -> ObservedEnergy | None:
+    found = observe_energies(log)
+    return found if found is not None and found.curves else None
+
+
+@draws(
+    "observed_energy",
+    "energies that the control laws declare: lines, observers, tanks",
+    unless(_observed_energy, "the laws of this run declare no energies"),
+    in_report=True,
+)
+def _draw_observed(log: Log, form: FigureSize) -> Figure:
+    found = observe_energies(log)
+    assert found is not None
+    return draw_observed_energy(log, found, form)
 
 
 def _draw(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:

@@ -39,8 +39,10 @@ from ...core.chain import LINK_PARAMETERS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
+from ...scenario.law_consent import find_user_laws
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
 
 _ROW_IN = 1.2
 """Height of a row of panels, where there are several."""
@@ -53,14 +55,26 @@ _LOOP_PT = 0.8
 """Width of a line that crosses itself."""
 _STEP = 0.01
 """Of its extent, between two points of a path."""
+NO_OPERATOR = "no site has an operator in this run"
+
+explain_absent_operator = unless(sites_with_operator, NO_OPERATOR)
+"""Returns why there is no torque of an operator to draw; "" if there is one."""
 
 
+@draws("operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True)
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques of the operators ON the arms over time, N m; Fig. 3 of the paper."""
     signal = style.site_records(log, external_torques)
     return _draw_joints(log, form, sites_with_operator(log), signal, "torque on the arm (N m)")
 
 
+def _explain_no_twin(log: Log) -> str:
+    """Returns why there is no run without operators, which runs the laws of the log."""
+    withheld = (str(law) for law in find_user_laws(log.scenario) if not law.allowed)
+    return next(withheld, "") if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
+
+
+@draws("hands_moved", "the log minus the same run without operators", _explain_no_twin, in_report=True)
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
@@ -73,6 +87,7 @@ def draw_operator_displacement(
     return _draw_joints(log, form, log.sites, signal, "moved by operators (rad)")
 
 
+@draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
     limits: dict[str, Array] = {}
@@ -136,6 +151,7 @@ def _add_joint_rows(
     return [[*column] for column in grid.T], [*grid[-1]]
 
 
+@draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques ON the arms, N m, above the angles of all arms, rad: a column per joint.
 
@@ -162,6 +178,7 @@ def _height_in(log: Log, of_two: float) -> float:
     return of_two if count == 2 else 0.8 + 0.9 * count
 
 
+@draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
     labels = [("{}: q (rad)" if form.narrow else "angle of {} (rad)").format(site) for site in log.sites]
@@ -182,6 +199,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
+@draws("tracking_errors", "errors, and the largest one still to come (Fig. 5)", in_report=True)
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it settles.
 
@@ -215,6 +233,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
+@draws("settling", "size of the errors on a log axis, settling times")
 def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the largest error of any joint of every site over time, rad, on a logarithmic axis.
 
@@ -249,6 +268,16 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
+def _learns(log: Log) -> bool:
+    return any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
+
+
+@draws(
+    "parameter_estimates",
+    "estimates and true values (Fig. 6)",
+    unless(_learns, "no estimate changed in this run"),
+    in_report=True,
+)
 def draw_parameter_estimates(
     log: Log, form: FigureSize = REPORT_SIZE, *, sites: Sequence[str] | None = None
 ) -> Figure:
@@ -316,6 +345,7 @@ def _draw_estimate(
         axes.axhline(truth, **{**style.LIMIT_LINE, "color": style.site_colour(plot.log, site)})
 
 
+@draws("phase", "errors against their rates")
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the phase portrait of the errors: e over the run against qd - qd_des, a panel per joint.
 
@@ -343,6 +373,12 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return figure
 
 
+@draws(
+    "paths",
+    "paths of the end effectors in three planes",
+    unless(lambda log: all(arm.chain for arm in log.scenario.arms.values()), "its arms are planar"),
+    in_report=True,
+)
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the paths of the end effectors of chains, m, in three planes of the frame that all sites share.
 
@@ -394,6 +430,11 @@ def sites_with_changing_dominance(log: Log) -> list[str]:
     return [site for site in log.sites if site in changing]
 
 
+@draws(
+    "authority",
+    "shares that change, and the motion of the arms",
+    unless(sites_with_changing_dominance, "the shares of all sites are constant"),
+)
 def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the shares that change, and how far every arm is from where it started, rad."""
     owners = sites_with_changing_dominance(log)
@@ -425,6 +466,11 @@ def sites_with_walls(log: Log) -> list[str]:
     return [site for site in log.sites if list_walls(log.scenario.sites[site])]
 
 
+@draws(
+    "contact",
+    "force of the walls, and depth in them",
+    unless(sites_with_walls, "no site has a wall in this run"),
+)
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the normal force of every wall over time, N, above the depth of the end effector in it, mm."""
     sites = sites_with_walls(log)

@@ -2,163 +2,35 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes.
+Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes. Whatever a file of
+this folder draws belongs to it.
 """
 
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
-from ...analysis.certificate.premises import check_scenario_premises
-from ...analysis.certificate.stability_certificate import certify
-from ...analysis.run_end import classify_log_end
-from ...analysis.site_signals import sites_with_operator
-from ...analysis.twin_growth import PushedTwins, TwinGrowth, measure_twins
+from ...analysis.twin_growth import PushedTwins, TwinGrowth
 from ...errors import UsageError
-from ...execution.log_inputs import explain_no_repetition
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
-from ...scenario.law_consent import find_user_laws
 from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
-from . import joint_motion
-from .age_and_lateness import (
-    draw_delay_distributions,
-    draw_loop_timing,
-    draw_sample_age,
-    explain_missing_loop_times,
-    has_varying_delay,
-)
-from .arm_poses import draw_arms
-from .certificate_energy import draw_functional, draw_observed_energy
-from .run_overview import draw_overlay, draw_overview
+from .figure_entry import FigureEntry, list_figures
+from .joint_motion import draw_operator_displacement
+from .run_overview import draw_overlay
 from .twin_differences import draw_twins
 
-NO_OPERATOR = "no site has an operator in this run"
+for _found in pkgutil.iter_modules(import_module(__package__).__path__):
+    import_module(f"{__package__}.{_found.name}")
 
-Draw = Callable[[Log, FigureSize], Figure]
-Absent = Callable[[Log], str]
-
-
-class FigureEntry(NamedTuple):
-    """A figure: what is in it, what draws it, and what returns why a log has nothing to show in it, or ""."""
-
-    about: str
-    draw: Draw
-    absent: Absent = lambda _: ""
-    in_report: bool = False
-
-
-def _unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    return lambda log: "" if shows(log) else reason
-
-
-explain_absent_operator = _unless(sites_with_operator, NO_OPERATOR)
-"""Returns why there is no torque of an operator to draw; "" if there is one."""
-
-
-def _explain_no_twin(log: Log) -> str:
-    """Returns why there is no run without operators, which runs the laws of the log."""
-    withheld = (str(law) for law in find_user_laws(log.scenario) if not law.allowed)
-    return next(withheld, "") if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
-
-
-def _no_functional(log: Log) -> str:
-    law = check_scenario_premises(log.scenario)[0]
-    return "" if law.holds else law.text
-
-
-def _observed_energy(log: Log) -> ObservedEnergy | None:
-    found = observe_energies(log)
-    return found if found is not None and found.curves else None
-
-
-def _draw_observed(log: Log, form: FigureSize) -> Figure:
-    found = observe_energies(log)
-    assert found is not None
-    return draw_observed_energy(log, found, form)
-
-
-def _learns(log: Log) -> bool:
-    return any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
-
-
-_ReportEntry = partial(FigureEntry, in_report=True)
-
-FIGURES = {
-    "overview": FigureEntry("errors, speeds, torques and ages of a run at a glance", draw_overview),
-    "operation": FigureEntry(
-        "torque on the arms above their angles", joint_motion.draw_operation, explain_absent_operator
-    ),
-    "operator_torques": _ReportEntry(
-        "torque on the arms (Fig. 3)", joint_motion.draw_operator_torques, explain_absent_operator
-    ),
-    "positions": _ReportEntry("actual and desired angles (Fig. 4)", joint_motion.draw_positions),
-    "tracking_errors": _ReportEntry(
-        "errors, and the largest one still to come (Fig. 5)",
-        joint_motion.draw_tracking_errors,
-    ),
-    "settling": FigureEntry("size of the errors on a log axis, settling times", joint_motion.draw_settling),
-    "phase": FigureEntry("errors against their rates", joint_motion.draw_phase_portrait),
-    "parameter_estimates": _ReportEntry(
-        "estimates and true values (Fig. 6)",
-        joint_motion.draw_parameter_estimates,
-        _unless(_learns, "no estimate changed in this run"),
-    ),
-    "control_torques": FigureEntry("torque of the controllers", joint_motion.draw_control_torques),
-    "hands_moved": _ReportEntry(
-        "the log minus the same run without operators",
-        joint_motion.draw_operator_displacement,
-        _explain_no_twin,
-    ),
-    "contact": FigureEntry(
-        "force of the walls, and depth in them",
-        joint_motion.draw_contact,
-        _unless(joint_motion.sites_with_walls, "no site has a wall in this run"),
-    ),
-    "authority": FigureEntry(
-        "shares that change, and the motion of the arms",
-        joint_motion.draw_authority,
-        _unless(joint_motion.sites_with_changing_dominance, "the shares of all sites are constant"),
-    ),
-    "certificate": _ReportEntry(
-        "V, its parts, who changed it, the energy balance",
-        lambda log, form: draw_functional(log, certify(log), form),
-        _no_functional,
-    ),
-    "observed_energy": _ReportEntry(
-        "energies that the control laws declare: lines, observers, tanks",
-        _draw_observed,
-        _unless(_observed_energy, "the laws of this run declare no energies"),
-    ),
-    "twins": _ReportEntry(
-        "what became of small pushes of the run",
-        lambda log, form: draw_twins(PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form),
-        explain_no_repetition,
-    ),
-    "arms": _ReportEntry("the arms at a few instants", draw_arms),
-    "paths": _ReportEntry(
-        "paths of the end effectors in three planes",
-        joint_motion.draw_end_effector_paths,
-        _unless(lambda log: all(arm.chain for arm in log.scenario.arms.values()), "its arms are planar"),
-    ),
-    "sample_age": _ReportEntry("age of the samples in use, per link", draw_sample_age),
-    "delay_distributions": _ReportEntry(
-        "distributions of delays and ages",
-        draw_delay_distributions,
-        _unless(has_varying_delay, "every link is stated as one constant delay"),
-    ),
-    "loop_timing": _ReportEntry(
-        "lateness and computing time of the loops", draw_loop_timing, explain_missing_loop_times
-    ),
-}
+FIGURES = list_figures()
 """By name, in the order in which a paper has them."""
 
 
@@ -261,7 +133,7 @@ def write_report_figures(
     if twin is None:
         chosen.pop("hands_moved", None)
     else:
-        chosen["hands_moved"] = partial(joint_motion.draw_operator_displacement, log, twin=twin)
+        chosen["hands_moved"] = partial(draw_operator_displacement, log, twin=twin)
     if pushed is not None and "twins" in chosen:
         chosen["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
     return _write(chosen, folder, REPORT_SIZE, ["png"], progress)

@@ -21,6 +21,7 @@ from ...theory.end_pose import certify_run
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 from ..palette import SITE_COLOURS
+from .figure_entry import draws
 
 _HEIGHT_IN, _NARROW_HEIGHT_IN = 3.9, 5.6
 _DECADES = 6.0
@@ -58,6 +59,7 @@ _PANELS = (
 )
 
 
+@draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns a run in four panels, a line per site, with what the certificate says of it."""
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN

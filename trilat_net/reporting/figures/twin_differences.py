@@ -16,12 +16,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ...analysis.envelope_trend import EnvelopeTrend
-from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude
+from ...analysis.run_end import classify_log_end
+from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude, measure_twins
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
+from ...execution.log_inputs import explain_no_repetition
 from ...execution.twins import SMALLEST, TwinPath
+from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
+from .figure_entry import draws
 
 _POINTS = 150
 """Of a line, about: each is the largest of the time around it."""
@@ -64,6 +68,11 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
         plot.finish([below], [(name, line) for name, _, _, line in lines], title=style.typeset(words))
         below.set_xlim(from_s, growth.to_s)
     return plot.figure
+
+
+@draws("twins", "what became of small pushes of the run", explain_no_repetition, in_report=True)
+def _draw_pushed(log: Log, form: FigureSize) -> Figure:
+    return draw_twins(PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form)
 
 
 def _list_lines(found: PushedTwins) -> Iterator[_Line]:

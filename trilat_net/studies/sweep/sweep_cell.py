@@ -16,11 +16,11 @@ import msgspec
 import numpy as np
 
 from ...analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend
-from ...analysis.json_values import finite_or_none
 from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
 from ...execution.fused import FusedRun, RunTotals, check_fusable
+from ...results import finite_or_none
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
 

@@ -1,0 +1,87 @@
+"""A figure and a format of exports are one file each: whoever knows them knows one put beside the others."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.dropped_files import look
+from trilat_net.reporting.figures.figure_entry import draws
+from trilat_net.reporting.figures.registry import FIGURES
+
+FIGURE = """
+import numpy as np
+
+from trilat_net.reporting import style
+from trilat_net.reporting.figures.figure_entry import draws
+
+
+@draws("haste", "speeds over time", in_report=True)
+def draw_haste(log, form):
+    with style.time_figure(log, form, 2.0) as plot:
+        (axes,) = style.add_panels(plot.figure, 1, 1)[:, 0]
+        for site in log.sites:
+            axes.plot(log[site].t_s, np.abs(log[site].qd).max(axis=1))
+    return plot.figure
+"""
+FORMAT = """
+from trilat_net.reporting.export import ExportFormat
+
+
+def _write(log, path, written):
+    path.write_text(" ".join(f"{site} {len(log[site])}" for site in log.sites))
+    written(sum(len(log[site]) for site in log.sites))
+
+
+FORMAT = ExportFormat(_write, ".counts")
+"""
+LOOK = """
+import contextlib, io, json, os, sys
+from pathlib import Path
+os.environ["COLUMNS"] = "200"
+import trilat_net.reporting.exports
+import trilat_net.reporting.figures
+for room in (trilat_net.reporting.exports, trilat_net.reporting.figures):
+    room.__path__.append(sys.argv[1] + "/" + room.__name__.rsplit(".", 1)[1])
+import trilat_net as tn
+from trilat_net.cli import app
+from trilat_net.cli.options import complete_figures
+
+def run(*words):
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        app(words, standalone_mode=False)
+    return said.getvalue()
+
+path = tn.simulate("two_sites", {"duration_s": 0.1}).save("run.mcap")
+tn.report(path, "report", png=True)
+figures = json.loads(run("figure", str(path), "--list", "--json"))
+run("figure", str(path), "haste", "--format", "svg")
+print(json.dumps({
+    "figures": [row["name"] for row in figures],
+    "completed": complete_figures("ha"),
+    "drawn": [str(one) for one in sorted(Path().rglob("haste.*")) if one.suffix in (".svg", ".png")],
+    "told": json.loads(run("log", "export", str(path), "--to", "counts", "--json"))["file"],
+    "asked": tn.export(path, "counts", "mine").read_text(),
+    "help": run("log", "export", "--help"),
+}))
+"""
+
+
+def test_files_beside_the_others_are_figures_and_formats_everywhere(tmp_path: Path) -> None:
+    for name, text in {"figures/haste.py": FIGURE, "exports/counts.py": FORMAT}.items():
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text)
+    found = look(LOOK, tmp_path)
+    assert found["figures"][-1] == "haste"
+    assert found["completed"] == ["hands_moved", "haste"]
+    assert [Path(name).name for name in found["drawn"]] == ["haste.png", "haste.svg"]
+    assert found["told"] == "run.counts"
+    assert found["asked"] == "m 100 s 100"
+    assert "counts" in found["help"]
+
+
+def test_a_figure_with_two_definitions_is_refused_with_both_homes() -> None:
+    with pytest.raises(
+        ValueError, match=r"figure arms has two definitions, in .*arm_poses and .*run_overview"
+    ):
+        draws("arms", "again")(FIGURES["overview"].draw)

@@ -1,0 +1,172 @@
+"""A ROS 2 bag: standard messages at full rate, in an MCAP file of profile `ros2`.
+
+Invariant: a bag has every record once, with its numbers and times; nothing is decimated. A header's stamp is
+the nominal time of its tick, the publish time the time of sending, the log time the time of arrival.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.ticks import NS_PER_S
+from ...log.log_layout import SCENARIO, collect_provenance
+from ...log.log_reader import Log
+from ...log.mcap_writer import McapWriter
+from ...log.ros2 import cdr
+from ...log.ros2.cdr import pack_string
+from ...log.ros2.ros2_messages import (
+    FRAMES,
+    ROBOT,
+    ROBOT_CHANNELS,
+    SESSION_CHANNELS,
+    Ros2Channel,
+    Ros2SiteChannels,
+    pack_event,
+    stack_signals,
+)
+from ..export import ExportFormat, Written
+
+SOURCE_METADATA = "trilat.source"
+"""Metadata of the file: its session."""
+_QOS = """\
+- history: 1
+  depth: 10
+  reliability: 1
+  durability: 2
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+"""
+"""Reliable, volatile, the last ten: the default of publishers in ROS 2."""
+_TF = "/tf"
+"""The frames of all sites, where tools look for them."""
+_EVERY = 1000
+"""Records between two reports of progress."""
+
+
+class _TimedMessages(NamedTuple):
+    """Messages of one publish time, by topic."""
+
+    log_ns: int
+    publish_ns: int
+    messages: list[tuple[str, bytes]]
+
+
+def export_ros2(log: Log, path: Path, written: Written = lambda _: None) -> None:
+    """Writes a log as a bag that `ros2 bag` and its like play and read.
+
+    Per site, under its name: `joint_states`, `reference`, `error`, `tau_x`, `theta_hat`, `mode`, in task
+    space `end_effector` and `wrench`; its statistics `link_age`, `link_delay`, `link_offset`, `timing`; of
+    the session `/events` and `/log`. Units and names stand in the channels' metadata and in the labels of
+    dimensions. A chain has its `robot_description` and its links' frames in `/tf`.
+
+    An earlier file is replaced; `written` is called with the number of records since its last call.
+
+    Raises:
+        LogError: a message of the log cannot be read.
+        OSError: the disk refuses.
+    """
+    with path.open("wb") as stream:
+        file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2")
+        file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
+        file.add_attachment(0, 0, SCENARIO, "application/toml", log.scenario_text.encode())
+        sites = [_SiteMessages(log, name, written) for name in log.sites]
+        known = {f"/{name}": channel for name, channel in SESSION_CHANNELS.items()}
+        for site in sites:
+            known |= site.channels
+        bag = _BagChannels(file, known)
+        parts = [part for site in sites for part in (site.records(), site.statistics())]
+        for log_ns, publish_ns, messages in heapq.merge(*parts, _events(log), key=itemgetter(0)):
+            for topic, data in messages:
+                file.add_message(bag.channel(topic), log_ns, data, publish_ns)
+        file.finish()
+
+
+class _BagChannels:
+    """The channels of a bag, of all that are known by topic; each is registered with its first message."""
+
+    def __init__(self, file: McapWriter, known: dict[str, Ros2Channel]) -> None:
+        self._file, self._known = file, known
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def channel(self, topic: str) -> int:
+        """Returns the number of a channel."""
+        if topic not in self._channels:
+            kind, about = self._known[topic]
+            if kind not in self._schemas:
+                text = cdr.ROS2_SCHEMAS[kind]
+                self._schemas[kind] = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, text)
+            self._channels[topic] = self._file.register_channel(
+                topic, cdr.ENCODING, self._schemas[kind], {"offered_qos_profiles": _QOS, **about}
+            )
+        return self._channels[topic]
+
+
+class _SiteMessages:
+    """The messages of one site, on topics under its name."""
+
+    def __init__(self, log: Log, name: str, progress: Callable[[int], None]) -> None:
+        self._log, self._name, self._progress = log, name, progress
+        self._epoch_unix_ns = int(log.session.get("epoch_unix_ns", "0"))
+        self._shapes = shapes = Ros2SiteChannels(log.scenario, name)
+        self._states = cdr.JointStatePacker(shapes.joints)
+        self._reference = cdr.JointStatePacker(shapes.joints, effort=False)
+        self.channels = {
+            f"/{name}/joint_states": shapes.joint_states(shapes.joints),
+            f"/{name}/reference": shapes.joint_states(shapes.joints, effort=False),
+            **{f"/{name}/{part}": array.channel for part, array in shapes.arrays.items()},
+        }
+        if shapes.robot is not None:
+            self.channels |= {f"/{name}/{ROBOT}": ROBOT_CHANNELS[ROBOT], _TF: ROBOT_CHANNELS[FRAMES]}
+
+    def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+        return [(part if part == _TF else f"/{self._name}/{part}", data) for part, data in messages]
+
+    def records(self) -> Iterator[_TimedMessages]:
+        """Yields its records in the order of arrival."""
+        part = self._log[self._name]
+        log_ns, publish_ns = part.log_time_ns.tolist(), part.publish_time_ns.tolist()
+        for count, at in enumerate(np.argsort(part.log_time_ns, kind="stable").tolist(), 1):
+            state = part.states[at]
+            stamp_ns = max(0, self._epoch_unix_ns + state.tick * NS_PER_S // part.rate_hz)
+            row = [column[0] for column in stack_signals([state])]
+            messages = [
+                ("joint_states", self._states.pack(stamp_ns, state.q, state.qd, state.tau)),
+                *self._shapes.end_effector(state),
+                ("error", self._shapes.arrays["error"].pack(*row[self._shapes.error_row])),
+                *self._shapes.slow(row[self._shapes.slow_row]),
+            ]
+            if not self._shapes.task:
+                messages.insert(1, ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)))
+            if (robot := self._shapes.robot) is not None:
+                if count == 1:
+                    messages.append((ROBOT, pack_string(robot.description)))
+                messages.append((_TF, robot.pack(stamp_ns, state.q)))
+            yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
+            if not count % _EVERY or count == len(part):
+                self._progress((count - 1) % _EVERY + 1)
+
+    def statistics(self) -> Iterator[_TimedMessages]:
+        """Yields its statistics in the order of arrival."""
+        timed = self._log.timed_link_stats(self._name)
+        rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
+        for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
+            yield _TimedMessages(log_ns, publish_ns, self._named(self._shapes.statistics(stats)))
+
+
+def _events(log: Log) -> Iterator[_TimedMessages]:
+    timed = log.timed_events()
+    rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
+    for log_ns, publish_ns, event in rows:
+        messages = [(f"/{topic}", data) for topic, data in pack_event(event, publish_ns)]
+        yield _TimedMessages(log_ns, publish_ns, messages)
+
+
+FORMAT = ExportFormat(export_ros2, "-ros2.mcap")
