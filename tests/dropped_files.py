@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import trilat_net
+
 
 def look(program: str, folder: Path) -> Any:
     """The JSON that a program prints in its last line."""
@@ -13,3 +15,11 @@ def look(program: str, folder: Path) -> Any:
     out = subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
     assert out.returncode == 0, out.stderr
     return json.loads(out.stdout.splitlines()[-1])
+
+
+def drop(folder: Path, room: str, file: str, text: str) -> None:
+    """Puts a file beside those of a room that looks for files as it is imported: in a copy made of links."""
+    (folder / room).mkdir()
+    for one in (Path(trilat_net.__file__).parent / room).iterdir():
+        (folder / room / one.name).symlink_to(one)
+    (folder / room / file).write_text(text)

@@ -9,7 +9,9 @@ import errno
 import gc
 import inspect
 import os
+import pkgutil
 import sys
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -19,7 +21,7 @@ from ..errors import LogRefused, TrilatError
 from ..files import DISK_ERRNOS
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
-from . import inputs, log, members, options, runs, sessions, studies, sweep
+from . import options, sessions
 from .options import flag
 
 
@@ -28,6 +30,11 @@ class _Commands(TyperGroup):
 
     Its exception gets lost where Python raises it inside a `__del__`; `Interrupt` remembers the signal.
     """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Returns the names of all commands as the help has them."""
+        place = {name: n for n, name in enumerate(_FIRST)}
+        return sorted(super().list_commands(ctx), key=lambda name: place.get(name, len(place)))
 
     def invoke(self, ctx: Any) -> Any:
         """Runs a command."""
@@ -68,91 +75,47 @@ def _main(
     pass
 
 
-_SINGLE = {
-    "demo": ["paper --duration 10 --set control.Kd=5"],
-    "live": ["play", "--session paper"],
-    "site": ["m1 --scenario paper"],
-    "record": ["--session paper -o run.mcap --split-duration 600"],
-    "ping": ["--session paper"],
-    "watch": ["--session paper"],
-    "stop": ["--session paper s", "--session paper --end"],
-    "enable": ["--session paper s"],
-    "reset": ["--session paper s"],
-    "doctor": ["--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper"],
-    "router": ["--keys keys/router"],
-    "sim": ["free -o free.mcap --set link.delay_ms=400"],
-    "verify": ["run.mcap"],
-    "certify": ["run.mcap"],
-    "twin": ["run.mcap --at 12 --push m1.q1=1e-6 -o twin.png", "run.mcap --delta 1e-9:1e-3"],
-    "metrics": ["run.mcap"],
-    "compare": ["a.mcap b.mcap", "--tune free --law adaptive,p_d"],
-    "figure": ["run.mcap positions settling --width 3.5 --format pdf --out paper"],
-    "report": ["run.mcap -o report"],
-    "replay": ["run.mcap --rate 2 --start 5"],
-    "rerun": ["run.mcap --replace s --set control.Kd=5 -o kd5.mcap"],
+_FIRST = (
+    "demo", "live", "site", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router", "sim",
+    "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay", "rerun", "log", "test",
+    "sweep", "bench", "linear",
+)  # fmt: skip
+"""The order of the help; others follow."""
+_GROUPS: dict[str, dict[str, Any]] = {
+    "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
+    "scenario": {"help": "The shipped scenarios and your own."},
+    "new": {"help": "A control law of your own, with its test."},
+    "trace": {"help": "Imports delays that other programs measured."},
+    "set": {"callback": options.spread(sessions.set_command)},
+    "keys": {"help": "Keys that authenticate members of a session, and sign logs."},
 }
-_LOG = {
-    "info": ["run.mcap"],
-    "check": ["run.mcap", "run.mcap --key lab.pub"],
-    "sign": ["run.mcap --key lab.key"],
-    "recover": ["run.mcap.active"],
-    "export": ["run.mcap --to parquet"],
-    "view": ["run.mcap"],
-}
-_STUDIES = {
-    "test": ["jitter --seeds 1..20 --junit out.xml"],
-    "sweep": [
-        "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
-        "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
-        "runs/sweep-p_d_margin-001 --cell 17",
-    ],
-    "bench": ["--small", "--study round-trips --law wave,smith"],
-    "linear": ["p_d_margin --set control.d=0.9 --over control.d=0.1:3"],
-}
-_SCENARIO = {"list": [""], "show": ["paper --set control.Kd=5"], "check": ["mine.toml"], "new": ["mine.toml"]}
-_NEW = {"law": ["mylaw.py"]}
-_TRACE = {"import": ["irtt run.json.gz", "csv drive.txt --way half -o drive.csv"]}
-_SET = {"link": ["'m1->s' --delay 350ms --loss 5%"], "dominance": ["s m1=0.9 m2=0.1"]}
-_KEYS = {
-    "new": ["keys m1 m2 s recorder operator --host 192.0.2.1"],
-    "pair": ["lab"],
-    "info": ["keys/m1"],
-}
-
-_MODULES = (sessions, members, runs, log, studies, sweep, inputs)
-_FUNCTIONS = {name: run for module in _MODULES for name, run in vars(module).items()}
+_WITHIN = {"set": "--session paper "}
+"""What examples of a group have before the name of a command."""
 
 
-def _group(examples: dict[str, list[str]], words: str = "", **more: Any) -> typer.Typer:
-    """Returns a group of commands: by name the arguments of their examples, which follow `words`.
-
-    The function of a command `log info` is `log_info_command`, that of `ping` is `ping_command`.
-    """
-    group = typer.Typer(**more)
-    for name, arguments in examples.items():
-        run = _FUNCTIONS[f"{'_'.join([*words.split()[:1], name])}_command"]
-        epilog = "\n\n".join(f"Example: trilat {words}{name} {one}".rstrip() for one in arguments)
-        text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
-        paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
-        text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
-        group.command(name, help=text, epilog=epilog)(options.spread(run))
-    return group
+def _add_command(group: typer.Typer, words: str, run: Any) -> None:
+    """Adds a command: `words` stand before the arguments of its examples."""
+    epilog = "\n\n".join(f"Example: trilat {words} {one}".rstrip() for one in run.examples)
+    text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
+    paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
+    text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
+    group.command(words.split()[-1], help=text, epilog=epilog)(options.spread(run))
 
 
-def _add(name: str, examples: dict[str, list[str]], words: str = "", **more: Any) -> None:
-    """Adds a group of commands to `trilat`; `words` follow its name in their examples."""
-    app.add_typer(_group(examples, f"{name} {words}", no_args_is_help=True, **more), name=name)
+def _add_commands() -> None:
+    """Adds the commands of every file of this folder: `log_info_command` is `trilat log info`."""
+    groups = {name: typer.Typer(no_args_is_help=True, **more) for name, more in _GROUPS.items()}
+    for file in pkgutil.iter_modules(__path__):
+        for name, run in vars(import_module(f"{__name__}.{file.name}")).items():
+            if hasattr(run, "examples"):
+                first, _, rest = name.removesuffix("_command").partition("_")
+                within = f"{first} {_WITHIN.get(first, '')}{rest}"
+                _add_command(groups[first] if rest else app, within if rest else first, run)
+    for name, group in groups.items():
+        app.add_typer(group, name=name)
 
 
-app.add_typer(_group(_SINGLE))
-_add("log", _LOG, help="Inspects, checks, signs, recovers, exports or views a log.")
-app.add_typer(_group(_STUDIES))
-_add("scenario", _SCENARIO, help="The shipped scenarios and your own.")
-_add("new", _NEW, help="A control law of your own, with its test.")
-_add("trace", _TRACE, help="Imports delays that other programs measured.")
-_add("set", _SET, "--session paper ", callback=options.spread(sessions.set_command))
-_add("keys", _KEYS, help="Keys that authenticate members of a session, and sign logs.")
-
+_add_commands()
 
 _TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
 _WITHOUT_MEMORY = ("failed to map segment", "libllvmlite", "start new thread", "allocate memory")

@@ -13,6 +13,7 @@ from . import options
 from .options import value
 
 
+@options.command("")
 def scenario_list_command(as_json: options.JsonOption = False) -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario
@@ -28,6 +29,7 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
     return terminal.print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
 
 
+@options.command("paper --set control.Kd=5")
 def scenario_show_command(
     name: options.ScenarioArgument,
     duration: options.DurationOption = None,
@@ -38,6 +40,7 @@ def scenario_show_command(
     sys.stdout.write(options.load_chosen_scenario(name, overrides, duration, seed).text)
 
 
+@options.command("mine.toml")
 def scenario_check_command(
     file: options.ScenarioArgument,
     overrides: options.SetOption = None,
@@ -58,6 +61,7 @@ def scenario_check_command(
     return None
 
 
+@options.command("mine.toml")
 def scenario_new_command(
     file: Annotated[Path, typer.Argument(help="File to write.")], force: options.ForceOption = False
 ) -> None:
@@ -68,6 +72,7 @@ def scenario_new_command(
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
+@options.command("mylaw.py")
 def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, as in mylaw.py.")],
     force: options.ForceOption = False,
@@ -84,6 +89,7 @@ def new_law_command(
     terminal.print_text(f"  pytest {test.name}")
 
 
+@options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")
 def trace_import_command(
     form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
     file: Annotated[
@@ -118,6 +124,7 @@ def trace_import_command(
     terminal.print_line(f"{place}: use it with --set link.model=trace --set link.file={place}")
 
 
+@options.command("keys m1 m2 s recorder operator --host 192.0.2.1")
 def keys_new_command(
     folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
     members: Annotated[
@@ -148,6 +155,7 @@ def keys_new_command(
     )
 
 
+@options.command("lab")
 def keys_pair_command(
     name: Annotated[Path, typer.Argument(help="Makes NAME.key and NAME.pub.", metavar="NAME")],
 ) -> None:
@@ -162,6 +170,7 @@ def keys_pair_command(
     terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
 
 
+@options.command("keys/m1")
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,

@@ -12,6 +12,7 @@ from . import options
 _LOSSY_EXIT_CODE = 3
 
 
+@options.command("run.mcap")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
     from ..analysis.file_overview import FileOverview, describe_files
@@ -23,6 +24,7 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
         terminal.warn_if_unfinished(path)
 
 
+@options.command("run.mcap", "run.mcap --key lab.pub")
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
@@ -53,6 +55,7 @@ def log_check_command(
     raise typer.Exit(found.exit_code)
 
 
+@options.command("run.mcap --key lab.key")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[Path, options.value("--key", "KEY", "Private key, made by trilat keys pair.")],
@@ -74,6 +77,7 @@ def log_sign_command(
         terminal.print_text(f"{made}: signs {file}")
 
 
+@options.command("run.mcap.active")
 def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
@@ -97,6 +101,7 @@ def log_recover_command(
         raise typer.Exit(_LOSSY_EXIT_CODE)
 
 
+@options.command("run.mcap --to parquet")
 def log_export_command(
     files: options.LogsArgument,
     form: Annotated[
@@ -129,6 +134,7 @@ def log_export_command(
         terminal.print_text(f"{exporter.path}: {sum(records.values())} records of {', '.join(records)}")
 
 
+@options.command("run.mcap")
 def log_view_command(
     files: options.LogsArgument,
     full: Annotated[

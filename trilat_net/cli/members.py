@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
+@options.command("m1 --scenario paper")
 def site_command(
     name: Annotated[
         str, typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites)
@@ -115,6 +116,7 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
     return tuple(without)
 
 
+@options.command("--session paper -o run.mcap --split-duration 600")
 def record_command(
     session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
@@ -226,6 +228,7 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
 _MIB = 1 << 20
 
 
+@options.command("run.mcap --rate 2 --start 5")
 def replay_command(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
@@ -427,6 +430,7 @@ def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
 LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
 
 
+@options.command("--keys keys/router")
 def router_command(
     listen: Annotated[
         list[str] | None,

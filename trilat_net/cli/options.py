@@ -6,7 +6,7 @@ from enum import StrEnum
 from functools import wraps
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ..net.connection import Connection
     from ..results import Result
     from ..scenario import Scenario
+
+Runs = TypeVar("Runs", bound=Callable[..., None])
 
 
 def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackParam, float | None], Any]:
@@ -50,6 +52,16 @@ def flag(names: str, text: str, **more: Any) -> Any:
 def seconds(name: str, text: str) -> Any:
     """Returns an option that takes a waiting time, s, with its help."""
     return value(name, "S", text, callback=check_seconds)
+
+
+def command(*examples: str) -> Callable[[Runs], Runs]:
+    """Declares a command of the program, with the arguments of its examples."""
+
+    def declare(run: Runs) -> Runs:
+        run.examples = examples  # type: ignore[attr-defined]
+        return run
+
+    return declare
 
 
 def complete_scenarios(incomplete: str) -> list[str]:

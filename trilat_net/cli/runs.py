@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..theory import LinearAnalysis
 
 
+@options.command("free -o free.mcap --set link.delay_ms=400")
 def sim_command(
     scenario: options.ScenarioArgument,
     output: Annotated[Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
@@ -59,6 +60,7 @@ def sim_command(
         raise typer.Exit(1)
 
 
+@options.command("run.mcap")
 def verify_command(
     files: options.LogsArgument,
     virtual: Annotated[
@@ -95,6 +97,7 @@ def verify_command(
     raise typer.Exit(result.exit_code)
 
 
+@options.command("run.mcap")
 def certify_command(
     files: options.LogsArgument,
     accept: options.AcceptOption = None,
@@ -130,6 +133,7 @@ _PUSHED = (
 )
 
 
+@options.command("run.mcap --at 12 --push m1.q1=1e-6 -o twin.png", "run.mcap --delta 1e-9:1e-3")
 def twin_command(
     files: options.LogsArgument,
     at_s: Annotated[float, value("--at", "S", "The instant of the push, s.")] = 0.0,
@@ -166,6 +170,7 @@ def twin_command(
     options.print_drawn(found, picture, draw, as_json=as_json)
 
 
+@options.command("run.mcap")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
 
@@ -178,6 +183,7 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
     terminal.print_result(compute_log_metrics(log), as_json=as_json)
 
 
+@options.command("run.mcap positions settling --width 3.5 --format pdf --out paper")
 def figure_command(
     file: options.LogArgument,
     names: Annotated[
@@ -252,6 +258,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
             terminal.out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)
 
 
+@options.command("run.mcap -o report")
 def report_command(
     files: options.LogsArgument,
     folder: Annotated[Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")] = None,
@@ -274,6 +281,7 @@ def report_command(
     raise typer.Exit(conclusion.exit_code)
 
 
+@options.command("run.mcap --replace s --set control.Kd=5 -o kd5.mcap")
 def rerun_command(
     files: options.LogsArgument,
     replace: Annotated[
@@ -327,6 +335,7 @@ def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
 LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
 
 
+@options.command("p_d_margin --set control.d=0.9 --over control.d=0.1:3")
 def linear_command(
     scenario: options.ScenarioArgument,
     overrides: options.SetOption = None,

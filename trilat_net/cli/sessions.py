@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
+@options.command("paper --duration 10 --set control.Kd=5")
 def demo_command(
     scenario: options.ScenarioArgument = "paper",
     *,
@@ -60,6 +61,7 @@ def run_and_report(
         raise typer.Exit(outcome.exit_code)
 
 
+@options.command("play", "--session paper")
 def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
@@ -114,6 +116,7 @@ def _check_count(value: int) -> int:
     return value
 
 
+@options.command("--session paper")
 def ping_command(
     context: typer.Context,
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
@@ -243,6 +246,7 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
         raise typer.Exit(interrupt.exit_code)
 
 
+@options.command("--session paper")
 def watch_command(
     session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
@@ -279,6 +283,7 @@ def _print_answers(answers: list[str]) -> None:
         terminal.print_text(text)
 
 
+@options.command("--session paper s", "--session paper --end")
 def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
@@ -298,6 +303,7 @@ def stop_command(
     _print_answers(running.end() if end else running.stop(*(sites or ())))
 
 
+@options.command("--session paper s")
 def enable_command(
     session: SessionOption,
     sites: SitesArgument = None,
@@ -308,6 +314,7 @@ def enable_command(
     _print_answers(_find(session, reach).enable(*(sites or ())))
 
 
+@options.command("--session paper s")
 def reset_command(
     session: SessionOption,
     sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="The sites in fault.")],
@@ -369,6 +376,7 @@ def set_command(
     context.obj = name, reach.resolve()
 
 
+@options.command("'m1->s' --delay 350ms --loss 5%")
 def set_link_command(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
@@ -395,6 +403,7 @@ def set_link_command(
     _send_change(context, receiver, {"link": name, "to": table})
 
 
+@options.command("s m1=0.9 m2=0.1")
 def set_dominance_command(
     context: typer.Context,
     site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
@@ -424,6 +433,7 @@ def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> No
     terminal.print_text(reply.text)
 
 
+@options.command("--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper")
 def doctor_command(
     *,
     ways: options.MemberOptions,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 MAX_SEEDS = 100_000
 
 
+@options.command("jitter --seeds 1..20 --junit out.xml")
 def test_command(
     scenarios: Annotated[
         list[str] | None,
@@ -218,6 +219,7 @@ def _run_tuning(
 _option = partial(value, rich_help_panel="Tune laws")
 
 
+@options.command("a.mcap b.mcap", "--tune free --law adaptive,p_d")
 def compare_command(
     context: typer.Context,
     files: Annotated[
@@ -314,6 +316,7 @@ def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bo
         raise
 
 
+@options.command("--small", "--study round-trips --law wave,smith")
 def bench_command(
     study: Annotated[str, value("--study", "full|small|round-trips", "Part of the suite to run.")] = "full",
     small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,

@@ -198,6 +198,11 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     return None
 
 
+@options.command(
+    "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
+    "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
+    "runs/sweep-p_d_margin-001 --cell 17",
+)
 def sweep_command(
     context: typer.Context,
     scenario: Annotated[

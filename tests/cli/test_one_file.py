@@ -1,0 +1,82 @@
+"""A command, and the study behind it, are one file: the program knows one that was put beside the others."""
+
+from pathlib import Path
+
+from tests.dropped_files import drop, look
+
+STUDY = '''
+"""How far the slave lags for each seed, kept in a journal."""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from ..reporting import terminal_output as terminal
+from ..reporting.text_table import TextTable
+from ..studies.executor import open_worker_pool
+from ..studies.study_folder import RunJournal
+from . import options
+
+
+class Lag(msgspec.Struct, frozen=True):
+    """The lag of one seed."""
+
+    cell: str
+    seed: int
+    rms_error_rad: float
+
+
+def measure_lag(item):
+    """Measures one seed."""
+    from .. import metrics, simulate
+
+    scenario, seed = item
+    found = metrics(simulate(scenario, {"duration_s": 0.2}, seed=seed))
+    return Lag(scenario, seed, found.sites["s"]["rms_error_rad"].value)
+
+
+@options.command("paper --seeds 3")
+def lag_command(
+    scenario: options.ScenarioArgument,
+    seeds: Annotated[int, options.value("--seeds", "N", "How many.")] = 3,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Measures how far the slave lags, seed by seed."""
+    with RunJournal(Path("lag.jsonl"), scenario, Lag, "make room") as journal, open_worker_pool(1) as pool:
+        left = [(scenario, seed) for seed in range(seeds) if (scenario, seed) not in journal.done]
+        journal.complete(pool, measure_lag, left, seeds - len(left), seeds, lambda *_: None)
+        rows = {str(one.seed): one.rms_error_rad for one in journal.done.values()}
+    terminal.print_json({"made": len(left), "rows": rows})
+'''
+LOOK = """
+import contextlib, io, json, os, sys
+os.environ["COLUMNS"] = "200"
+import trilat_net
+trilat_net.__path__.insert(0, sys.argv[1])
+from trilat_net.cli import app
+
+def run(*words):
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        app(words, standalone_mode=False)
+    return said.getvalue()
+
+print(json.dumps({
+    "listed": run("--help"),
+    "help": run("lag", "--help"),
+    "first": json.loads(run("lag", "two_sites", "--seeds", "2", "--json")),
+    "again": json.loads(run("lag", "two_sites", "--seeds", "3", "--json")),
+}))
+"""
+
+
+def test_a_file_beside_the_others_is_a_command_and_its_study(tmp_path: Path) -> None:
+    drop(tmp_path, "cli", "lag.py", STUDY)
+    found = look(LOOK, tmp_path)
+    assert "Measures how far the slave lags, seed by seed." in found["listed"]
+    assert "Example: trilat lag paper --seeds 3" in found["help"]
+    assert found["first"]["made"] == 2
+    assert found["again"]["made"] == 1  # the journal has the others
+    assert set(found["first"]["rows"]) < set(found["again"]["rows"]) == {"0", "1", "2"}
