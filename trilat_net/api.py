@@ -286,6 +286,7 @@ def sweep(
     duration_s: float | None = None,
     longest_s: float | None = None,
     judge: str = "verdict",
+    metrics: Sequence[str] = (),
     out: str | Path | None = None,
     jobs: int | None = None,
     on: "Workers" = None,
@@ -306,6 +307,7 @@ def sweep(
         duration_s: how long a cell runs at first, s.
         longest_s: how long at most, s; by default eight times that, or just that if twins judge.
         judge: "twins" measures the growth exponent of every cell besides its verdict.
+        metrics: keys of docs/metrics.md that are measured of every run besides; columns of the rows.
         out: folder of the results; a sweep in it is continued. By default the next free runs/sweep-NAME-N.
         jobs: how many processes; None for one per core.
         on: what runs the cells instead: a Dask scheduler's address or an executor.
@@ -319,7 +321,8 @@ def sweep(
 
     require_polars()
     texts = _texts(set, duration_s)
-    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, laws=laws, longest_s=longest_s, judge=judge)
+    more: dict[str, Any] = {"laws": laws, "longest_s": longest_s, "judge": judge, "metrics": metrics}
+    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, **more)
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results
 

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -38,8 +38,9 @@ def _check_modes(given: Sequence[str]) -> Sequence[str]:
         raise UsageError("--width is of a map: use it with --map")
     if "--tolerance" in given and "--margin" not in given:
         raise UsageError("--tolerance is of an edge: use it with --margin")
-    if "--judge" in given and "--margin" in given:
-        raise UsageError("--judge is of a sweep and its map: leave --margin out")
+    for name in ("--judge", "--metric"):
+        if name in given and "--margin" in given:
+            raise UsageError(f"{name} is of a sweep and its map: leave --margin out")
     return given
 
 
@@ -240,6 +241,10 @@ def sweep_command(
             "What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.",
         ),
     ] = "verdict",
+    metric: Annotated[
+        list[str] | None,
+        value("--metric", "KEY", "Measure this of every run besides (docs/metrics.md); repeatable."),
+    ] = None,
     output: Annotated[
         Path | None,
         value(
@@ -314,8 +319,8 @@ def sweep_command(
         within = None if margin is None else parse_search_range(margin, tolerance)
         axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
         laws, texts = options.split_names(law), options.list_overrides(overrides, duration)
-        count = parse_seed_count(seeds)
-        asked = plan_sweep(scenario, texts, over=axes, seeds=count, laws=laws, longest_s=longest, judge=judge)
+        more: dict[str, Any] = {"longest_s": longest, "judge": judge, "metrics": metric or ()}
+        asked = plan_sweep(scenario, texts, over=axes, seeds=parse_seed_count(seeds), laws=laws, **more)
         if within is not None:
             return _search_margins(asked, within, output, jobs, on, as_json=as_json)
         with terminal.lines_aside(as_json):
@@ -355,7 +360,17 @@ def _show_results(
 
 def _refuse_beside_results(given: Sequence[str]) -> None:
     """Refuses options that a sweep was planned with where it is finished or continued."""
-    for name in ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--set", "--duration"):
+    for name in (
+        "--over",
+        "--seeds",
+        "--law",
+        "-o",
+        "--longest",
+        "--judge",
+        "--metric",
+        "--set",
+        "--duration",
+    ):
         if name in given:
             raise UsageError(f"{name} is of the sweep already: leave it out")
     if "--margin" in given:

@@ -6,7 +6,8 @@ import pytest
 
 import trilat_net
 from tests.dropped_files import look
-from trilat_net.analysis.metrics.measures import Quantity, list_measures, measures
+from trilat_net.analysis.metrics.log_metrics import find_quantity
+from trilat_net.analysis.metrics.measures import list_measures, measures
 from trilat_net.analysis.run_view import RunView
 
 METRIC = """
@@ -28,11 +29,13 @@ log = tn.simulate("free", {"duration_s": 0.5})
 found = tn.metrics(log)
 asked = {"duration_s": 0.5, "expect": {"metrics": {"haste_rad_s": [0.0, 10.0]}}}
 (trial,) = tn.trials("free", set=asked)
+swept = tn.sweep("free", ["link.delay_ms=20"], asked, metrics=["haste_rad_s"], out="o", jobs=1)
 print(json.dumps({
     "json": found.to_dict()["sites"]["s"]["haste_rad_s"],
     "text": found.summary(),
     "frame": [row["key"] for row in found.to_rows()],
     "compared": tn.compare(log, log).metrics.row("haste_rad_s").values,
+    "swept": swept.rows[0]["haste_rad_s"],
     "expected": [[one.key, one.held] for one in trial.check().outcomes],
 }))
 """
@@ -44,6 +47,7 @@ def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None
     assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
     assert "mean |qd|" in found["text"]
     assert "haste_rad_s" in found["frame"]
+    assert 0.0 < found["swept"] != found["compared"][0]
     assert ["metrics.haste_rad_s", True] in found["expected"]
 
 
@@ -54,7 +58,7 @@ def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
     with pytest.raises(
         ValueError, match=r"rms_error_rad has two definitions, in .*motion_metrics and .*test"
     ):
-        measures("site", "twice", Quantity("rms_error_rad", "again"))(measure_again)  # type: ignore[arg-type]
+        measures("site", "twice", find_quantity("rms_error_rad"))(measure_again)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["free", "contact"])

@@ -649,6 +649,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
         words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
     words += ["--law", ",".join(plan.laws)] if plan.laws else []
     words += ["--judge", plan.judge] if plan.judge != "verdict" else []
+    words += [word for key in plan.metrics for word in ("--metric", key)]
     if plan.longest_s != plan.default_longest_s:
         words += ["--longest", format_override_value(plan.longest_s)]
     return format_command("sweep", plan.written.called, *words, *more)

@@ -273,6 +273,8 @@ class CellRun(msgspec.Struct, frozen=True):
         random: whether another seed would be another run.
         law: the laws of its sites, each once.
         scenario: its canonical text, as what differs from that of the experiment.
+        metrics: those that the plan asks for besides, over the duration of the scenario; None of what the run
+            has no number for.
     """
 
     cell: int
@@ -282,3 +284,4 @@ class CellRun(msgspec.Struct, frozen=True):
     sha256: str
     scenario: LineDiff
     outcome: CellResult
+    metrics: dict[str, float | None] = {}

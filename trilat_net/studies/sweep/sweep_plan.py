@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...analysis.metrics.log_metrics import find_quantity
 from ...errors import ScenarioError, UsageError
 from ...fields import is_number, suggest_nearest
 from ...scenario import Scenario, apply_overrides
@@ -215,6 +216,7 @@ class SweepPlan(NamedTuple):
         seeds: of the runs of a cell in which anything is random; in others the first alone is run.
         longest_s: how long a cell may be extended, s.
         judge: of `JUDGES`.
+        metrics: keys of `docs/metrics.md` that are measured of every run besides.
     """
 
     written: ExperimentText
@@ -225,6 +227,7 @@ class SweepPlan(NamedTuple):
     seeds: tuple[int, ...]
     longest_s: float
     judge: str = "verdict"
+    metrics: tuple[str, ...] = ()
 
     @property
     def default_longest_s(self) -> float:
@@ -281,6 +284,7 @@ class SweepPlan(NamedTuple):
             "scenario_sha256": self.base.sha256,
             "text": self.written.text,
             **({} if self.judge == "verdict" else {"judge": self.judge}),
+            **({"metrics": list(self.metrics)} if self.metrics else {}),
         }
 
 
@@ -293,6 +297,7 @@ def plan_sweep(
     laws: Sequence[str | type] = (),
     longest_s: float | None = None,
     judge: str = "verdict",
+    metrics: Sequence[str] = (),
 ) -> SweepPlan:
     """Returns a sweep, checked and ready to run.
 
@@ -307,6 +312,7 @@ def plan_sweep(
         longest_s: how long an undecided cell may be extended, s; by default eight times its duration, and
             not at all if twins judge.
         judge: "twins" measures besides the growth exponent of every cell, and maps are drawn of that.
+        metrics: keys of `docs/metrics.md`: what is measured of every whole run besides.
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
@@ -326,7 +332,9 @@ def plan_sweep(
     forced = {law: _law_overrides(written, texts, base, law) for law in chosen}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
-    plan = SweepPlan(written, texts, base, axes, forced, _seeds(seeds, base.seed), 0.0, judge)
+    plan = SweepPlan(
+        written, texts, base, axes, forced, _seeds(seeds, base.seed), 0.0, judge, _list_metrics(metrics)
+    )
     if longest_s is None:
         longest_s = plan.default_longest_s
     elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
@@ -351,8 +359,21 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     base = allow_own_laws(written.load(texts))
     axes = tuple(map(parse_axis, facts["over"]))
     forced = {law: _law_overrides(written, texts, base, law) for law in facts["laws"]}
-    judge = facts.get("judge", "verdict")
-    return SweepPlan(written, texts, base, axes, forced, tuple(facts["seeds"]), facts["longest_s"], judge)
+    more = (facts["longest_s"], facts.get("judge", "verdict"), tuple(facts.get("metrics", ())))
+    return SweepPlan(written, texts, base, axes, forced, tuple(facts["seeds"]), *more)
+
+
+def _list_metrics(asked: Sequence[str]) -> tuple[str, ...]:
+    """Returns the metrics that are asked for, each once.
+
+    Raises:
+        UsageError: there is no such metric.
+    """
+    keys = [asked] if isinstance(asked, str) else asked
+    try:
+        return tuple(dict.fromkeys(find_quantity(key).key for key in keys))
+    except KeyError as error:
+        raise UsageError(f"--metric: {error.args[0]}") from None
 
 
 def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:

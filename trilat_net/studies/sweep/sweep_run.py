@@ -25,8 +25,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from ...analysis.metrics.log_metrics import find_quantity, measure_whole
 from ...errors import ScenarioError, UsageError
 from ...execution.fused import RunTotals
+from ...execution.virtual import simulate_scenario
 from ...files import import_extra, make_results_folder, write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
@@ -48,8 +50,9 @@ _PLAN_KEY = "trilat_net.sweep"
 _ROWS_OF_A_GROUP = 16_384
 
 ResultRow = Mapping[str, Any]
-"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, every field of `CellResult`,
-`scenario_sha256`, `command` and `scenario`, its canonical text. Verdict and motion are their words."""
+"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, the metrics that were asked for
+under their keys, every field of `CellResult`, `scenario_sha256`, `command` and `scenario`, its canonical
+text. Verdict and motion are their words."""
 
 
 def require_polars() -> Any:
@@ -117,6 +120,7 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
                 "law": entry.law,
                 "seed": entry.seed,
                 "random": entry.random,
+                **entry.metrics,
                 **msgspec.to_builtins(entry.outcome),
                 "scenario_sha256": entry.sha256,
                 "command": build_sim_command(plan, cell.overrides, entry.seed, lasts_s, log),
@@ -153,7 +157,7 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
         UsageError: polars is not installed.
     """
     kinds = {**_kinds_of_axes(plan), "seed": int, "random": bool}
-    kinds |= dict.fromkeys(CellResult.__struct_fields__, float)
+    kinds |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
     kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command", "scenario"), str)
     plan_text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
     options = {"row_group_size": _ROWS_OF_A_GROUP, "metadata": {_PLAN_KEY: plan_text}}
@@ -195,8 +199,6 @@ def read_results(path: Path) -> SweepResults:
 
 
 GRID_POINTS_FILE = "places.parquet"
-RUN_TOTALS = RunTotals._fields
-"""The numbers of a run that are averaged over its seeds."""
 
 
 class GridPoint(NamedTuple):
@@ -205,15 +207,15 @@ class GridPoint(NamedTuple):
     Attributes:
         cell, law, values: its place.
         counts: how many runs came to each class, in the order of `CellClass`.
-        means: of each of `RUN_TOTALS` its mean over the runs that stayed within their limits; None of fewer
-            than two runs.
+        means: of each number of a run that `list_totals` names its mean over the runs that stayed within
+            their limits; None of fewer than two runs.
     """
 
     cell: int
     law: str
     values: tuple[float | str, ...]
     counts: tuple[int, ...]
-    means: tuple[MeanInterval | None, ...] = (None,) * len(RUN_TOTALS)
+    means: tuple[MeanInterval | None, ...] = ()
 
     @property
     def decided(self) -> int:
@@ -236,16 +238,21 @@ class GridPoint(NamedTuple):
         return wilson_interval(self.stable, self.decided)
 
 
+def list_totals(plan: SweepPlan) -> list[str]:
+    """Returns the keys of the numbers of a run that are averaged over its seeds."""
+    return list(dict.fromkeys((*RunTotals._fields, *plan.metrics)))
+
+
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     """Returns every grid point of a sweep, in the order of the cells."""
     rows_of: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
         rows_of.setdefault((row["cell"], row["law"]), []).append(row)
-    points = []
+    points, totals = [], list_totals(results.plan)
     for (cell, law), rows in rows_of.items():
         counts = Counter(row["verdict"] for row in rows)
         kept = [row for row in rows if row["diverged_s"] is None]
-        means = tuple(mean_interval([row.get(key) for row in kept]) for key in RUN_TOTALS)
+        means = tuple(mean_interval([row.get(key) for row in kept]) for key in totals)
         values = results.plan.cell(cell).values
         points.append(GridPoint(cell, law, values, tuple(counts[one.value] for one in CellClass), means))
     return points
@@ -259,7 +266,9 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
     """
     kinds = _kinds_of_axes(plan) | dict.fromkeys(("runs", *(one.value for one in CellClass)), int)
     kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
-    kinds |= dict.fromkeys((f"{key}_{word}" for key in RUN_TOTALS for word in MeanInterval._fields), float)
+    kinds |= dict.fromkeys(
+        (f"{key}_{word}" for key in list_totals(plan) for word in MeanInterval._fields), float
+    )
     rows = []
     for one in found:
         low, high = one.interval
@@ -312,9 +321,10 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
         yield f"{len(extended)} were undecided after {first_s:g} s {continued}"
     kept = [row for row in rows if row["diverged_s"] is None]
     ranges = []
-    for key, (name, unit) in _TOTALS.items():
+    asked = {one.key: (one.name, one.unit) for one in map(find_quantity, results.plan.metrics)}
+    for key, (name, unit) in {**asked, **_TOTALS}.items():
         values = [row[key] for row in kept if row.get(key) is not None]
-        ranges += [f"{name} {min(values):.3g} to {max(values):.3g} {unit}"] if values else []
+        ranges += [f"{name} {min(values):.3g} to {max(values):.3g} {unit}".rstrip()] if values else []
     if ranges:
         yield f"within their limits {len(kept)}: {', '.join(ranges)}"
     found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
@@ -390,6 +400,7 @@ _DIFFERENCES = {
     "seeds": "other seeds",
     "longest_s": "another longest time",
     "judge": "another judge",
+    "metrics": "other metrics",
     "arithmetic": "another kind of arithmetic",
     "versions": "another version of the program",
 }
@@ -446,7 +457,7 @@ def open_sweep_folder(path: Path, asked: SweepPlan | None = None) -> SweepFolder
 
 
 def _shown(key: str, facts: Mapping[str, Any]) -> str:
-    value = facts.get(key, JUDGES[0])
+    value = facts.get(key, JUDGES[0] if key == "judge" else [])
     if key in ("text", "scenario_sha256"):
         digest = hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
         return f"{facts.get('name')} (sha256 {digest[:12]})"
@@ -468,7 +479,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    needed = {"source", "folder", "name", *_DIFFERENCES} - {"judge"}  # older plans name none
+    needed = {"source", "folder", "name", *_DIFFERENCES} - {"judge", "metrics"}  # older plans name none
     if not isinstance(facts, dict) or not needed <= facts.keys():
         raise UsageError(f"{file}: is no plan of a sweep")
     return facts
@@ -545,9 +556,13 @@ def run_cell(task: CellItem) -> CellRun:
     outcome = sweep_cell.classify_cell(scenario.text, max(plan.longest_s, scenario.duration_s))
     if plan.judge == "twins":
         outcome = msgspec.structs.replace(outcome, exponent_per_s=sweep_cell.measure_exponent(scenario))
+    metrics: dict[str, float | None] = {}
+    if further := [key for key in plan.metrics if key not in CellResult.__struct_fields__]:
+        measured = measure_whole(simulate_scenario(scenario), further)
+        metrics = {key: measured[key].value for key in further}
     laws = ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
     text = sweep_cell.diff_lines(scenario.text, plan.base.text)
-    return CellRun(cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome)
+    return CellRun(cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome, metrics)
 
 
 def estimate_sweep(
