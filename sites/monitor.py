@@ -4,7 +4,6 @@ A terminal shows a table that is refreshed; other outputs get the same rows as l
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 from rich.box import HEAVY
@@ -17,14 +16,12 @@ from rich.text import Text
 
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
-from trilat_net.errors import WireError
 from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import read_events, read_messages
+from trilat_net.net.membership import read_events, read_messages, read_records
 from trilat_net.net.messages import LinkStats, State
-from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario
 
 AGES = "age of each peer's sample"
@@ -161,10 +158,8 @@ class SessionMonitor:
             if event.kind in LOUD_EVENTS:
                 self._display.say(event.text)
         for name, states in self._states.items():
-            if (message := states.poll()) is not None:
-                with suppress(WireError):
-                    *_, last = split_states(message[1])
-                    self.records[name] = decode(last, State, layout=scenario.layout(name))
+            for record in read_records(states, scenario.layout(name)):
+                self.records[name] = record
         if self._display.due:
             known = [(name, self.records.get(name), self.latest.get(name)) for name in scenario.names]
             rows = [describe_site(scenario, *one) for one in known]

@@ -28,9 +28,9 @@ from trilat_net.net.discovery import (
     find_site_info,
     send_change,
 )
+from trilat_net.net.membership import read_records
 from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
-from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators import find_live_hand
@@ -117,8 +117,7 @@ class RunningSession:
             rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or ("*",)]
 
             def take() -> list[State]:
-                payloads = (message[1] for ring in rings for message in iter(ring.poll, None))
-                return [decode(one, State) for payload in payloads for one in split_states(payload)]
+                return [record for ring in rings for record in read_records(ring)]
 
             yield take
 

@@ -11,8 +11,11 @@ from typing import ClassVar
 
 _OPTION = re.compile(r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?")
 _SWITCHES = ("--force", "--insecure", "--full", "--closed-loop")
-_ARGUMENTS = {"-o": "out", "--resume": "the same out", "--duration": "duration_s", "--longest": "longest_s"}
-_ARGUMENTS |= {"--law": "laws", "--margin": "along", "--gravity": "gravity_percent", "--at": "at_s"}
+_ARGUMENTS = {
+    "-o": "out", "--resume": "the same out", "--duration": "duration_s", "--longest": "longest_s",
+    "--law": "laws", "--metric": "metrics", "--margin": "along", "--gravity": "gravity_percent",
+    "--at": "at_s",
+}  # fmt: skip
 """Arguments in Python that are not called as their options."""
 
 

@@ -59,7 +59,7 @@ def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
 
 def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
     done = trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder)
-    done.refuses("--to", "xlsx", "ros2, parquet, csv")
+    done.refuses("--to", "xlsx", "csv, mat, npz, parquet, ros2")
     assert [path.name for path in folder.iterdir()] == ["run.mcap"]
 
 

@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
+from trilat_net.net.bus import BoundedRing
+from trilat_net.net.membership import read_records
 from trilat_net.net.messages import (
     MOST_PEERS,
     READABLE,
@@ -392,3 +394,11 @@ def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
     )
     done = subprocess.run([sys.executable, "-OO", "-c", program], capture_output=True, check=True)
     assert json.loads(done.stdout) == [json_schema(kind) for kind in kinds]
+
+
+def test_records_that_wait_are_read_past_what_strangers_send() -> None:
+    ring: BoundedRing[tuple[str, bytes]] = BoundedRing(9)
+    one, two, bad = payload(tick=1), payload(tick=2), b"\xc1"
+    for sent in (one + two, b"no record", one + bad + two, b"", two):
+        ring.put(("t/m1/state", sent))
+    assert [record.tick for record in read_records(ring)] == [1, 2, 1, 2]

@@ -121,11 +121,8 @@ def log_export_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Exports a log to files for other tools: names end in their units, numbers are exact."""
-    from ..errors import UsageError
     from ..reporting.export import Exporter
 
-    if form not in list_export_formats():
-        raise UsageError(f"--to is one of {', '.join(list_export_formats())}, not {form!r}")
     exporter = Exporter(form, output, force=force, log=files[0])
     log = terminal.open_with_progress(*files)
     with terminal.progress_bar(f"writing {exporter.path}") as progress:

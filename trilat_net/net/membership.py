@@ -11,18 +11,20 @@ import hashlib
 import platform
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import msgspec
 
 from ..core.fingerprint import compute_fingerprint
+from ..core.site_setup import Layout
 from ..errors import SessionError, WireError
 from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
-from .messages import Event, Info
+from .messages import Event, Info, State
 from .pinging import RepeatedQuery
-from .wire import M, decode, encode
+from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
@@ -55,6 +57,14 @@ def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
 def read_events(inbox: Inbox) -> Iterator[Event]:
     """Yields the events that wait in a ring; skips other payloads."""
     return read_messages(inbox, Event)
+
+
+def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
+    """Yields the records that wait in a ring; skips other payloads, and of a block what follows one."""
+    while (message := inbox.poll()) is not None:
+        with suppress(WireError):
+            for payload in split_states(message[1]):
+                yield decode(payload, State, layout=layout)
 
 
 class EventPublisher:

@@ -57,7 +57,7 @@ class Exporter:
         """Without a path it is next to the log, or its first part, and named after it."""
         names = exports.list_export_formats()
         if form not in names:
-            raise UsageError(f"an export is to one of {', '.join(names)}, not {form!r}")
+            raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
         self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
         name = log.name.removesuffix(".active").removesuffix(".mcap")
         self.path, self._force = path or log.with_name(name + self._format.ending), force

@@ -7,7 +7,7 @@ belongs to it. A comparison has one column per log and one row per metric of the
 
 import math
 import pkgutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows
 from .measured_impedance import FrequencyResponse, ImpedanceEstimate, estimate_impedances
-from .measures import Metric, MetricValues, Quantity, list_measures, quantities
+from .measures import Measure, Metric, MetricValues, Quantity, list_measures, quantities
 from .motion_metrics import ParameterEstimates, read_all_estimates
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
@@ -106,39 +106,50 @@ class LogMetrics(Result):
         return {name: metrics[quantity.key] for name, metrics in found.items()}
 
     def whole(self, quantity: Quantity) -> Metric:
-        """Returns a quantity of the run: the largest of its places, or their sum.
-
-        A place that can have none does not count; if one lacks a number that it could have, so does the run.
-        """
-        places = {name: one for name, one in self.places(quantity).items() if one.applies}
-        whys = [f"{name}: {one.why}" if name else one.why for name, one in places.items() if one.why]
-        if whys:
-            return Metric(None, "; ".join(whys))
-        values = [one.value for one in places.values() if one.value is not None]
-        if not values:
-            nowhere = dict.fromkeys(one.why for one in self.places(quantity).values())
-            return Metric(None, "; ".join(nowhere) or f"there is no {quantity.of}", applies=False)
-        return Metric(sum(values) if quantity.whole == "sum" else max(values))
+        """Returns a quantity of the run, see `find_whole`."""
+        return find_whole(quantity, self.places(quantity))
 
 
+def find_whole(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
+    """Returns a quantity of the run, of that of its places: the largest of them, or their sum.
+
+    A place that can have none does not count; if one lacks a number that it could have, so does the run.
+    """
+    counted = {name: one for name, one in places.items() if one.applies}
+    whys = [f"{name}: {one.why}" if name else one.why for name, one in counted.items() if one.why]
+    if whys:
+        return Metric(None, "; ".join(whys))
+    values = [one.value for one in counted.values() if one.value is not None]
+    if not values:
+        nowhere = dict.fromkeys(one.why for one in places.values())
+        return Metric(None, "; ".join(nowhere) or f"there is no {quantity.of}", applies=False)
+    return Metric(sum(values) if quantity.whole == "sum" else max(values))
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is no number
 def compute_log_metrics(log: Log) -> LogMetrics:
     """Returns all quantities of a log; of torn, short and empty ones too.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is no number
-        return _measure(RunView(log))
+    return _measure(RunView(log))
+
+
+def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
+    """Returns what is wanted of every place, by kind and name."""
+    found: dict[str, dict[str, MetricValues]] = {
+        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
+    }
+    for one in wanted:
+        for place, values in found[one.of].items():
+            values.update(one.measure(view, place))
+    return found
 
 
 def _measure(view: RunView) -> LogMetrics:
     log, scenario = view.log, view.scenario
-    found: dict[str, dict[str, MetricValues]] = {
-        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
-    }
-    for one in list_measures():
-        for place, values in found[one.of].items():
-            values.update(one.measure(view, place))
+    found = _measure_places(view, list_measures())
     return LogMetrics(
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
         found["run"][""],
@@ -167,13 +178,16 @@ def find_quantity(key: str) -> Quantity:
     return known[key]
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as there
 def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Returns quantities of the whole run by their keys."""
+    """Returns quantities of the whole run by their keys; nothing else is computed."""
     asked = {key: find_quantity(key) for key in keys}
-    if not asked:
-        return {}
-    metrics = compute_log_metrics(log)
-    return {key: metrics.whole(one) for key, one in asked.items()}
+    wanted = [one for one in list_measures() if any(quantity.key in asked for quantity in one.quantities)]
+    found = _measure_places(RunView(log), wanted)
+    return {
+        key: find_whole(one, {place: values[key] for place, values in found[one.of].items()})
+        for key, one in asked.items()
+    }
 
 
 def _find_joint_names(scenario: Scenario) -> tuple[str, ...]:

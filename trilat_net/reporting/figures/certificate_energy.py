@@ -75,9 +75,9 @@ def _no_functional(log: Log) -> str:
     return "" if law.holds else law.text
 
 
-@draws("certificate", "V, its parts, who changed it, the energy balance", _no_functional, in_report=True)
-def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    return draw_functional(log, certify(log), form)
+draws("certificate", "V, its parts, who changed it, the energy balance", _no_functional, in_report=True)(
+    lambda log, form: draw_functional(log, certify(log), form)
+)
 
 
 def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:

@@ -22,7 +22,6 @@ from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
 from ...execution.log_inputs import explain_no_repetition
 from ...execution.twins import SMALLEST, TwinPath
-from ...log.log_reader import Log
 from .. import style
 from ..figure_size import REPORT_SIZE, FigureSize
 from .figure_entry import draws
@@ -70,9 +69,9 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-@draws("twins", "what became of small pushes of the run", explain_no_repetition, in_report=True)
-def _draw_pushed(log: Log, form: FigureSize) -> Figure:
-    return draw_twins(PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form)
+draws("twins", "what became of small pushes of the run", explain_no_repetition, in_report=True)(
+    lambda log, form: draw_twins(PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form)
+)
 
 
 def _list_lines(found: PushedTwins) -> Iterator[_Line]:
