@@ -50,7 +50,12 @@ class RunningSession:
         self.name, self._connection, self._clock = name, connection, SystemClock()
 
     @contextmanager
-    def _reach(self, *, operates: bool = True, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
+    def reach(self, *, operates: bool = True, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
+        """Yields a connection to the session; with keys that of an operator, or to look alone of anybody.
+
+        Raises:
+            SessionError: no site answers.
+        """
         if operates:
             self._connection.require(OPERATOR)
         there = self._connection, self._clock, self.name, embedded_names_reader(self.name)
@@ -59,7 +64,7 @@ class RunningSession:
             yield bus
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
-        with self._reach(operates=order != "stop") as bus:
+        with self.reach(operates=order != "stop") as bus:
             replies = order_sites(bus, self._clock, self.name, sites, order)
         if refused := [reply.text for reply in replies if not reply.accepted]:
             raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
@@ -79,7 +84,7 @@ class RunningSession:
 
     def end(self) -> list[str]:
         """Ends the session in order; as `trilat stop --end`."""
-        with self._reach() as bus:
+        with self.reach() as bus:
             return stop_session(bus, self._clock, self.name)
 
     def set_link(self, link: str, **to: Any) -> str:
@@ -102,7 +107,7 @@ class RunningSession:
         Raises:
             SessionError: the session has no such site, has not begun, or the site does not reply.
         """
-        with self._reach() as bus:
+        with self.reach() as bus:
             _find_running(bus, self._clock, self.name, site)
             return send_change(bus, self._clock, self.name, site, request)
 
@@ -113,7 +118,7 @@ class RunningSession:
         >>> with tn.session("paper").records("s") as take:  # doctest: +SKIP
         ...     [record.q_des for record in take()]
         """
-        with self._reach(operates=False) as bus:
+        with self.reach(operates=False) as bus:
             rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or ("*",)]
 
             def take() -> list[State]:
@@ -209,7 +214,7 @@ def hand(
     """
     connection = secure_connection(resolve_member_connection(None, connect, router), keys, insecure=False)
     clock = SystemClock()
-    with RunningSession(session, connection)._reach(timeout_s=timeout_s) as bus:
+    with RunningSession(session, connection).reach(timeout_s=timeout_s) as bus:
         give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
         while True:
             try:
@@ -265,7 +270,7 @@ def order_sites(
     Raises:
         SessionError: the session has not begun or has no such site, or a site does not answer.
     """
-    scenario, found = _meet_sites(bus, clock, session)
+    scenario, found = meet_sites(bus, clock, session)
     for name in sites:
         if name not in scenario.names:
             raise SessionError(
@@ -293,7 +298,7 @@ def stop_session(bus: Bus, clock: Clock, session: str) -> list[str]:
     Raises:
         SessionError: the session has not begun, or a site does not answer.
     """
-    scenario, found = _meet_sites(bus, clock, session)
+    scenario, found = meet_sites(bus, clock, session)
     asked = _list_present(scenario, found)
     lacking = [name for name in asked if name not in found]
     waiting = [name for name in asked if name in found and not found[name].running]
@@ -306,7 +311,7 @@ def stop_session(bus: Bus, clock: Clock, session: str) -> list[str]:
     return [send_change(bus, clock, session, name, request).text for name in asked]
 
 
-def _meet_sites(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, dict[str, Info]]:
+def meet_sites(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, dict[str, Info]]:
     """Returns a session's scenario, and the sites that have answered."""
     found: dict[str, Info] = {}
     scenario: Scenario | None = None

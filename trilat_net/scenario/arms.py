@@ -211,6 +211,14 @@ class ArmModel(NamedTuple):
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return list(place_end_effector(rows, np.array(self.chain.tip_m)))
 
+    def end_turn(self, q: Vector) -> tuple[float, float, float]:
+        """Returns the end effector's orientation in a pose as a rotation vector, rad."""
+        if self.chain is None:
+            return 0.0, 0.0, q[0] + q[1]
+        rows = build_chain(self.chain.joints)
+        place_joints(rows, np.asarray(q, dtype=np.float64))
+        return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
+
     @property
     def shares_pose(self) -> bool:
         """True if its site follows with the end effector, in task space."""
@@ -226,13 +234,10 @@ class ArmModel(NamedTuple):
         """Returns what a site shares of a pose: its joint angles, or its end effector's place or pose."""
         if self.chain is None or self.chain.task is None:
             return tuple(q)
-        rows = build_chain(self.chain.joints)
-        place_joints(rows, np.asarray(q, dtype=np.float64))
-        place = np.array(place_end_effector(rows, np.array(self.chain.tip_m))) * self.chain.task.scale
+        place = np.array(self.end_effector(q)) * self.chain.task.scale
         if self.counts.shared == len(place):
             return tuple(place.tolist())
-        turned = turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
-        return (*place.tolist(), *turned)
+        return (*place.tolist(), *self.end_turn(q))
 
     def task_jacobian(self, q: Vector) -> Array:
         """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n), per joint."""

@@ -1,4 +1,4 @@
-"""Packer of standard ROS 2 messages: CDR, little-endian; no ROS installation needed.
+"""Packer and reader of standard ROS 2 messages: CDR, little-endian; no ROS installation needed.
 
 Invariant: the bytes equal those of any other serializer. Fields are aligned to their size, counted from
 the end of the four-byte header; padding is zero. The constant layout is computed once, so that a message
@@ -7,9 +7,9 @@ is one `struct` call.
 
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...core.ticks import NS_PER_S
 
@@ -176,3 +176,101 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
     """Returns an `rcl_interfaces/msg/Log` of a member at a time (Unix ns, not below 0)."""
     fields = _pack_fields(9, name, text, "", "", 0)  # after stamp and level; of no file, function and line
     return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields
+
+
+def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
+    """Returns a `PoseStamped` (x, y, z, m, and a quaternion) or a `WrenchStamped` (N, N m) of a frame."""
+    head = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, frame)
+    return _HEAD + head + b"\0" * (-len(head) % 8) + struct.pack(f"<{len(numbers)}d", *numbers)
+
+
+def pack_trigger_response(*, success: bool, text: str) -> bytes:
+    """Returns the response of `std_srvs/srv/Trigger`."""
+    return _HEAD + bytes([success]) + _pack_fields(1, text)
+
+
+class Diagnosis(NamedTuple):
+    """A part of `/diagnostics`: its level (0 ok, 1 warning, 2 error, 3 stale), name, text and values."""
+
+    level: int
+    name: str
+    text: str
+    values: Mapping[str, str]
+
+
+def pack_diagnostics(stamp_ns: int, parts: Sequence[Diagnosis]) -> bytes:
+    """Returns a `diagnostic_msgs/msg/DiagnosticArray`."""
+    data = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, "", len(parts))
+    for part in parts:
+        data += bytes([part.level])
+        fields = [one for pair in part.values.items() for one in pair]
+        data += _pack_fields(len(data), part.name, part.text, "", len(part.values), *fields)
+    return _HEAD + data
+
+
+class CdrReader:
+    """Reads the fields of a message one after another.
+
+    Raises:
+        ValueError: the message is not plain CDR, little-endian, or ends before a field does.
+    """
+
+    def __init__(self, payload: bytes) -> None:
+        if payload[:2] != _HEAD[:2] or len(payload) < len(_HEAD):
+            raise ValueError("is not plain CDR, little-endian")
+        self._data, self._at = payload[len(_HEAD) :], 0
+
+    def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
+        """Returns numbers of a format of `struct`."""
+        size = struct.calcsize(f"<{code}")
+        start = self._at + (-self._at % size if count else 0)
+        self._at = start + count * size
+        if self._at > len(self._data):
+            raise ValueError("ends in the middle of a field")
+        return struct.unpack_from(f"<{count}{code}", self._data, start)
+
+    def text(self) -> str:
+        """Returns a string."""
+        (length,) = self.numbers("I")
+        (data,) = self.numbers("s", length) if length else (b"",)
+        return bytes(data).removesuffix(b"\0").decode()
+
+    def floats(self) -> tuple[float, ...]:
+        """Returns a list of numbers."""
+        (count,) = self.numbers("I")
+        return self.numbers("d", count)
+
+
+class RosJoints(NamedTuple):
+    """A `JointState`: names, and positions, velocities, efforts, each as long as they, or empty."""
+
+    names: list[str]
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    effort: tuple[float, ...]
+
+
+def read_joint_state(payload: bytes) -> RosJoints:
+    """Returns what a `sensor_msgs/msg/JointState` says.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    reader = CdrReader(payload)
+    reader.numbers("i"), reader.numbers("I"), reader.text()
+    (count,) = reader.numbers("I")
+    if count > len(payload):
+        raise ValueError("ends in the middle of a field")
+    names = [reader.text() for _ in range(count)]
+    return RosJoints(names, reader.floats(), reader.floats(), reader.floats())
+
+
+def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
+    """Returns the frame of a `PoseStamped` (7 numbers) or a `WrenchStamped` (6), and its numbers.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    reader = CdrReader(payload)
+    reader.numbers("i"), reader.numbers("I")
+    return reader.text(), reader.numbers("d", count)
