@@ -312,3 +312,23 @@ class Holder:
         """Kills it."""
         self._process.kill()
         self._process.wait()
+
+
+GONE_S = 0.320
+"""From the last sign of life of whoever holds an arm to no force on it."""
+
+
+def assert_let_go(log: Log, who: str = "to be killed") -> None:
+    """Soon after its last message there is no force on m1, and the log says why."""
+    part = log["m1"]
+    number, grip = part.hand[:, 1], part.hand[:, 0]
+    newest = int(np.flatnonzero(np.diff(number) > 0)[-1]) + 1
+    last = int(np.flatnonzero(grip > 0.0)[-1])
+    assert np.abs(part.tau_x[newest : last + 1]).max() > 1.0
+    assert not part.tau_x[last + 1 :].any()
+    assert part.t_s[last + 1] - part.t_s[newest] <= GONE_S
+    texts = [event.text for event in log.events if event.kind == "hand"]
+    assert [text.partition(" at t")[0] for text in texts][-2:] == [
+        f"m1: {who} takes hold",
+        f"m1: {who} is silent: let go",
+    ]

@@ -17,10 +17,7 @@ from trilat_net.log.log_reader import Log
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
 from .namespaces import Machines, bridged
-from .processes import PAPER, Holder, Session, Stage, connections
-
-GONE_S = 0.320
-"""From the last sign of life of whoever holds an arm to no force on it."""
+from .processes import PAPER, Holder, Session, Stage, assert_let_go, connections
 
 
 class Circling(threading.Thread):
@@ -129,22 +126,6 @@ def test_a_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, t
         holder.end()
     log = session.is_reproduced()
     assert_let_go(log)
-
-
-def assert_let_go(log: Log) -> None:
-    """Soon after its last message there is no force on m1, and the log says why."""
-    part = log["m1"]
-    number, grip = part.hand[:, 1], part.hand[:, 0]
-    newest = int(np.flatnonzero(np.diff(number) > 0)[-1]) + 1
-    last = int(np.flatnonzero(grip > 0.0)[-1])
-    assert np.abs(part.tau_x[newest : last + 1]).max() > 1.0
-    assert not part.tau_x[last + 1 :].any()
-    assert part.t_s[last + 1] - part.t_s[newest] <= GONE_S
-    texts = [event.text for event in log.events if event.kind == "hand"]
-    assert [text.partition(" at t")[0] for text in texts] == [
-        "m1: to be killed takes hold",
-        "m1: to be killed is silent: let go",
-    ]
 
 
 @pytest.mark.long

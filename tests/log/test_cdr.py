@@ -2,6 +2,7 @@
 
 import math
 import struct
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -151,3 +152,73 @@ def test_a_line_of_a_log_is_read_as_it_was_written(
 def test_a_stamp_beyond_what_ros_2_can_say_is_its_last_second() -> None:
     message = by_rosbags(cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
     assert message.header.stamp.sec == 2**31 - 1
+
+
+def pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+    point, turn = type_of("geometry_msgs/msg/Point"), type_of("geometry_msgs/msg/Quaternion")
+    where = type_of("geometry_msgs/msg/Pose")(position=point(*numbers[:3]), orientation=turn(*numbers[3:]))
+    return type_of("geometry_msgs/msg/PoseStamped")(header=header(stamp_ns, frame), pose=where)
+
+
+def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
+    vector = type_of("geometry_msgs/msg/Vector3")
+    pull = type_of("geometry_msgs/msg/Wrench")(force=vector(*numbers[:3]), torque=vector(*numbers[3:]))
+    return type_of("geometry_msgs/msg/WrenchStamped")(header=header(stamp_ns, frame), wrench=pull)
+
+
+@given(stamps_ns, words, st.lists(floats, min_size=7, max_size=7))
+def test_poses_and_wrenches_are_those_of_rosbags_and_are_read_back(
+    stamp_ns: int, frame: str, numbers: list[float]
+) -> None:
+    for kind, make, count in (("PoseStamped", pose, 7), ("WrenchStamped", wrench, 6)):
+        data = cdr.pack_frame_vectors(stamp_ns, frame, *numbers[:count])
+        assert data == serialized(f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count]))
+        named, read = cdr.read_frame_vectors(data, count)
+        assert (named, bits(read)) == (frame, bits(numbers[:count]))
+
+
+@given(stamps_ns, words, st.lists(words, max_size=4), st.booleans())
+def test_joint_states_of_others_are_read(stamp_ns: int, frame: str, names: list[str], moves: bool) -> None:
+    speeds = [0.5] * len(names) if moves else []
+    message = type_of(cdr.JOINT_STATE)(
+        header=header(stamp_ns, frame),
+        name=names,
+        position=np.arange(len(names), dtype=np.float64),
+        velocity=np.array(speeds),
+        effort=np.zeros(0),
+    )
+    found = cdr.read_joint_state(serialized(cdr.JOINT_STATE, message))
+    assert found == (names, tuple(range(len(names))), tuple(speeds), ())
+
+
+@given(
+    stamps_ns, st.lists(st.tuples(st.integers(0, 3), words, words, st.dictionaries(words, words, max_size=3)))
+)
+def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, ...]]) -> None:
+    status, pair = type_of("diagnostic_msgs/msg/DiagnosticStatus"), type_of("diagnostic_msgs/msg/KeyValue")
+    theirs = [
+        status(
+            level=n, name=name, message=text, hardware_id="", values=[pair(*one) for one in values.items()]
+        )
+        for n, name, text, values in parts
+    ]
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    message = type_of(kind)(header=header(stamp_ns, ""), status=theirs)
+    assert cdr.pack_diagnostics(stamp_ns, [cdr.Diagnosis(*one) for one in parts]) == serialized(kind, message)
+
+
+@given(st.booleans(), words)
+def test_the_response_of_a_trigger_is_a_boolean_and_a_text(success: bool, text: str) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg("bool success\nstring message\n", "std_srvs/msg/Told"))
+    told = store.types["std_srvs/msg/Told"](success=success, message=text)
+    assert cdr.pack_trigger_response(success=success, text=text) == bytes(
+        store.serialize_cdr(told, "std_srvs/msg/Told")
+    )
+
+
+@given(st.binary(max_size=200) | st.binary(max_size=200).map(lambda rest: b"\0\1\0\0" + rest))
+def test_what_is_no_message_is_a_value_error(data: bytes) -> None:
+    for read in (cdr.read_joint_state, lambda one: cdr.read_frame_vectors(one, 7)):
+        with suppress(ValueError):
+            read(data)

@@ -1,0 +1,146 @@
+"""A session in the graph of ROS 2: a stranger that knows the wire form alone leads an arm."""
+
+import json
+import signal
+import struct
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+
+from tests.net.waiting import until
+from trilat_net.net.connection import find_free_endpoints
+
+from .processes import PAPER, Session, Stage, assert_let_go, connections
+
+ROS = get_typestore(Stores.ROS2_JAZZY)
+TRIGGER = (
+    "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+)
+
+
+class Stranger:
+    """The side of ROS, written from the design of rmw_zenoh alone: CDR is that of rosbags."""
+
+    def __init__(self, router: str, name: bytes = b"stranger") -> None:
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": [router]},
+            "scouting": {"multicast": {"enabled": False}},
+        }
+        self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        self._gid, self._sent = name.ljust(16), 0
+        self.heard: dict[str, list[tuple[bytes, bytes]]] = defaultdict(list)
+        self._kept = [self._session.declare_subscriber("0/**", self._hear)]
+
+    def _hear(self, sample: Any) -> None:
+        came = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        self.heard["/".join(str(sample.key_expr).split("/")[1:-2])].append((sample.payload.to_bytes(), came))
+
+    def _attachment(self) -> bytes:
+        self._sent += 1
+        return struct.pack("<qqB16s", self._sent, time.time_ns(), 16, self._gid)
+
+    def tokens(self) -> list[str]:
+        return [str(reply.ok.key_expr) for reply in self._session.liveliness().get("@ros2_lv/0/**")]
+
+    def publish(self, topic: str, kind: str, message: Any) -> None:
+        dds = kind.replace("/msg/", "::msg::dds_::") + "_"
+        data = bytes(ROS.serialize_cdr(message, kind))
+        key = f"0/{topic}/{dds}/{ROS.hash_rihs01(kind)}"
+        self._session.put(key, data, attachment=self._attachment())
+
+    def call(self, service: str) -> tuple[bool, str]:
+        replies = self._session.get(
+            f"0/{service}/{TRIGGER}",
+            target=zenoh.QueryTarget.ALL_COMPLETE,
+            payload=b"\0\1\0\0\0",
+            attachment=self._attachment(),
+            timeout=10.0,
+        )
+        (reply,) = list(replies)
+        assert reply.ok.attachment.to_bytes()[17:] == self._gid
+        data = reply.ok.payload.to_bytes()
+        (length,) = struct.unpack_from("<I", data, 8)
+        return bool(data[4]), data[12 : 12 + length - 1].decode()
+
+    def newest(self, topic: str, kind: str) -> Any:
+        until(lambda: bool(self.heard[topic]), 20.0)
+        return ROS.deserialize_cdr(self.heard[topic][-1][0], kind)
+
+    def close(self) -> None:
+        self._session.close()
+
+
+def pose(x: float, y: float) -> Any:
+    types = ROS.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    where = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0), turn)
+    return types["geometry_msgs/msg/PoseStamped"](types["std_msgs/msg/Header"](stamp, "m1/base"), where)
+
+
+@contextmanager
+def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, Any, Stranger]]:
+    """A session whose arms people can hold, its bridge, and a stranger behind a router."""
+    (router,) = find_free_endpoints(1)
+    running = stage.start("router", "router", "--listen", router)
+    session = Session(stage, "play", PAPER, "--duration", str(duration_s))
+    session.all()
+    session.begun()
+    bridge = stage.start("ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints))
+    bridge.prints("is in the graph of ROS 2")
+    stranger = Stranger(router)
+    try:
+        yield session, bridge, stranger
+    finally:
+        stranger.close()
+        running.end()
+
+
+@pytest.mark.long
+def test_a_stranger_leads_an_arm_stops_it_and_the_log_is_verified(stage: Stage) -> None:
+    with bridged_session(stage, 25) as (session, bridge, ros):
+        start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
+        for n in range(150):
+            goal = pose(start.x - 0.15 * min(1.0, n / 60.0), start.y)
+            ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", goal)
+            time.sleep(1.0 / 60.0)
+        led = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
+        assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
+        assert ros.call("t/s/stop")[0]
+        assert ros.call("t/s/reset") == (False, "s is in stopped; reset is for a site in fault")
+        until(lambda: ros.newest("t/s/mode", "std_msgs/msg/String").data == "stopped", 20.0)
+        assert ros.call("t/s/enable")[0]
+        kinds = {"joint_states": "MP", "target_pose": "MS", "stop": "SS"}
+        told = ros.tokens()
+        for name, kind in kinds.items():
+            assert any(f"/{kind}/%/%t/trilat/%t%m1%{name}/" in token for token in told)
+        log = session.is_reproduced()
+        assert bridge.code() == 0
+        for states, attachment in ros.heard["t/m2/joint_states"][-50:]:
+            assert len(attachment) == 33
+            one = ROS.deserialize_cdr(states, "sensor_msgs/msg/JointState")
+            stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+            row = (stamp_ns - int(log.session["epoch_unix_ns"])) * log["m2"].rate_hz // 10**9
+            assert one.position.tolist() == log["m2"].q[row].tolist()
+            assert one.effort.tolist() == log["m2"].tau[row].tolist()
+        assert np.abs(log["m1"].tau_x).max() > 1.0
+
+
+@pytest.mark.long
+def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
+    with bridged_session(stage, 15) as (session, bridge, ros):
+        start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
+        for _ in range(60):
+            ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", pose(start.x - 0.1, start.y))
+            time.sleep(1.0 / 60.0)
+        bridge.signal(signal.SIGKILL)
+        log = session.is_reproduced()
+    assert_let_go(log, "ros2")

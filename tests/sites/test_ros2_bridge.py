@@ -1,0 +1,128 @@
+"""Targets from ROS 2: what holds an arm, what is refused and how it is said, and when an arm is let go."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sites.ros2_bridge import SILENCE_NS, Refusals, TargetTopic, read_joint_target, read_place_target
+from tests.net.manual_clock import ManualClock
+from trilat_net.errors import UsageError
+from trilat_net.log.ros2 import cdr
+from trilat_net.net.ros2_wire import Attachment
+
+FIRST, SECOND = Attachment(1, 5, b"a" * 16), Attachment(1, 5, b"b" * 16)
+NAMES = [("m1_q1", "q1"), ("m1_q2", "q2")]
+
+
+class HeldArm:
+    """A hand of which it is noted what is done with it."""
+
+    def __init__(self) -> None:
+        self.goals: list[tuple[float, ...]] = []
+        self.holds = False
+
+    def move(self, *goal: float) -> int:
+        if any(abs(one) > 1e6 for one in goal):
+            raise UsageError("is beyond the arm")
+        self.goals.append(goal)
+        self.holds = True
+        return len(self.goals)
+
+    def release(self) -> None:
+        self.holds = False
+
+
+class Desk:
+    """A topic `target_pose` of an arm in the plane, its clock, and what was said."""
+
+    def __init__(self) -> None:
+        self.arm, self.clock, self.said = HeldArm(), ManualClock(), list[str]()
+        self.refusals = Refusals(self.said.append)
+        self.topic = TargetTopic(
+            self.arm,  # type: ignore[arg-type]
+            "play/m1/target_pose",
+            lambda data: read_place_target(2, 7, data),
+            self.arm.move,
+            self.clock,
+            self.refusals,
+        )
+
+    def hears(self, x: float, sender: Attachment = FIRST, after_ns: int = 0) -> None:
+        self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
+        self.topic.watch()
+        self.topic.take(cdr.pack_frame_vectors(7, "m1/base", x, 0.5, 0, 0, 0, 0, 1), sender)
+
+
+def joints(names: Sequence[str], angles: Sequence[float]) -> bytes:
+    return cdr.JointStatePacker(names, velocity=False, effort=False).pack(0, angles)
+
+
+def test_a_pose_moves_the_target_and_silence_lets_go() -> None:
+    desk = Desk()
+    desk.hears(0.1)
+    desk.hears(0.2, after_ns=SILENCE_NS)
+    assert desk.arm.goals == [(0.1, 0.5), (0.2, 0.5)]
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + SILENCE_NS)
+    desk.topic.watch()
+    assert desk.arm.holds
+    desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
+    desk.topic.watch()
+    assert not desk.arm.holds
+
+
+def test_two_publishers_move_nothing_until_one_is_gone() -> None:
+    desk = Desk()
+    desk.hears(0.1)
+    desk.hears(0.9, SECOND, after_ns=10)
+    assert not desk.arm.holds
+    for _ in range(9):
+        desk.hears(0.2, after_ns=100_000_000)
+    assert desk.arm.goals == [(0.1, 0.5)]
+    desk.hears(0.3, after_ns=200_000_000)
+    assert desk.arm.goals == [(0.1, 0.5), (0.3, 0.5)]
+    assert desk.said == [
+        "play/m1/target_pose has two publishers: neither moves the arm until the other is gone"
+    ]
+    assert desk.refusals.counts.total() == 10
+
+
+@given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
+def test_whatever_comes_is_taken_or_counted(data: bytes) -> None:
+    desk = Desk()
+    desk.topic.take(data, FIRST)
+    assert len(desk.arm.goals) + desk.refusals.counts.total() == 1
+    assert all(map(math.isfinite, (x for goal in desk.arm.goals for x in goal)))
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, 1e7])
+def test_a_target_that_no_arm_can_take_is_refused_and_the_last_one_stays(x: float) -> None:
+    desk = Desk()
+    desk.hears(0.1)
+    desk.hears(x)
+    desk.hears(x)
+    assert desk.arm.goals == [(0.1, 0.5)]
+    assert len(desk.said) == 1
+    assert desk.refusals.counts.total() == 2
+
+
+def test_joints_are_found_by_their_names_in_any_order() -> None:
+    assert read_joint_target(NAMES, joints(["m1_q2", "m1_q1"], [2.0, 1.0])) == [1.0, 2.0]
+    assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("names", "angles", "said"),
+    [
+        (["m1_q1"], [1.0], "lacks m1_q2; it has m1_q1"),
+        ([], [], "lacks m1_q1, m1_q2; it has no names"),
+        (["q1", "q2"], [1.0, math.nan], "has a number that is not finite"),
+    ],
+)
+def test_joints_that_are_missing_or_not_finite_are_named(
+    names: list[str], angles: list[float], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        read_joint_target(NAMES, joints(names, angles))
