@@ -13,8 +13,12 @@ import msgspec
 from recorder.backfill import GapRepair
 from recorder.inbound_queue import InboundMessage, InboundQueue
 from recorder.site_reception import SiteReception
-from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy
-from trilat_net.analysis.record_window import RecordWindow, make_windows
+from trilat_net.analysis.certificate.running_energy import (
+    EnergyCourse,
+    RecordWindow,
+    RunningEnergy,
+    make_windows,
+)
 from trilat_net.core.live_hand import TAKEN
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError

@@ -25,8 +25,7 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import State
 from trilat_net.net.requests import OrderName
-from trilat_net.net.ros2_node import Ros2Node
-from trilat_net.net.ros2_wire import Attachment, QualityOfService
+from trilat_net.net.ros2_graph import Attachment, QualityOfService, Ros2Graph
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
@@ -58,7 +57,7 @@ class SiteTopics:
     """What one site shows, under `/<session>/<site>`, and its part of `/tf`.
 
     Args:
-        node: publishes.
+        graph: publishes.
         scenario, session, site: whose.
         epoch_unix_ns: Unix time of tick 0, from which stamps count.
         put_frames: publishes on `/tf`.
@@ -66,7 +65,7 @@ class SiteTopics:
 
     def __init__(
         self,
-        node: Ros2Node,
+        graph: Ros2Graph,
         scenario: Scenario,
         session: str,
         site: str,
@@ -81,7 +80,7 @@ class SiteTopics:
         self._reference = cdr.JointStatePacker(names, effort=False)
 
         def topic(name: str, kind: str, qos: QualityOfService = RELIABLE) -> Callable[[bytes], None]:
-            return node.publisher(f"{session}/{site}/{name}", kind, qos)
+            return graph.publisher(f"{session}/{site}/{name}", kind, qos)
 
         self._put_states, self._put_mode = (
             topic("joint_states", cdr.JOINT_STATE),
@@ -240,7 +239,7 @@ class Bridge(NamedTuple):
 
 
 def open_bridge(
-    node: Ros2Node,
+    graph: Ros2Graph,
     bus: Bus,
     clock: Clock,
     session: str,
@@ -250,9 +249,9 @@ def open_bridge(
 ) -> Bridge:
     """Returns the bridge of a session that runs, whose topics and services are there from now on."""
     refusals = Refusals(say)
-    frames = node.publisher("tf", cdr.TRANSFORMS, RELIABLE)
+    frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
     sites = {
-        name: SiteTopics(node, scenario, session, name, epoch_unix_ns, frames) for name in scenario.names
+        name: SiteTopics(graph, scenario, session, name, epoch_unix_ns, frames) for name in scenario.names
     }
     able = [name for name in scenario.names if find_live_hand(scenario.sites[name].hands) is not None]
     targets = []
@@ -261,10 +260,10 @@ def open_bridge(
         last, kind, read, act = describe_target(scenario, name, hand)
         topic = f"{session}/{name}/{last}"
         targets.append(TargetTopic(hand, topic, read, act, clock, refusals))
-        node.subscribe(topic, kind, targets[-1].take)
+        graph.subscribe(topic, kind, targets[-1].take)
     for service, order in list_services(bus, clock, session, scenario):
-        node.serve(service, TRIGGER, partial(_answer, order))
-    put_diagnostics = node.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+        graph.serve(service, TRIGGER, partial(_answer, order))
+    put_diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
 
     def diagnose(records: dict[str, State]) -> None:
         """Publishes the state of every site."""
@@ -374,7 +373,7 @@ def run_bridge(
 
 def serve_ros2(
     running: RunningSession,
-    open_node: Callable[[], Ros2Node],
+    open_graph: Callable[[], Ros2Graph],
     rate_hz: float,
     stopped: Callable[[], bool],
     say: Callable[[str], None],
@@ -384,7 +383,7 @@ def serve_ros2(
 
     Args:
         running: the session.
-        open_node: opens the node, if its router answers.
+        open_graph: opens the node, if its router answers.
         rate_hz: messages a second of each topic.
         stopped: whether to end.
         say: takes a line for people.
@@ -393,19 +392,15 @@ def serve_ros2(
     clock = SystemClock()
     wait = partial(_wait_for, clock, stopped, say)
     with running.reach(timeout_s=timeout_s) as bus:
-        begun = wait(
-            partial(_find_begun, bus, clock, running.name), f"session {running.name} has not begun: waiting"
-        )
-        node = (
-            None
-            if begun is None
-            else wait(partial(_try_node, open_node), "no router of ROS answers: waiting for it")
-        )
-        if begun is None or node is None:
+        begun = wait(partial(_find_begun, bus, clock, running.name), f"{running.name} has not begun: waiting")
+        if begun is None:
+            return
+        graph = wait(partial(_try_graph, open_graph), "no router of ROS answers: waiting for it")
+        if graph is None:
             return
         scenario, epoch_unix_ns = begun
-        with node:
-            bridge = open_bridge(node, bus, clock, running.name, scenario, epoch_unix_ns, say)
+        with graph:
+            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, say)
             held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
             say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
             run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)
@@ -437,8 +432,8 @@ def _find_begun(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, int] | 
     return (scenario, begun[0].epoch_unix_ns) if begun else None
 
 
-def _try_node(open_node: Callable[[], Ros2Node]) -> Ros2Node | None:
+def _try_graph(open_graph: Callable[[], Ros2Graph]) -> Ros2Graph | None:
     try:
-        return open_node()
+        return open_graph()
     except RouterSilent:
         return None

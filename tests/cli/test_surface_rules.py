@@ -18,7 +18,9 @@ OPTIONS = {name: names for name, names in all_options().items() if name != "tril
 COMMANDS = [name for name in OPTIONS if not any(other.startswith(f"{name} ") for other in OPTIONS)]
 GOLDEN_LOG = Path(__file__).parents[1] / "golden" / "live-paper.mcap"
 NO_RESULT = {
-    *(f"trilat {name}" for name in ("site", "record", "watch", "router", "log view")),  # run until they end
+    *(
+        f"trilat {name}" for name in ("site", "record", "watch", "router", "ros2", "log view")
+    ),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
     *(
         f"trilat {name}" for name in ("scenario show", "scenario new", "new law", "keys new", "keys pair")

@@ -11,7 +11,7 @@ from sites.ros2_bridge import SILENCE_NS, Refusals, TargetTopic, read_joint_targ
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import UsageError
 from trilat_net.log.ros2 import cdr
-from trilat_net.net.ros2_wire import Attachment
+from trilat_net.net.ros2_graph import Attachment
 
 FIRST, SECOND = Attachment(1, 5, b"a" * 16), Attachment(1, 5, b"b" * 16)
 NAMES = [("m1_q1", "q1"), ("m1_q2", "q2")]

@@ -223,7 +223,7 @@ def _benchmark(
     )
 
     def draw() -> "Figure":
-        from ..reporting.figures.network_delays import draw_network_delays
+        from ..reporting.figures.linear_figures import draw_network_delays
 
         return draw_network_delays(found.to_dict())
 

@@ -1,4 +1,4 @@
-"""The bus over Eclipse Zenoh; the only importer of `zenoh`.
+"""The bus over Eclipse Zenoh; only it and `ros2_graph` import `zenoh`.
 
 Invariant: nothing here waits for the network. A publisher drops a message rather than delay its caller
 (except a patient one), queries go into a ring, and a session that cannot open yet raises an error.

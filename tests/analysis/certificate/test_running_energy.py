@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy
-from trilat_net.analysis.record_window import make_windows
+from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy, make_windows
 from trilat_net.log.log_reader import Log
 
 BLOCK = 60

@@ -7,11 +7,11 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from trilat_net.errors import UsageError
-from trilat_net.net.ros2_wire import (
+from trilat_net.net.ros2_graph import (
     TYPE_HASHES,
     Attachment,
     EndpointKind,
-    NodeName,
+    GraphPlace,
     QualityOfService,
     check_ros_name,
     find_type_hash,
@@ -23,7 +23,7 @@ from trilat_net.net.ros2_wire import (
 STRING, LOG = "std_msgs/msg/String", "rcl_interfaces/msg/Log"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
-LISTENER = NodeName(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
+LISTENER = GraphPlace(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
 
 
 def test_keys_are_those_of_the_design_of_rmw_zenoh() -> None:
@@ -43,7 +43,7 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
     assert LISTENER.endpoint_token(*heard) == (
         f"{root}/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/{STRING_HASH}/::,10:,:,:,,"
     )
-    server = NodeName(2, "f9980ee0495eaafb3e38f0d19e2eae12", "", "add_two_ints_server")
+    server = GraphPlace(2, "f9980ee0495eaafb3e38f0d19e2eae12", "", "add_two_ints_server")
     kind = "example_interfaces/srv/AddTwoInts"
     served = server.endpoint_token(
         10, EndpointKind.SERVER, "add_two_ints", kind, ADD_HASH, QualityOfService()
@@ -52,7 +52,7 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
         "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints/"
         f"example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}/::,10:,:,:,,"
     )
-    talker = NodeName(0, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
+    talker = GraphPlace(0, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
     assert talker.endpoint_token(
         1, EndpointKind.PUBLISHER, "rosout", LOG, "RIHS01_e28c", QualityOfService()
     ).startswith("@ros2_lv/0/999bf91283606d2068c7524e5badfa6c/0/1/MP/%/%robot1/talker/%rosout/rcl_interfaces")

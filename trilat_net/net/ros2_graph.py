@@ -1,0 +1,280 @@
+"""A member of the graph of ROS 2 over Zenoh, as rmw_zenoh has it on the wire; no ROS is needed.
+
+It has a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or of any other.
+
+Source: ros2/rmw_zenoh, docs/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
+
+Invariant: every message bears an attachment of 33 bytes, since a peer aborts at one that it cannot parse. Its
+numbers begin at 1. A name of ROS has no empty part, so that no token has one either. Nothing that comes from
+ROS raises here: what bears no attachment is counted and passed over. A publisher drops a message rather than
+delay its caller.
+"""
+
+import hashlib
+import json
+import re
+import struct
+from collections import Counter
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import zenoh
+from zenoh import CongestionControl, Reliability, handlers
+
+from ..errors import UsageError
+from .clock import Clock
+from .zenoh_bus import RouterSilent
+from .zenoh_config import Endpoint, make_zenoh_config
+
+TYPE_HASHES = {
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "geometry_msgs/msg/WrenchStamped": "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
+    "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "std_msgs/msg/Float64MultiArray": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
+    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+}
+"""By type the SHA-256 of its definition (REP 2016), the same in Iron to Lyrical."""
+DISTROS = ("humble", "jazzy", "kilted", "lyrical")
+_NO_HASH = "TypeHashNotSupported"
+"""What Humble writes in place of a hash."""
+MAX_DOMAIN = 232
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_ATTACHMENT = struct.Struct("<qqB16s")
+_GID_BYTES = 16
+
+
+class EndpointKind(StrEnum):
+    """What an endpoint of a node is, as its token says it."""
+
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+    SERVER = "SS"
+    CLIENT = "SC"
+
+
+class QualityOfService(NamedTuple):
+    """Quality of service of an endpoint.
+
+    Attributes:
+        reliable: whether messages are sent again until they arrive.
+        latched: whether who comes later gets the last ones (transient local).
+        depth: how many are kept.
+    """
+
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 10
+
+    def encode(self) -> str:
+        """Returns it as tokens have it; what is the default of ROS 2 is left out."""
+        depth = "" if self.depth == 42 else self.depth
+        return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{depth}:,:,:,,"
+
+
+class Attachment(NamedTuple):
+    """What comes with every message, request and reply.
+
+    Attributes:
+        number: of the message, from 1 on.
+        sent_unix_ns: when it was sent.
+        gid: 16 bytes that name the sender; of a reply, who asked.
+    """
+
+    number: int
+    sent_unix_ns: int
+    gid: bytes
+
+    def encode(self) -> bytes:
+        """Returns its 33 bytes."""
+        return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
+
+
+def parse_attachment(data: bytes) -> Attachment | None:
+    """Returns an attachment; None if it is none."""
+    if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
+        return None
+    number, sent_unix_ns, _, gid = _ATTACHMENT.unpack(data)
+    return Attachment(number, sent_unix_ns, gid)
+
+
+def check_ros_name(name: str, what: str) -> str:
+    """Returns a name of ROS without the slash before it.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not _NAME.fullmatch(bare := name.removeprefix("/")):
+        raise UsageError(f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /")
+    return bare
+
+
+def find_type_hash(kind: str, distro: str) -> str:
+    """Returns the hash of a type as a distribution of ROS 2 writes it."""
+    return _NO_HASH if distro == "humble" else f"RIHS01_{TYPE_HASHES[kind]}"
+
+
+def name_dds_type(kind: str) -> str:
+    """Returns a type as keys and tokens have it: `std_msgs::msg::dds_::String_` of `std_msgs/msg/String`."""
+    package, group, name = kind.split("/")
+    return f"{package}::{group}::dds_::{name}_"
+
+
+def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
+    """Returns the key of a topic, or of a service; with the hash `*` that of any version of the type."""
+    return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
+
+
+class GraphPlace(NamedTuple):
+    """A node of ROS: its domain, the identity of its Zenoh session, its namespace and name."""
+
+    domain: int
+    zid: str
+    namespace: str
+    name: str
+
+    def token(self) -> str:
+        """Returns the token by which others see it."""
+        return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._place()}"
+
+    def endpoint_token(
+        self, number: int, end: EndpointKind, name: str, kind: str, type_hash: str, qos: QualityOfService
+    ) -> str:
+        """Returns the token of one of its endpoints; its number is its own in the session."""
+        about = f"{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
+        return f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._place()}/{about}"
+
+    def _place(self) -> str:
+        return f"%/{_mangle('/' + self.namespace) if self.namespace else '%'}/{self.name}"
+
+
+def _mangle(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def make_gid(token: str) -> bytes:
+    """Returns 16 bytes that name an endpoint."""
+    return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
+
+
+_OWN = {"timestamping": {"enabled": {"client": True}}}
+"""A latched topic tells by their times which of its messages are the last."""
+SENSOR = QualityOfService(reliable=False, depth=5)
+"""What a subscription asks for: it matches every publisher."""
+
+
+class Ros2Graph:
+    """The graph of ROS as one node of it sees it; a context, which takes that node from the graph.
+
+    Args:
+        routers: endpoints of ROS's router, of which the first that answers is taken.
+        namespace, name: of the node.
+        clock: tells when a message is sent.
+        domain: ROS_DOMAIN_ID.
+        distro: of `DISTROS`, the distribution of ROS 2 whose form it writes.
+
+    Attributes:
+        passed_over: how many messages of others were not taken, by their reason.
+
+    Raises:
+        RouterSilent: no router answers, or not yet.
+        UsageError: an endpoint cannot be right.
+    """
+
+    def __init__(
+        self,
+        routers: Sequence[Endpoint],
+        namespace: str,
+        name: str,
+        clock: Clock,
+        domain: int = 0,
+        distro: str = "jazzy",
+    ) -> None:
+        try:
+            config = make_zenoh_config([], routers, "client", _OWN)
+            self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        except zenoh.ZError as error:
+            if "Unable to connect" in str(error):
+                raise RouterSilent(f"no router of ROS answers at {', '.join(map(str, routers))}") from None
+            raise UsageError(f"cannot open a session with {', '.join(map(str, routers))}: {error}") from None
+        self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
+        self._distro, self._clock, self._endpoints = distro, clock, 0
+        self.passed_over: Counter[str] = Counter()
+        self._kept: list[Any] = [self._session.liveliness().declare_token(self._place.token())]
+
+    def __enter__(self) -> "Ros2Graph":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not self._session.is_closed():
+            self._session.close()
+
+    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> Callable[[bytes], None]:
+        """Returns what publishes messages of a type, in CDR, on a topic."""
+        key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
+        how: dict[str, Any] = {
+            "congestion_control": CongestionControl.DROP,
+            "reliability": Reliability.RELIABLE if qos.reliable else Reliability.BEST_EFFORT,
+        }
+        publisher: Any
+        if qos.latched:
+            cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
+            publisher = zenoh.ext.declare_advanced_publisher(
+                self._session, key, cache=cache, publisher_detection=True, **how
+            )
+        else:
+            publisher = self._session.declare_publisher(key, **how)
+        self._kept.append(publisher)
+        number = 0
+
+        def publish(data: bytes) -> None:
+            nonlocal number
+            number += 1
+            publisher.put(data, attachment=Attachment(number, self._clock.unix_ns(), gid).encode())
+
+        return publish
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]) -> None:
+        """Gives the messages of a topic, of any version of its type, to `take`, in a thread of Zenoh's."""
+        self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
+
+        def heard(sample: zenoh.Sample) -> None:
+            attachment = _read_attachment(sample.attachment)
+            if attachment is None:
+                self.passed_over[f"{topic}: no attachment"] += 1
+            else:
+                take(sample.payload.to_bytes(), attachment)
+
+        key = topic_key(self._place.domain, topic, kind, "*")
+        self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
+
+    def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
+        """Answers the requests of a service, in a thread of its own."""
+        key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
+
+        def reply(query: zenoh.Query) -> None:
+            with query:  # it ends for its sender only when it is dropped
+                asked = _read_attachment(query.attachment)
+                if asked is None or query.payload is None:
+                    self.passed_over[f"{service}: no attachment"] += 1
+                    return
+                told = asked._replace(sent_unix_ns=self._clock.unix_ns())
+                query.reply(query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode())
+
+        handler = handlers.Callback(reply, indirect=True)
+        self._kept.append(self._session.declare_queryable(key, handler, complete=True))
+
+    def _declare(self, end: EndpointKind, name: str, kind: str, qos: QualityOfService) -> tuple[str, bytes]:
+        """Shows an endpoint to others; returns its key, and what names it in attachments."""
+        self._endpoints += 1
+        type_hash = find_type_hash(kind, self._distro)
+        token = self._place.endpoint_token(self._endpoints, end, name, kind, type_hash, qos)
+        self._kept.append(self._session.liveliness().declare_token(token))
+        return topic_key(self._place.domain, name, kind, type_hash), make_gid(token)
+
+
+def _read_attachment(found: Any) -> Attachment | None:
+    return None if found is None else parse_attachment(found.to_bytes())
