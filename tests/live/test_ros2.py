@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.net.waiting import until
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import PAPER, Session, Stage, assert_let_go, connections
+from .processes import PAPER, Session, Stage, assert_let_go, connections, executed_again, whole
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 TRIGGER = (
@@ -73,6 +74,20 @@ class Stranger:
     def newest(self, topic: str, kind: str) -> Any:
         until(lambda: bool(self.heard[topic]), 20.0)
         return ROS.deserialize_cdr(self.heard[topic][-1][0], kind)
+
+    def latched(self, topic: str, kind: str) -> Any:
+        """The last message of a topic that was published before this subscription."""
+        came: list[bytes] = []
+        late = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            f"0/{topic}/**",
+            lambda sample: came.append(sample.payload.to_bytes()),
+            history=late,
+        )
+        until(lambda: bool(came), 20.0)
+        subscriber.undeclare()
+        return ROS.deserialize_cdr(came[-1], kind)
 
     def close(self) -> None:
         self._session.close()
@@ -144,3 +159,38 @@ def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
         bridge.signal(signal.SIGKILL)
         log = session.is_reproduced()
     assert_let_go(log, "ros2")
+
+
+@pytest.mark.long
+def test_a_router_that_comes_late_and_again_is_joined_and_latecomers_see_the_arm(stage: Stage) -> None:
+    (router,) = find_free_endpoints(1)
+    session = Session(stage, "play", PAPER, "--duration", "40")
+    session.all()
+    session.begun()
+    bridge = stage.start("ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints))
+    bridge.prints("no router of ROS answers: waiting for it")
+    first = stage.start("router", "router", "--listen", router)
+    bridge.prints("is in the graph of ROS 2")
+    first.end()
+    second = stage.start("again", "router", "--listen", router)
+    second.prints("listening at")
+    ros = Stranger(router)
+    try:
+        ros.newest("t/s/joint_states", "sensor_msgs/msg/JointState")
+        text = ros.latched("t/s/robot_description", "std_msgs/msg/String").data
+        assert [joint.get("name") for joint in ElementTree.fromstring(text).findall("joint")]
+        discovery = pytest.importorskip(
+            "zenoh_ros2_sdk.discovery", reason="make .venv/long.stamp installs it"
+        )
+        host, port = router.removeprefix("tcp/").split(":")
+        seen = dict(discovery.get_topic_names_and_types(0, host, int(port), timeout=3.0))
+        assert seen["/t/m1/joint_states"] == ["sensor_msgs/msg/JointState"]
+        assert seen["/t/m2/target_pose"] == ["geometry_msgs/msg/PoseStamped"]
+        services = dict(discovery.get_service_names_and_types(0, host, int(port), timeout=3.0))
+        assert services["/t/end"] == ["std_srvs/srv/Trigger"]
+        assert ros.call("t/end")[0]
+        session.ends_well()
+        executed_again(whole(session.log, in_full=False))
+        assert bridge.code() == 0
+    finally:
+        ros.close()
