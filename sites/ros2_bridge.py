@@ -8,13 +8,17 @@ counted by its reason, and the first of each reason is said.
 
 import math
 import threading
+import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import TrilatError
+from trilat_net.errors import TrilatError, UsageError
+from trilat_net.fields import suggest_nearest
+from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import RobotModel, find_quaternion
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
@@ -25,7 +29,7 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import State
 from trilat_net.net.requests import OrderName
-from trilat_net.net.ros2_graph import Attachment, QualityOfService, Ros2Graph
+from trilat_net.net.ros2_graph import Attachment, QualityOfService, Ros2Graph, check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
@@ -53,6 +57,46 @@ _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
 """Of `/diagnostics`, by mode; others warn."""
 
 
+CRTK = {
+    "joint_states": "measured_js",
+    "reference": "setpoint_js",
+    "tip_pose": "measured_cp",
+    "tip_wrench": "measured_cf",
+    "target_joint": "servo_jp",
+    "target_pose": "servo_cp",
+    "target_wrench": "servo_cf",
+}
+"""By our names those of the Collaborative Robotics Toolkit, as the da Vinci Research Kit has them."""
+
+
+def read_topic_names(asked: str) -> Mapping[str, str]:
+    """Returns the names that topics have instead of ours: none for "crisp", those of "crtk" or of a file.
+
+    The file is TOML: `joint_states = "arm/joint_states"`.
+
+    Raises:
+        UsageError: it cannot be read, or a name in it cannot be right.
+    """
+    if asked in ("crisp", "crtk"):
+        return CRTK if asked == "crtk" else {}
+    try:
+        with open_regular(Path(asked)) as stream:
+            found = tomllib.loads(stream.read().decode())
+    except OSError as error:
+        raise UsageError(
+            f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
+        ) from None
+    except ValueError as error:
+        raise UsageError(f"{asked}: is no TOML: {error}") from None
+    for key, name in found.items():
+        if key not in CRTK:
+            raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(CRTK))}")
+        check_ros_name(str(name), f"{asked}: {key}")
+    if len(set(found.values())) < len(found):
+        raise UsageError(f"{asked}: two topics have one name")
+    return found
+
+
 class SiteTopics:
     """What one site shows, under `/<session>/<site>`, and its part of `/tf`.
 
@@ -61,6 +105,7 @@ class SiteTopics:
         scenario, session, site: whose.
         epoch_unix_ns: Unix time of tick 0, from which stamps count.
         put_frames: publishes on `/tf`.
+        called: the names of topics, where they are not ours.
     """
 
     def __init__(
@@ -71,6 +116,7 @@ class SiteTopics:
         site: str,
         epoch_unix_ns: int,
         put_frames: Callable[[bytes], None],
+        called: Mapping[str, str],
     ) -> None:
         self._arm, self._epoch_unix_ns, self._put_frames = scenario.arms[site], epoch_unix_ns, put_frames
         task = None if self._arm.chain is None else self._arm.chain.task
@@ -80,7 +126,7 @@ class SiteTopics:
         self._reference = cdr.JointStatePacker(names, effort=False)
 
         def topic(name: str, kind: str, qos: QualityOfService = RELIABLE) -> Callable[[bytes], None]:
-            return graph.publisher(f"{session}/{site}/{name}", kind, qos)
+            return graph.publisher(f"{session}/{site}/{called.get(name, name)}", kind, qos)
 
         self._put_states, self._put_mode = (
             topic("joint_states", cdr.JOINT_STATE),
@@ -245,20 +291,25 @@ def open_bridge(
     session: str,
     scenario: Scenario,
     epoch_unix_ns: int,
+    called: Mapping[str, str],
     say: Callable[[str], None],
 ) -> Bridge:
-    """Returns the bridge of a session that runs, whose topics and services are there from now on."""
+    """Returns the bridge of a session that runs, whose topics and services are there from now on.
+
+    `called` has the names of topics where they are not ours.
+    """
     refusals = Refusals(say)
     frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
     sites = {
-        name: SiteTopics(graph, scenario, session, name, epoch_unix_ns, frames) for name in scenario.names
+        name: SiteTopics(graph, scenario, session, name, epoch_unix_ns, frames, called)
+        for name in scenario.names
     }
     able = [name for name in scenario.names if find_live_hand(scenario.sites[name].hands) is not None]
     targets = []
     for name in able:
         hand = open_hand(bus, clock, session, name, scenario, "ros2")
         last, kind, read, act = describe_target(scenario, name, hand)
-        topic = f"{session}/{name}/{last}"
+        topic = f"{session}/{name}/{called.get(last, last)}"
         targets.append(TargetTopic(hand, topic, read, act, clock, refusals))
         graph.subscribe(topic, kind, targets[-1].take)
     for service, order in list_services(bus, clock, session, scenario):
@@ -345,17 +396,18 @@ def run_bridge(
     records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
     presence = bus.presence(topics.presence_key(session, "*"))
     newest: dict[str, State] = {}
-    shown: dict[str, int] = {}
+    shown: dict[str, tuple[int, int]] = {}
     present: set[str] = set()
     diagnosed_ns = clock.monotonic_ns()
     wake_ns = clock.monotonic_ns()
     while not stopped():
         for record in read_records(records):
             if record.site in bridge.sites:
-                newest[record.site] = record
                 bucket = int(record.t_ns * rate_hz) // NS_PER_S
-                if bucket != shown.get(record.site):
-                    shown[record.site] = bucket
+                boot, last = shown.get(record.site, (record.boot, -1))
+                if bucket > last or record.boot != boot:  # none is shown after a later one
+                    shown[record.site] = record.boot, bucket
+                    newest[record.site] = record
                     bridge.sites[record.site].publish(record)
         for parts, alive in topics.read_presence(presence):
             if parts.member in bridge.sites:
@@ -375,6 +427,7 @@ def serve_ros2(
     running: RunningSession,
     open_graph: Callable[[], Ros2Graph],
     rate_hz: float,
+    called: Mapping[str, str],
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     timeout_s: float,
@@ -385,6 +438,7 @@ def serve_ros2(
         running: the session.
         open_graph: opens the node, if its router answers.
         rate_hz: messages a second of each topic.
+        called: the names of topics, where they are not ours.
         stopped: whether to end.
         say: takes a line for people.
         timeout_s: longest wait for the first answer of a site.
@@ -400,7 +454,7 @@ def serve_ros2(
             return
         scenario, epoch_unix_ns = begun
         with graph:
-            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, say)
+            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called, say)
             held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
             say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
             run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)

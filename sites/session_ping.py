@@ -1,13 +1,16 @@
-"""Ping client: round trips to every member of a session, and the link statistics that its sites publish.
+"""Ping client: round trips to every member of a session, the links of its sites; latency of a topic of ROS 2.
 
-Invariant: read-only. It announces no token; a session neither waits for it nor sees it.
+Invariant: read-only. It announces no token in a session, which neither waits for it nor sees it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
+from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import RunFailed, ScenarioError, SessionError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -18,6 +21,7 @@ from trilat_net.net.membership import MemberQuery, read_messages
 from trilat_net.net.messages import Info, LinkStats
 from trilat_net.net.offset import exact_offset
 from trilat_net.net.pinging import PING_PACE_NS, Pinger
+from trilat_net.net.ros2_graph import Attachment, Ros2Graph
 from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
 
@@ -171,3 +175,72 @@ def ping_session(
             "name, and has it not ended? name other endpoints with --connect"
         )
     return ping.report()
+
+
+@dataclass(frozen=True, repr=False)
+class TopicLatency(Result):
+    """How long messages of a topic of ROS 2 were on their way, for each publisher of it.
+
+    From the time of sending in the attachment of each to its arrival here: it contains the offset between the
+    clocks of the two machines.
+    """
+
+    topic: str
+    lasted_s: float
+    publishers: list[dict[str, Any]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat ping --ros2 --json`."""
+        return {"topic": self.topic, "lasted_s": self.lasted_s, "publishers": self.publishers}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per publisher."""
+        return self.publishers
+
+
+def ping_topic(
+    graph: Ros2Graph, clock: Clock, topic: str, lasts_s: float, stopped: Callable[[], bool]
+) -> TopicLatency:
+    """Listens to a topic of ROS 2 for some time, or until `stopped`.
+
+    Raises:
+        RunFailed: nobody published anything.
+    """
+    heard: dict[bytes, list[tuple[int, int]]] = {}
+    types: dict[bytes, str] = {}
+
+    def take(kind: str, attachment: Attachment) -> None:
+        late_ns = clock.unix_ns() - attachment.sent_unix_ns
+        types[attachment.gid] = kind
+        heard.setdefault(attachment.gid, []).append((attachment.number, late_ns))
+
+    graph.tap(topic, take)
+    begun_ns = clock.monotonic_ns()
+    while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
+        clock.sleep_until(clock.monotonic_ns() + 10 * POLL_NS)
+    lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+    if not heard:
+        raise RunFailed(
+            f"nobody published on /{topic} in {lasted_s:.3g} s: see ros2 topic list, and --domain"
+        )
+    publishers = [
+        {"gid": gid.hex(), "type": types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")}
+        | _describe_latency(list(came), lasted_s)
+        for gid, came in list(heard.items())
+    ]
+    return TopicLatency(topic, lasted_s, publishers)
+
+
+def _describe_latency(came: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
+    """Returns what is known of one publisher; a number that is missing between others was lost."""
+    numbers = {number for number, _ in came}
+    late_us = np.array([late_ns for _, late_ns in came]) / 1e3
+    counts, edges_us = np.histogram(late_us, bins=20)
+    quantiles = {"min": 0.0, "p50": 50.0, "p99": 99.0, "max": 100.0}
+    return {
+        "messages": len(came),
+        "lost": max(numbers) - min(numbers) + 1 - len(numbers),
+        "rate_hz": len(came) / lasted_s,
+        "latency_us": {name: float(np.percentile(late_us, at)) for name, at in quantiles.items()},
+        "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
+    }

@@ -84,6 +84,7 @@ ELSEWHERE = {
     "docs/network.md: trilat ping --session": "tests/live/test_clocks.py",
     "docs/network.md: trilat site m2 --scenario glide.toml": "tests/live/test_returning.py",
     "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
+    "docs/ros2.md: trilat": "tests/live/test_ros2.py",
     "docs/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
     "docs/sweep.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
 }
@@ -98,6 +99,8 @@ NOT_RUN = {
     "docs/maps/p_d.md: trilat sweep p_d_margin --duration 40": "of 640 s; see test_page_numbers.py",
     "docs/maps/round-trips.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws the page itself",
     "docs/maps/tick-rate.md: trilat sweep free": "870 runs: minutes; it draws the page itself",
+    "docs/ros2.md: export RMW": "needs an installation of ROS 2",
+    "docs/ros2.md: ros2": "needs an installation of ROS 2",
     "docs/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }
 """Beginnings of blocks of which only the words are checked, with the reason."""

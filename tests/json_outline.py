@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import trilat_net as tn
-from tests.sites.visits import ping_sites
+from tests.sites.visits import ping_publishers, ping_sites
 from trilat_net.results import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -58,6 +58,7 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
         )
     ],
     "ping": lambda _: [ping_sites()],
+    "ping --ros2": lambda _: [ping_publishers()],
     "ping --benchmark": lambda _: [
         tn.ping_benchmark("p_d_margin", duration_s=2),
         tn.ping_benchmark(EXTERNAL, duration_s=2),

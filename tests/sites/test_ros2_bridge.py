@@ -2,12 +2,20 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.ros2_bridge import SILENCE_NS, Refusals, TargetTopic, read_joint_target, read_place_target
+from sites.ros2_bridge import (
+    SILENCE_NS,
+    Refusals,
+    TargetTopic,
+    read_joint_target,
+    read_place_target,
+    read_topic_names,
+)
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import UsageError
 from trilat_net.log.ros2 import cdr
@@ -126,3 +134,28 @@ def test_joints_that_are_missing_or_not_finite_are_named(
 ) -> None:
     with pytest.raises(ValueError, match=said):
         read_joint_target(NAMES, joints(names, angles))
+
+
+def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
+    (tmp_path / "names.toml").write_text('joint_states = "arm/joint_states"\n')
+    assert read_topic_names(str(tmp_path / "names.toml")) == {"joint_states": "arm/joint_states"}
+    assert read_topic_names("crtk")["target_pose"] == "servo_cp"
+    assert not read_topic_names("crisp")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("joint_state = 'a'", "no topic 'joint_state'.*joint_states"),
+        ("joint_states = 'a b'", "joint_states 'a b' is no name of ROS 2"),
+        ("joint_states", "is no TOML"),
+        ("joint_states = 'a'\nreference = 'a'", "two topics have one name"),
+        (None, "--names is crisp, crtk or a file, and .* cannot be read: No such file"),
+    ],
+)
+def test_names_that_cannot_be_right_are_refused(tmp_path: Path, text: str | None, said: str) -> None:
+    file = tmp_path / "names.toml"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(UsageError, match=said.replace("--names", "names")):
+        read_topic_names(str(file))

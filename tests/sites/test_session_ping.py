@@ -1,13 +1,17 @@
 """A visitor sees who is there and where their clocks stand; nobody sees the visitor."""
 
-from sites.session_ping import GATHER_NS
+import pytest
+
+from sites.session_ping import GATHER_NS, ping_topic
 from tests.json_outline import is_documented
+from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Member, Party, told
+from trilat_net.errors import RunFailed
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.wire import encode
 
-from .visits import S, Visit, link_stats, ping_sites
+from .visits import S, Visit, link_stats, ping_publishers, ping_sites
 
 
 def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
@@ -93,3 +97,26 @@ def test_it_waits_a_little_for_the_others() -> None:
 
 def test_its_json_is_as_documented() -> None:
     assert is_documented("ping", ping_sites().to_dict())
+
+
+def test_the_latency_of_a_topic_of_ros_is_that_of_every_publisher() -> None:
+    found = ping_publishers()
+    first, second = found.publishers
+    assert first["messages"] == 201
+    assert (first["lost"], second["lost"]) == (0, 66)  # the last that it sent is no loss
+    assert first["latency_us"] == {"min": 2000.0, "p50": 2000.0, "p99": 12000.0, "max": 12000.0}
+    assert sum(first["histogram"]["counts"]) == 201
+    assert first["rate_hz"] == pytest.approx(100.0, rel=0.01)
+    text = found.summary()
+    assert "std_msgs/msg/String" in text
+    assert "the clock there is ahead" in text  # of the second
+    assert is_documented("ping --ros2", found.to_dict())
+
+
+def test_a_topic_of_which_nothing_comes_is_said() -> None:
+    class Silent:
+        def tap(self, topic: str, take: object) -> None:
+            del topic, take
+
+    with pytest.raises(RunFailed, match="nobody published on /chatter in 1 s"):
+        ping_topic(Silent(), ManualClock(), "chatter", 1.0, lambda: False)  # type: ignore[arg-type]

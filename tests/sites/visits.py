@@ -1,10 +1,15 @@
 """A visitor of a party: a ping of a session that is on its way or runs, on the party's clock."""
 
-from sites.session_ping import PingReport, SessionPing
+from collections.abc import Callable
+from functools import partial
+
+from sites.session_ping import PingReport, SessionPing, TopicLatency, ping_topic
+from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Party
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION, LinkStats
+from trilat_net.net.ros2_graph import Attachment
 from trilat_net.net.wire import encode
 
 S = 1_000_000_000
@@ -47,3 +52,28 @@ def ping_sites() -> PingReport:
     visit = Visit(party)
     party.say("m", encode(link_stats()), topics.LINK)
     return visit.look().report()
+
+
+class Publishers:
+    """A graph of ROS with two publishers of a topic, of which the second loses a third of its messages."""
+
+    def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
+        del topic
+        self._take, self._n = take, 0
+
+    def publish(self, clock: ManualClock) -> bool:
+        """Publishes at one instant; the first takes 2 ms, and every tenth message 12 ms."""
+        self._n += 1
+        kind, now_ns = "std_msgs::msg::dds_::String_", clock.unix_ns()
+        late_ns = 12_000_000 if self._n % 10 == 0 else 2_000_000
+        self._take(kind, Attachment(self._n, now_ns - late_ns, b"a" * 16))
+        if self._n % 3:  # its clock is ahead
+            self._take(kind, Attachment(self._n, now_ns + 5_000, b"b" * 16))
+        return False
+
+
+def ping_publishers(lasts_s: float = 2.0) -> TopicLatency:
+    """What is measured of these publishers, a message every 10 ms."""
+    graph, clock = Publishers(), ManualClock(0, 10**18)
+    stopped = partial(graph.publish, clock)
+    return ping_topic(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]

@@ -481,17 +481,11 @@ def _say_of_router(text: str) -> None:
     terminal.print_line(f"router: {text}")
 
 
-ROS_ROUTER = "tcp/127.0.0.1:7447"
-
-
 @options.command("--session paper", "--session paper --ros tcp/192.0.2.7:7447 --domain 3")
 def ros2_command(
     session: Annotated[str, value("--session", "ID", "Session to show.")],
-    ros: Annotated[
-        list[str] | None,
-        value("--ros", "EP", f"Endpoint of ROS's Zenoh router (rmw_zenohd); default: {ROS_ROUTER}."),
-    ] = None,
-    domain: Annotated[int, value("--domain", "N", "ROS_DOMAIN_ID.", min=0, max=232)] = 0,
+    ros: options.RosRouterOption = None,
+    domain: options.RosDomainOption = 0,
     distro: Annotated[
         str,
         value("--ros-distro", "humble|jazzy|kilted|lyrical", "Distribution of ROS 2 whose form is written."),
@@ -505,6 +499,9 @@ def ros2_command(
             callback=options.check_range(1.0, 20_000.0, "a rate, Hz,"),
         ),
     ] = 100.0,
+    names: Annotated[
+        str, value("--names", "crisp|crtk|FILE", "Names of the topics of a site, or a TOML file of them.")
+    ] = "crisp",
     timeout: options.AnswerOption = 10.0,
     *,
     reach: options.Reach,
@@ -514,7 +511,7 @@ def ros2_command(
     ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here. The bridge waits
     for the router, and ends with the session. docs/ros2.md has all topics and services.
     """
-    from sites.ros2_bridge import serve_ros2
+    from sites.ros2_bridge import read_topic_names, serve_ros2
     from sites.running_session import RunningSession
 
     from ..errors import UsageError
@@ -525,9 +522,12 @@ def ros2_command(
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
+    called = read_topic_names(names)
     running = RunningSession(name, reach.resolve())
-    open_graph = partial(Ros2Graph, ros or [ROS_ROUTER], name, "trilat", SystemClock(), domain, distro)
+    open_graph = partial(
+        Ros2Graph, ros or [options.ROS_ROUTER], name, "trilat", SystemClock(), domain, distro
+    )
     with Interrupt() as interrupt:
-        serve_ros2(running, open_graph, rate, interrupt.requested, terminal.print_line, timeout)
+        serve_ros2(running, open_graph, rate, called, interrupt.requested, terminal.print_line, timeout)
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)

@@ -206,6 +206,12 @@ LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE"
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
 ]
+ROS_ROUTER = "tcp/127.0.0.1:7447"
+RosRouterOption = Annotated[
+    list[str] | None,
+    value("--ros", "EP", f"Endpoint of ROS's Zenoh router (rmw_zenohd); default: {ROS_ROUTER}."),
+]
+RosDomainOption = Annotated[int, value("--domain", "N", "ROS_DOMAIN_ID.", min=0, max=232)]
 NeedsRecorderOption = Annotated[bool, flag("--needs-recorder", "Wait for a recorder.")]
 
 

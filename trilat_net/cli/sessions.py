@@ -133,13 +133,19 @@ def ping_command(
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
+    ros2: Annotated[
+        str | None, value("--ros2", "TOPIC", "Measure how long messages of this topic of ROS 2 take instead.")
+    ] = None,
+    ros: options.RosRouterOption = None,
+    domain: options.RosDomainOption = 0,
     overrides: options.SetOption = None,
     seconds: Annotated[
         float | None,
         value(
             "--seconds",
             "S",
-            "Duration of all cases together, s; default 24. With --answer: time until it ends.",
+            "Duration of all cases together, s; default 24. With --answer: time until it ends; with "
+            "--ros2: 5.",
             callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
         ),
     ] = None,
@@ -165,14 +171,18 @@ def ping_command(
     delay margin of trilat linear. The far end is trilat ping --answer EP on another machine, given as
     --connect EP; without one it runs here, over TCP, TLS and QUIC. This takes half a minute; exit code 1 if
     the network is not good enough.
+
+    With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any type, unseen
+    (docs/ros2.md).
     """
-    if benchmark is not None or answer:
-        _refuse_others(context, "--answer" if benchmark is None else "--benchmark")
+    ways = {"--benchmark": benchmark is not None, "--ros2": ros2 is not None, "--answer": bool(answer)}
+    _refuse_others(context, next((way for way, chosen in ways.items() if chosen), ""))
     if benchmark is not None:
         return _benchmark(benchmark, overrides, seconds, reach, picture, force=force, as_json=as_json)
+    if ros2 is not None:
+        return _ping_topic(ros2, ros, domain, seconds or 5.0, as_json=as_json)
     if answer:
         return _answer(answer, reach.keys, seconds, insecure=insecure)
-    _refuse_others(context, "")
     from sites.session_ping import ping_session
 
     from ..net.clock import make_system_clock
@@ -194,15 +204,18 @@ def ping_command(
 
 _OF_BENCHMARK = {"--benchmark", "--set", "--seconds", "--figure", "--force", "--connect", "--keys", "--json"}
 _OF_ANSWER = {"--answer", "--seconds", "--keys", "--insecure"}
+_OF_ROS2 = {"--ros2", "--ros", "--domain", "--seconds", "--json"}
 
 
 def _refuse_others(context: typer.Context, way: str) -> None:
-    """Refuses options that have no meaning beside --benchmark, --answer, or neither."""
+    """Refuses options that have no meaning beside --benchmark, --answer, --ros2, or none of them."""
     given = set(options.given_options(context))
-    own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER}.get(way)
-    alone = {"--set", "--seconds", "--figure", "--force", "--insecure"}
+    own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER, "--ros2": _OF_ROS2}.get(way)
+    alone = {"--set", "--seconds", "--figure", "--force", "--insecure", "--ros", "--domain"}
     if other := sorted(given & alone if own is None else given - own):
-        raise UsageError(f"{other[0]}: {f'not with {way}' if way else 'only with --benchmark or --answer'}")
+        raise UsageError(
+            f"{other[0]}: {f'not with {way}' if way else 'only with --benchmark, --answer or --ros2'}"
+        )
 
 
 def _benchmark(
@@ -230,6 +243,20 @@ def _benchmark(
     options.print_drawn(found, picture, draw, as_json=as_json)
     if not found.good:
         raise typer.Exit(1)
+
+
+def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool) -> None:
+    from sites.session_ping import ping_topic
+
+    from ..net.clock import SystemClock
+    from ..net.ros2_graph import Ros2Graph, check_ros_name
+    from ..process import Interrupt
+
+    name, clock = check_ros_name(topic, "topic"), SystemClock()
+    graph = Ros2Graph(routers or [options.ROS_ROUTER], "", "trilat_ping", clock, domain)
+    with graph, Interrupt() as interrupt:
+        found = ping_topic(graph, clock, name, lasts_s, interrupt.requested)
+    terminal.print_result(found, as_json=as_json)
 
 
 def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool) -> None:

@@ -251,6 +251,22 @@ class Ros2Graph:
         key = topic_key(self._place.domain, topic, kind, "*")
         self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
 
+    def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
+        """Gives the type and the attachment of every message of a topic to `take`, in a thread of Zenoh's.
+
+        It listens unseen: no subscription of it is in the graph.
+        """
+
+        def heard(sample: zenoh.Sample) -> None:
+            attachment = _read_attachment(sample.attachment)
+            if attachment is None:
+                self.passed_over[f"{topic}: no attachment"] += 1
+            else:
+                take(str(sample.key_expr).rsplit("/", 2)[1], attachment)
+
+        key = f"{self._place.domain}/{topic}/*/*"
+        self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
+
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
         """Answers the requests of a service, in a thread of its own."""
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
