@@ -9,7 +9,6 @@ counted by its reason, and the first of each reason is said.
 import math
 import threading
 import tomllib
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from trilat_net.errors import TrilatError, UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.robot_model import RobotModel, find_quaternion
+from trilat_net.log.ros2.robot_model import WORLD, RobotModel, find_quaternion
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.net import topics
 from trilat_net.net.arm_client import Hand
@@ -29,7 +28,7 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import State
 from trilat_net.net.requests import OrderName
-from trilat_net.net.ros2_graph import Attachment, QualityOfService, Ros2Graph, check_ros_name
+from trilat_net.net.ros2_graph import Attachment, QualityOfService, Refusals, Ros2Graph, check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
@@ -136,7 +135,11 @@ class SiteTopics:
         self._put_reference = None if self._arm.shares_pose else topic("reference", cdr.JOINT_STATE)
         self._put_wrench = topic("tip_wrench", WRENCH) if self._arm.shares_pose else None
         topic("robot_description", cdr.STRING, LATCHED)(cdr.pack_string(self._robot.description))
-        self._base = self._robot.frames[0][1]
+        spec = scenario.sites[site].arm
+        self._frame, self._placed = self._robot.frames[0][1], any((*spec.base_xyz_m, *spec.base_rpy_rad))
+        if self._placed:  # the end effector is in the frame that the sites share
+            self._frame = f"{site}/shared"
+            self._pack_shared = cdr.TransformPacker([(WORLD, self._frame)]).pack
 
     def publish(self, record: State) -> None:
         """Publishes a record."""
@@ -146,33 +149,20 @@ class SiteTopics:
             self._put_reference(self._reference.pack(stamp_ns, record.q_des, record.qd_des))
         place = [*self._arm.end_effector(record.q), 0.0][:3]
         turned = find_quaternion(self._arm.end_turn(record.q))
-        self._put_pose(cdr.pack_frame_vectors(stamp_ns, self._base, *place, *turned))
+        self._put_pose(cdr.pack_frame_vectors(stamp_ns, self._frame, *place, *turned))
         if self._put_wrench is not None:
             wrench = [
                 *(-scale * one for scale, one in zip(self._scale, record.wrench, strict=False)),
                 *[0.0] * 6,
             ]
-            self._put_wrench(cdr.pack_frame_vectors(stamp_ns, self._base, *wrench[:6]))
+            self._put_wrench(cdr.pack_frame_vectors(stamp_ns, self._frame, *wrench[:6]))
         self._put_frames(self._robot.pack(stamp_ns, record.q))
+        if self._placed:
+            origin, turned = self._robot.shared
+            self._put_frames(self._pack_shared(stamp_ns, [*origin, *turned]))
         if record.mode != self._mode:
             self._mode = record.mode
             self._put_mode(cdr.pack_string(record.mode))
-
-
-class Refusals:
-    """What came from ROS and was not taken: counted by its reason, and said when it is new."""
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self.counts: Counter[str] = Counter()
-        self._say, self._lock = say, threading.Lock()
-
-    def add(self, reason: str) -> None:
-        """Counts one; the first of a reason is said."""
-        with self._lock:
-            self.counts[reason] += 1
-            first = self.counts[reason] == 1
-        if first:
-            self._say(reason)
 
 
 class TargetTopic:
@@ -275,13 +265,11 @@ class Bridge(NamedTuple):
         sites: by name what a site shows.
         targets: the topics that hold arms.
         diagnose: publishes `/diagnostics` of the newest records.
-        refusals: what was not taken.
     """
 
     sites: dict[str, SiteTopics]
     targets: list[TargetTopic]
     diagnose: Callable[[dict[str, State]], None]
-    refusals: Refusals
 
 
 def open_bridge(
@@ -292,13 +280,11 @@ def open_bridge(
     scenario: Scenario,
     epoch_unix_ns: int,
     called: Mapping[str, str],
-    say: Callable[[str], None],
 ) -> Bridge:
     """Returns the bridge of a session that runs, whose topics and services are there from now on.
 
     `called` has the names of topics where they are not ours.
     """
-    refusals = Refusals(say)
     frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
     sites = {
         name: SiteTopics(graph, scenario, session, name, epoch_unix_ns, frames, called)
@@ -310,7 +296,7 @@ def open_bridge(
         hand = open_hand(bus, clock, session, name, scenario, "ros2")
         last, kind, read, act = describe_target(scenario, name, hand)
         topic = f"{session}/{name}/{called.get(last, last)}"
-        targets.append(TargetTopic(hand, topic, read, act, clock, refusals))
+        targets.append(TargetTopic(hand, topic, read, act, clock, graph.refusals))
         graph.subscribe(topic, kind, targets[-1].take)
     for service, order in list_services(bus, clock, session, scenario):
         graph.serve(service, TRIGGER, partial(_answer, order))
@@ -322,7 +308,7 @@ def open_bridge(
         newest_ns = max((record.t_ns for record in records.values()), default=0)
         put_diagnostics(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
 
-    return Bridge(sites, targets, diagnose, refusals)
+    return Bridge(sites, targets, diagnose)
 
 
 class TargetKind(NamedTuple):
@@ -425,7 +411,7 @@ def run_bridge(
 
 def serve_ros2(
     running: RunningSession,
-    open_graph: Callable[[], Ros2Graph],
+    open_graph: Callable[[Refusals], Ros2Graph],
     rate_hz: float,
     called: Mapping[str, str],
     stopped: Callable[[], bool],
@@ -436,7 +422,7 @@ def serve_ros2(
 
     Args:
         running: the session.
-        open_graph: opens the node, if its router answers.
+        open_graph: opens the graph, if its router answers, with what takes refusals.
         rate_hz: messages a second of each topic.
         called: the names of topics, where they are not ours.
         stopped: whether to end.
@@ -449,12 +435,15 @@ def serve_ros2(
         begun = wait(partial(_find_begun, bus, clock, running.name), f"{running.name} has not begun: waiting")
         if begun is None:
             return
-        graph = wait(partial(_try_graph, open_graph), "no router of ROS answers: waiting for it")
+        graph = wait(
+            partial(_try_graph, partial(open_graph, Refusals(say))),
+            "no router of ROS answers: waiting for it",
+        )
         if graph is None:
             return
         scenario, epoch_unix_ns = begun
         with graph:
-            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called, say)
+            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called)
             held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
             say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
             run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)

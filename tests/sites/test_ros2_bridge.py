@@ -1,16 +1,22 @@
 """Targets from ROS 2: what holds an arm, what is refused and how it is said, and when an arm is let go."""
 
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
+import trilat_net
 from sites.ros2_bridge import (
     SILENCE_NS,
-    Refusals,
+    SiteTopics,
     TargetTopic,
     read_joint_target,
     read_place_target,
@@ -19,8 +25,9 @@ from sites.ros2_bridge import (
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import UsageError
 from trilat_net.log.ros2 import cdr
-from trilat_net.net.ros2_graph import Attachment
+from trilat_net.net.ros2_graph import Attachment, Refusals
 
+ROS = get_typestore(Stores.ROS2_JAZZY)
 FIRST, SECOND = Attachment(1, 5, b"a" * 16), Attachment(1, 5, b"b" * 16)
 NAMES = [("m1_q1", "q1"), ("m1_q2", "q2")]
 
@@ -92,7 +99,7 @@ def test_two_publishers_move_nothing_until_one_is_gone() -> None:
     desk.hears(0.3, after_ns=200_000_000)
     assert desk.arm.goals == [(0.1, 0.5), (0.3, 0.5)]
     assert desk.said == [
-        "play/m1/target_pose has two publishers: neither moves the arm until the other is gone"
+        "refused: play/m1/target_pose has two publishers: neither moves the arm until the other is gone"
     ]
     assert desk.refusals.counts.total() == 10
 
@@ -159,3 +166,59 @@ def test_names_that_cannot_be_right_are_refused(tmp_path: Path, text: str | None
         file.write_text(text)
     with pytest.raises(UsageError, match=said.replace("--names", "names")):
         read_topic_names(str(file))
+
+
+def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
+    said: list[str] = []
+    refusals = Refusals(said.append)
+    for n in range(1000):
+        refusals.add(f"reason {n}")
+    assert refusals.counts.total() == 1000
+    assert len(said) == len(refusals.counts) == 65
+
+
+class Listener:
+    """A graph of which the last message of every topic is kept."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, list[bytes]] = defaultdict(list)
+
+    def publisher(self, topic: str, _kind: str, _qos: object) -> Callable[[bytes], None]:
+        return self.last[topic].append
+
+
+def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
+    """Where all links of a site are in `world`, by the transforms alone; rotations by SciPy."""
+    found = {"world": (np.zeros(3), Rotation.identity())}
+    for one in frames:
+        (at, turned), move, turn = (
+            found[one.header.frame_id],
+            one.transform.translation,
+            one.transform.rotation,
+        )
+        place = at + turned.apply([move.x, move.y, move.z])
+        found[one.child_frame_id] = place, turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+    return [where for name, where in found.items() if name.startswith(f"{site}/")] + [found["world"]]
+
+
+@pytest.mark.parametrize("name", ["paper", "six_joints", "unlike_arms", "wall_in_space"])
+def test_the_pose_of_the_tip_is_that_of_a_link_in_the_transforms(name: str) -> None:
+    log = trilat_net.simulate(name, {"duration_s": 0.3})
+    for site in log.sites:
+        graph = Listener()
+        shown = SiteTopics(graph, log.scenario, "t", site, 0, graph.last["tf"].append, {})  # type: ignore[arg-type]
+        shown.publish(log[site].states[-1])
+        messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.last["tf"]]
+        frames = [one for message in messages for one in message.transforms]
+        tip = ROS.deserialize_cdr(graph.last[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped")
+        where, turn = tip.pose.position, tip.pose.orientation
+        held = next(one for one in frames if one.child_frame_id == tip.header.frame_id).transform
+        base = Rotation.from_quat([held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w])
+        place = base.apply([where.x, where.y, where.z])
+        place += [held.translation.x, held.translation.y, held.translation.z]
+        turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+        apart = [
+            max(np.abs(at - place).max(), (way.inv() * turned).magnitude())
+            for at, way in compose(frames, site)
+        ]
+        assert min(apart) < 1e-7

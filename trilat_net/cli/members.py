@@ -516,7 +516,7 @@ def ros2_command(
 
     from ..errors import UsageError
     from ..net.clock import SystemClock
-    from ..net.ros2_graph import DISTROS, Ros2Graph, check_ros_name
+    from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
     from ..process import Interrupt
 
     if distro not in DISTROS:
@@ -524,9 +524,10 @@ def ros2_command(
     name = check_ros_name(options.check_session_name(session), "session")
     called = read_topic_names(names)
     running = RunningSession(name, reach.resolve())
-    open_graph = partial(
-        Ros2Graph, ros or [options.ROS_ROUTER], name, "trilat", SystemClock(), domain, distro
-    )
+
+    def open_graph(refusals: Refusals) -> Ros2Graph:
+        return Ros2Graph(refusals, ros or [options.ROS_ROUTER], name, "trilat", SystemClock(), domain, distro)
+
     with Interrupt() as interrupt:
         serve_ros2(running, open_graph, rate, called, interrupt.requested, terminal.print_line, timeout)
     if interrupt.requested():

@@ -249,11 +249,13 @@ def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: flo
     from sites.session_ping import ping_topic
 
     from ..net.clock import SystemClock
-    from ..net.ros2_graph import Ros2Graph, check_ros_name
+    from ..net.ros2_graph import Refusals, Ros2Graph, check_ros_name
     from ..process import Interrupt
 
     name, clock = check_ros_name(topic, "topic"), SystemClock()
-    graph = Ros2Graph(routers or [options.ROS_ROUTER], "", "trilat_ping", clock, domain)
+    graph = Ros2Graph(
+        Refusals(terminal.print_note), routers or [options.ROS_ROUTER], "", "trilat_ping", clock, domain
+    )
     with graph, Interrupt() as interrupt:
         found = ping_topic(graph, clock, name, lasts_s, interrupt.requested)
     terminal.print_result(found, as_json=as_json)

@@ -14,6 +14,7 @@ import hashlib
 import json
 import re
 import struct
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -166,18 +167,38 @@ SENSOR = QualityOfService(reliable=False, depth=5)
 """What a subscription asks for: it matches every publisher."""
 
 
+_MOST_REASONS = 64
+"""Of refusals that are told apart, since strangers may invent further ones."""
+
+
+class Refusals:
+    """What came from ROS and was not taken: counted by its reason; the first of each reason is said."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self.counts: Counter[str] = Counter()
+        self._say, self._lock = say, threading.Lock()
+
+    def add(self, reason: str) -> None:
+        """Counts one, in whatever thread."""
+        with self._lock:
+            if reason not in self.counts and len(self.counts) >= _MOST_REASONS:
+                reason = "further reasons, which are counted together"
+            self.counts[reason] += 1
+            first = self.counts[reason] == 1
+        if first:
+            self._say(f"refused: {reason}")
+
+
 class Ros2Graph:
     """The graph of ROS as one node of it sees it; a context, which takes that node from the graph.
 
     Args:
+        refusals: takes what comes and cannot be taken.
         routers: endpoints of ROS's router, of which the first that answers is taken.
         namespace, name: of the node.
         clock: tells when a message is sent.
         domain: ROS_DOMAIN_ID.
         distro: of `DISTROS`, the distribution of ROS 2 whose form it writes.
-
-    Attributes:
-        passed_over: how many messages of others were not taken, by their reason.
 
     Raises:
         RouterSilent: no router answers, or not yet.
@@ -186,6 +207,7 @@ class Ros2Graph:
 
     def __init__(
         self,
+        refusals: Refusals,
         routers: Sequence[Endpoint],
         namespace: str,
         name: str,
@@ -202,7 +224,7 @@ class Ros2Graph:
             raise UsageError(f"cannot open a session with {', '.join(map(str, routers))}: {error}") from None
         self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
         self._distro, self._clock, self._endpoints = distro, clock, 0
-        self.passed_over: Counter[str] = Counter()
+        self.refusals = refusals
         self._kept: list[Any] = [self._session.liveliness().declare_token(self._place.token())]
 
     def __enter__(self) -> "Ros2Graph":
@@ -238,13 +260,25 @@ class Ros2Graph:
         return publish
 
     def subscribe(self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]) -> None:
-        """Gives the messages of a topic, of any version of its type, to `take`, in a thread of Zenoh's."""
+        """Gives the messages of a topic, of any version of its type, to `take`, in a thread of Zenoh's.
+
+        Publishers of another type are refused by their tokens.
+        """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
+        others = f"@ros2_lv/{self._place.domain}/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
+
+        def seen(sample: zenoh.Sample) -> None:
+            other = str(sample.key_expr).split("/")[10]
+            if sample.kind == zenoh.SampleKind.PUT and other != name_dds_type(kind):
+                self.refusals.add(f"{topic} is published as {other}, and here it is {name_dds_type(kind)}")
+
+        watcher = handlers.Callback(seen, indirect=False)
+        self._kept.append(self._session.liveliness().declare_subscriber(others, watcher, history=True))
 
         def heard(sample: zenoh.Sample) -> None:
             attachment = _read_attachment(sample.attachment)
             if attachment is None:
-                self.passed_over[f"{topic}: no attachment"] += 1
+                self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
                 take(sample.payload.to_bytes(), attachment)
 
@@ -260,7 +294,7 @@ class Ros2Graph:
         def heard(sample: zenoh.Sample) -> None:
             attachment = _read_attachment(sample.attachment)
             if attachment is None:
-                self.passed_over[f"{topic}: no attachment"] += 1
+                self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
                 take(str(sample.key_expr).rsplit("/", 2)[1], attachment)
 
@@ -275,7 +309,7 @@ class Ros2Graph:
             with query:  # it ends for its sender only when it is dropped
                 asked = _read_attachment(query.attachment)
                 if asked is None or query.payload is None:
-                    self.passed_over[f"{service}: no attachment"] += 1
+                    self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return
                 told = asked._replace(sent_unix_ns=self._clock.unix_ns())
                 query.reply(query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode())

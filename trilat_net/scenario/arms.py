@@ -217,6 +217,7 @@ class ArmModel(NamedTuple):
             return 0.0, 0.0, q[0] + q[1]
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))
+        place_end_effector(rows, np.array(self.chain.tip_m))  # which turns the links into base axes
         return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
     @property

@@ -94,6 +94,7 @@ class RobotModel:
     Attributes:
         description: the URDF, with the names of its links after the site.
         frames: pairs of frames: parent and child, from `WORLD` on.
+        shared: where in `WORLD` the frame is in which the base of the arm is placed.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -119,7 +120,9 @@ class RobotModel:
         upright = _upright(rotate_vector(own, (x, y, z)))
         x, y, z = spec.base_xyz_m
         x, y, z = rotate_vector(upright, (x, y, z))
-        place = (x, y + SPACING_M * scenario.names.index(site), z)
+        beside_m = SPACING_M * scenario.names.index(site)
+        self.shared = ((0.0, beside_m, 0.0), upright)
+        place = (x, y + beside_m, z)
         self._base = (place, multiply_quaternions(upright, own))
         self.description = _describe(root, site, scenario.names.index(site))
         self._packer = TransformPacker(self.frames)
