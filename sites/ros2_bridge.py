@@ -28,7 +28,14 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import State
 from trilat_net.net.requests import OrderName
-from trilat_net.net.ros2_graph import Attachment, QualityOfService, Refusals, Ros2Graph, check_ros_name
+from trilat_net.net.ros2_graph import (
+    Attachment,
+    QualityOfService,
+    Refusals,
+    Ros2Graph,
+    TopicPublisher,
+    check_ros_name,
+)
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
@@ -103,7 +110,7 @@ class SiteTopics:
         graph: publishes.
         scenario, session, site: whose.
         epoch_unix_ns: Unix time of tick 0, from which stamps count.
-        put_frames: publishes on `/tf`.
+        frames: publishes on `/tf`.
         called: the names of topics, where they are not ours.
     """
 
@@ -114,27 +121,25 @@ class SiteTopics:
         session: str,
         site: str,
         epoch_unix_ns: int,
-        put_frames: Callable[[bytes], None],
+        frames: TopicPublisher,
         called: Mapping[str, str],
     ) -> None:
-        self._arm, self._epoch_unix_ns, self._put_frames = scenario.arms[site], epoch_unix_ns, put_frames
+        self._arm, self._epoch_unix_ns, self._frames = scenario.arms[site], epoch_unix_ns, frames
         task = None if self._arm.chain is None else self._arm.chain.task
         self._scale, self._mode = (*[1.0 if task is None else task.scale] * 3, 1.0, 1.0, 1.0), ""
         self._robot, names = RobotModel(scenario, site), Ros2SiteChannels(scenario, site).joints
-        self._states = cdr.JointStatePacker(names)
-        self._reference = cdr.JointStatePacker(names, effort=False)
+        self._pack_states = cdr.JointStatePacker(names).pack
+        self._pack_reference = cdr.JointStatePacker(names, effort=False).pack
 
-        def topic(name: str, kind: str, qos: QualityOfService = RELIABLE) -> Callable[[bytes], None]:
+        def topic(name: str, kind: str, qos: QualityOfService = RELIABLE) -> TopicPublisher:
             return graph.publisher(f"{session}/{site}/{called.get(name, name)}", kind, qos)
 
-        self._put_states, self._put_mode = (
-            topic("joint_states", cdr.JOINT_STATE),
-            topic("mode", cdr.STRING, LATCHED),
-        )
-        self._put_pose = topic("tip_pose", POSE)
-        self._put_reference = None if self._arm.shares_pose else topic("reference", cdr.JOINT_STATE)
-        self._put_wrench = topic("tip_wrench", WRENCH) if self._arm.shares_pose else None
-        topic("robot_description", cdr.STRING, LATCHED)(cdr.pack_string(self._robot.description))
+        self._states, self._modes = topic("joint_states", cdr.JOINT_STATE), topic("mode", cdr.STRING, LATCHED)
+        self._pose = topic("tip_pose", POSE)
+        shares = self._arm.shares_pose
+        self._reference = None if shares else topic("reference", cdr.JOINT_STATE)
+        self._wrench = topic("tip_wrench", WRENCH) if shares else None
+        topic("robot_description", cdr.STRING, LATCHED).put(cdr.pack_string(self._robot.description))
         spec = scenario.sites[site].arm
         self._frame, self._placed = self._robot.frames[0][1], any((*spec.base_xyz_m, *spec.base_rpy_rad))
         if self._placed:  # the end effector is in the frame that the sites share
@@ -142,27 +147,27 @@ class SiteTopics:
             self._pack_shared = cdr.TransformPacker([(WORLD, self._frame)]).pack
 
     def publish(self, record: State) -> None:
-        """Publishes a record."""
+        """Publishes a record, as far as somebody listens."""
         stamp_ns = max(0, self._epoch_unix_ns + record.t_ns)
-        self._put_states(self._states.pack(stamp_ns, record.q, record.qd, record.tau))
-        if self._put_reference is not None:
-            self._put_reference(self._reference.pack(stamp_ns, record.q_des, record.qd_des))
-        place = [*self._arm.end_effector(record.q), 0.0][:3]
-        turned = find_quaternion(self._arm.end_turn(record.q))
-        self._put_pose(cdr.pack_frame_vectors(stamp_ns, self._frame, *place, *turned))
-        if self._put_wrench is not None:
-            wrench = [
-                *(-scale * one for scale, one in zip(self._scale, record.wrench, strict=False)),
-                *[0.0] * 6,
-            ]
-            self._put_wrench(cdr.pack_frame_vectors(stamp_ns, self._frame, *wrench[:6]))
-        self._put_frames(self._robot.pack(stamp_ns, record.q))
-        if self._placed:
-            origin, turned = self._robot.shared
-            self._put_frames(self._pack_shared(stamp_ns, [*origin, *turned]))
+        if self._states.heard:
+            self._states.put(self._pack_states(stamp_ns, record.q, record.qd, record.tau))
+        if self._reference is not None and self._reference.heard:
+            self._reference.put(self._pack_reference(stamp_ns, record.q_des, record.qd_des))
+        if self._pose.heard:
+            place = [*self._arm.end_effector(record.q), 0.0][:3]
+            turned = find_quaternion(self._arm.end_turn(record.q))
+            self._pose.put(cdr.pack_frame_vectors(stamp_ns, self._frame, *place, *turned))
+        if self._wrench is not None and self._wrench.heard:
+            pull = [-scale * one for scale, one in zip(self._scale, record.wrench, strict=False)]
+            self._wrench.put(cdr.pack_frame_vectors(stamp_ns, self._frame, *[*pull, *[0.0] * 6][:6]))
+        if self._frames.heard:
+            self._frames.put(self._robot.pack(stamp_ns, record.q))
+            if self._placed:
+                origin, upright = self._robot.shared
+                self._frames.put(self._pack_shared(stamp_ns, [*origin, *upright]))
         if record.mode != self._mode:
             self._mode = record.mode
-            self._put_mode(cdr.pack_string(record.mode))
+            self._modes.put(cdr.pack_string(record.mode))
 
 
 class TargetTopic:
@@ -300,13 +305,13 @@ def open_bridge(
         graph.subscribe(topic, kind, targets[-1].take)
     for service, order in list_services(bus, clock, session, scenario):
         graph.serve(service, TRIGGER, partial(_answer, order))
-    put_diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+    diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
 
     def diagnose(records: dict[str, State]) -> None:
         """Publishes the state of every site."""
         parts = [_diagnose(session, record) for record in records.values()]
         newest_ns = max((record.t_ns for record in records.values()), default=0)
-        put_diagnostics(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
+        diagnostics.put(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
 
     return Bridge(sites, targets, diagnose)
 

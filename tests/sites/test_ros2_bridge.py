@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -177,14 +177,21 @@ def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
     assert len(said) == len(refusals.counts) == 65
 
 
+class Topic(list[bytes]):
+    """A topic to which somebody listens, and what came on it."""
+
+    heard = True
+    put = list.append
+
+
 class Listener:
-    """A graph of which the last message of every topic is kept."""
+    """A graph in which every topic is heard."""
 
     def __init__(self) -> None:
-        self.last: dict[str, list[bytes]] = defaultdict(list)
+        self.came: dict[str, Topic] = defaultdict(Topic)
 
-    def publisher(self, topic: str, _kind: str, _qos: object) -> Callable[[bytes], None]:
-        return self.last[topic].append
+    def publisher(self, topic: str, _kind: str, _qos: object) -> Topic:
+        return self.came[topic]
 
 
 def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
@@ -206,11 +213,11 @@ def test_the_pose_of_the_tip_is_that_of_a_link_in_the_transforms(name: str) -> N
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
-        shown = SiteTopics(graph, log.scenario, "t", site, 0, graph.last["tf"].append, {})  # type: ignore[arg-type]
+        shown = SiteTopics(graph, log.scenario, "t", site, 0, graph.came["tf"], {})  # type: ignore[arg-type]
         shown.publish(log[site].states[-1])
-        messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.last["tf"]]
+        messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]]
         frames = [one for message in messages for one in message.transforms]
-        tip = ROS.deserialize_cdr(graph.last[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped")
+        tip = ROS.deserialize_cdr(graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped")
         where, turn = tip.pose.position, tip.pose.orientation
         held = next(one for one in frames if one.child_frame_id == tip.header.frame_id).transform
         base = Rotation.from_quat([held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w])

@@ -189,6 +189,29 @@ class Refusals:
             self._say(f"refused: {reason}")
 
 
+class TopicPublisher:
+    """Publishes on a topic.
+
+    Attributes:
+        heard: True while somebody listens: else a message need not be made.
+    """
+
+    def __init__(self, declared: Any, gid: bytes, clock: Clock) -> None:
+        self.heard = False
+        self._declared, self._gid, self._clock = declared, gid, clock
+        self._number = 0
+
+    def match(self, status: Any) -> None:
+        """Learns whether somebody listens, in a thread of Zenoh's."""
+        self.heard = bool(status.matching)
+
+    def put(self, data: bytes) -> None:
+        """Publishes a message."""
+        self._number += 1
+        attachment = Attachment(self._number, self._clock.unix_ns(), self._gid)
+        self._declared.put(data, attachment=attachment.encode())
+
+
 class Ros2Graph:
     """The graph of ROS as one node of it sees it; a context, which takes that node from the graph.
 
@@ -234,30 +257,22 @@ class Ros2Graph:
         if not self._session.is_closed():
             self._session.close()
 
-    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> Callable[[bytes], None]:
+    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> "TopicPublisher":
         """Returns what publishes messages of a type, in CDR, on a topic."""
         key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
         how: dict[str, Any] = {
             "congestion_control": CongestionControl.DROP,
             "reliability": Reliability.RELIABLE if qos.reliable else Reliability.BEST_EFFORT,
         }
-        publisher: Any
         if qos.latched:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
-            publisher = zenoh.ext.declare_advanced_publisher(
-                self._session, key, cache=cache, publisher_detection=True, **how
-            )
+            how |= {"cache": cache, "publisher_detection": True}
+            declared: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
         else:
-            publisher = self._session.declare_publisher(key, **how)
-        self._kept.append(publisher)
-        number = 0
-
-        def publish(data: bytes) -> None:
-            nonlocal number
-            number += 1
-            publisher.put(data, attachment=Attachment(number, self._clock.unix_ns(), gid).encode())
-
-        return publish
+            declared = self._session.declare_publisher(key, **how)
+        made = TopicPublisher(declared, gid, self._clock)
+        self._kept.append(declared.declare_matching_listener(made.match))
+        return made
 
     def subscribe(self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]) -> None:
         """Gives the messages of a topic, of any version of its type, to `take`, in a thread of Zenoh's.
