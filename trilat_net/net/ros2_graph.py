@@ -193,11 +193,11 @@ class TopicPublisher:
     """Publishes on a topic.
 
     Attributes:
-        heard: True while somebody listens: else a message need not be made.
+        heard: True while somebody listens, or may come later: else a message need not be made.
     """
 
-    def __init__(self, declared: Any, gid: bytes, clock: Clock) -> None:
-        self.heard = False
+    def __init__(self, declared: Any, gid: bytes, clock: Clock, *, heard: bool = False) -> None:
+        self.heard = heard
         self._declared, self._gid, self._clock = declared, gid, clock
         self._number = 0
 
@@ -267,9 +267,9 @@ class Ros2Graph:
         if qos.latched:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
             how |= {"cache": cache, "publisher_detection": True}
-            declared: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
-        else:
-            declared = self._session.declare_publisher(key, **how)
+            advanced: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
+            return TopicPublisher(advanced, gid, self._clock, heard=True)
+        declared = self._session.declare_publisher(key, **how)
         made = TopicPublisher(declared, gid, self._clock)
         self._kept.append(declared.declare_matching_listener(made.match))
         return made
