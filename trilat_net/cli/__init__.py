@@ -76,9 +76,9 @@ def _main(
 
 
 _FIRST = (
-    "demo", "live", "site", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router", "sim",
-    "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay", "rerun", "log", "test",
-    "sweep", "bench", "linear",
+    "demo", "live", "site", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router",
+    "ros2", "sim", "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay",
+    "rerun", "log", "test", "sweep", "bench", "linear",
 )  # fmt: skip
 """The order of the help; others follow."""
 _GROUPS: dict[str, dict[str, Any]] = {
