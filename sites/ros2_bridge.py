@@ -10,6 +10,7 @@ import math
 import threading
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -25,9 +26,10 @@ from trilat_net.net import topics
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.discovery import send_change
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import State
-from trilat_net.net.requests import OrderName
+from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.net.ros2_graph import (
     Attachment,
     QualityOfService,
@@ -43,11 +45,13 @@ from trilat_net.scenario.operators import find_live_hand
 from .running_session import RunningSession, meet_sites, open_hand, order_sites, stop_session
 
 POLL_NS = 1_000_000
-"""Between two looks at what has come."""
+"""Least time between two looks at what has come."""
 LOOK_NS = 200_000_000
 """Between two looks for what is not there yet."""
 SILENCE_NS = 200_000_000
 """A target that nobody repeats for so long lets the arm go."""
+RAMP_S = 1.0
+"""Of a change of shares, as of `trilat set dominance`."""
 RIVAL_NS = NS_PER_S
 """A publisher that was heard within this time has not gone."""
 T = TypeVar("T")
@@ -226,6 +230,51 @@ class TargetTopic:
             self._hand.release()
 
 
+class DominanceTopic:
+    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest message wins.
+
+    Args:
+        topic: its name.
+        peers: of the site, in the order of the numbers of a message.
+        change: asks the site, and waits for its reply.
+        refusals: of the bridge.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        peers: Sequence[str],
+        change: Callable[[dict[str, float]], ChangeReply],
+        refusals: Refusals,
+    ) -> None:
+        self.topic, self._peers, self._change, self._refusals = topic, peers, change, refusals
+        self._wanted: dict[str, float] | None = None
+        self._asked: dict[str, float] | None = None
+
+    def take(self, data: bytes, _: Attachment) -> None:
+        """Takes a message, in a thread of Zenoh's."""
+        try:
+            shares = _check_finite(cdr.read_float_array(data))
+            if len(shares) != len(self._peers):
+                raise ValueError(f"has {len(shares)} numbers; the peers are {', '.join(self._peers)}")
+            self._wanted = dict(zip(self._peers, shares, strict=True))
+        except ValueError as error:
+            self._refusals.add(f"{self.topic} {error}")
+
+    def ask(self) -> None:
+        """Asks the site for what is wanted, if that is new; waits for its reply."""
+        if (wanted := self._wanted) is None or wanted == self._asked:
+            return
+        self._asked = wanted
+        try:
+            reply = self._change(wanted)
+        except TrilatError as error:
+            self._refusals.add(f"{self.topic} {error}")
+        else:
+            if not reply.accepted:
+                self._refusals.add(f"{self.topic} {reply.text}")
+
+
 def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
     """Returns the angles of a `JointState` in the order of an arm's joints, whose names it has in any order.
 
@@ -269,11 +318,13 @@ class Bridge(NamedTuple):
     Attributes:
         sites: by name what a site shows.
         targets: the topics that hold arms.
+        dominance: the topics that change who leads.
         diagnose: publishes `/diagnostics` of the newest records.
     """
 
     sites: dict[str, SiteTopics]
     targets: list[TargetTopic]
+    dominance: list[DominanceTopic]
     diagnose: Callable[[dict[str, State]], None]
 
 
@@ -303,6 +354,12 @@ def open_bridge(
         topic = f"{session}/{name}/{called.get(last, last)}"
         targets.append(TargetTopic(hand, topic, read, act, clock, graph.refusals))
         graph.subscribe(topic, kind, targets[-1].take)
+    dominance = []
+    for name in scenario.names:
+        change = partial(_set_dominance, bus, clock, session, name)
+        peers = scenario.peers(name)
+        dominance.append(DominanceTopic(f"{session}/{name}/set_dominance", peers, change, graph.refusals))
+        graph.subscribe(dominance[-1].topic, cdr.FLOAT64_ARRAY, dominance[-1].take)
     for service, order in list_services(bus, clock, session, scenario):
         graph.serve(service, TRIGGER, partial(_answer, order))
     diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
@@ -313,7 +370,7 @@ def open_bridge(
         newest_ns = max((record.t_ns for record in records.values()), default=0)
         diagnostics.put(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
 
-    return Bridge(sites, targets, diagnose)
+    return Bridge(sites, targets, dominance, diagnose)
 
 
 class TargetKind(NamedTuple):
@@ -367,6 +424,11 @@ def list_services(
     yield f"{session}/end", lambda: "; ".join(stop_session(bus, clock, session))
 
 
+def _set_dominance(bus: Bus, clock: Clock, session: str, site: str, shares: dict[str, float]) -> ChangeReply:
+    request = ChangeRequest(dominance=site, to=shares, ramp_s=RAMP_S)
+    return send_change(bus, clock, session, site, request)
+
+
 def _answer(order: Callable[[], str], _request: bytes) -> bytes:
     """Does what a service is asked for; what is refused is an answer as well."""
     try:
@@ -390,6 +452,7 @@ def run_bridge(
     shown: dict[str, tuple[int, int]] = {}
     present: set[str] = set()
     diagnosed_ns = clock.monotonic_ns()
+    poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
     wake_ns = clock.monotonic_ns()
     while not stopped():
         for record in read_records(records):
@@ -410,8 +473,27 @@ def run_bridge(
         if clock.monotonic_ns() - diagnosed_ns > NS_PER_S:
             diagnosed_ns = clock.monotonic_ns()
             bridge.diagnose(newest)
-        wake_ns = max(wake_ns + POLL_NS, clock.monotonic_ns())
+        wake_ns = max(wake_ns + poll_ns, clock.monotonic_ns())
         clock.sleep_until(wake_ns)
+
+
+@contextmanager
+def _asking(dominance: Sequence[DominanceTopic]) -> Iterator[None]:
+    """Asks sites for the shares that are wanted, in a thread of its own, since they take time to reply."""
+    over = threading.Event()
+
+    def ask() -> None:
+        while not over.wait(0.05):
+            for topic in dominance:
+                topic.ask()
+
+    asker = threading.Thread(target=ask, name="shares", daemon=True)
+    asker.start()
+    try:
+        yield
+    finally:
+        over.set()
+        asker.join()
 
 
 def serve_ros2(
@@ -451,7 +533,8 @@ def serve_ros2(
             bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called)
             held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
             say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
-            run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)
+            with _asking(bridge.dominance):
+                run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)
 
 
 def _wait_for(

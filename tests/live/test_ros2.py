@@ -101,6 +101,11 @@ def pose(x: float, y: float) -> Any:
     return types["geometry_msgs/msg/PoseStamped"](types["std_msgs/msg/Header"](stamp, "m1/base"), where)
 
 
+def shares(*numbers: float) -> Any:
+    layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    return ROS.types["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(numbers))
+
+
 @contextmanager
 def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, Any, Stranger]]:
     """A session whose arms people can hold, its bridge, and a stranger behind a router."""
@@ -129,6 +134,7 @@ def test_a_stranger_leads_an_arm_stops_it_and_the_log_is_verified(stage: Stage) 
             time.sleep(1.0 / 60.0)
         led = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
+        ros.publish("t/s/set_dominance", "std_msgs/msg/Float64MultiArray", shares(0.9, 0.1))
         assert ros.call("t/s/stop")[0]
         assert ros.call("t/s/reset") == (False, "s is in stopped; reset is for a site in fault")
         until(lambda: ros.newest("t/s/mode", "std_msgs/msg/String").data == "stopped", 20.0)
@@ -147,6 +153,8 @@ def test_a_stranger_leads_an_arm_stops_it_and_the_log_is_verified(stage: Stage) 
             assert one.position.tolist() == log["m2"].q[row].tolist()
             assert one.effort.tolist() == log["m2"].tau[row].tolist()
         assert np.abs(log["m1"].tau_x).max() > 1.0
+        changes = [json.loads(text) for state in log["s"].states for text in state.cmd]
+        assert [one["to"] for one in changes if "dominance" in one] == [{"m1": 0.9, "m2": 0.1}]
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import trilat_net
 from sites.ros2_bridge import (
     SILENCE_NS,
+    DominanceTopic,
     SiteTopics,
     TargetTopic,
     read_joint_target,
@@ -25,6 +26,7 @@ from sites.ros2_bridge import (
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import UsageError
 from trilat_net.log.ros2 import cdr
+from trilat_net.net.requests import ChangeReply
 from trilat_net.net.ros2_graph import Attachment, Refusals
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -229,3 +231,40 @@ def test_the_pose_of_the_tip_is_that_of_a_link_in_the_transforms(name: str) -> N
             for at, way in compose(frames, site)
         ]
         assert min(apart) < 1e-7
+
+
+def shares(*numbers: float) -> bytes:
+    array = ROS.types["std_msgs/msg/Float64MultiArray"]
+    layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    return bytes(
+        ROS.serialize_cdr(array(layout=layout, data=np.array(numbers)), "std_msgs/msg/Float64MultiArray")
+    )
+
+
+def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
+    asked: list[dict[str, float]] = []
+    said: list[str] = []
+
+    def change(wanted: dict[str, float]) -> ChangeReply:
+        asked.append(wanted)
+        return ChangeReply(member="s", accepted=sum(wanted.values()) == 1.0, text="must sum to 1")
+
+    topic = DominanceTopic("t/s/set_dominance", ["m1", "m2"], change, Refusals(said.append))
+    for data in (
+        shares(0.9, 0.1),
+        shares(0.9, 0.1),
+        shares(0.5, 0.1),
+        shares(1.0),
+        shares(math.nan, 0.0),
+        b"x",
+    ):
+        topic.take(data, FIRST)
+        topic.ask()
+        topic.ask()
+    assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
+    assert said == [
+        "refused: t/s/set_dominance must sum to 1",
+        "refused: t/s/set_dominance has 1 numbers; the peers are m1, m2",
+        "refused: t/s/set_dominance has a number that is not finite",
+        "refused: t/s/set_dominance is not plain CDR, little-endian",
+    ]

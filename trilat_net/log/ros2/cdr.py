@@ -265,6 +265,22 @@ def read_joint_state(payload: bytes) -> RosJoints:
     return RosJoints(names, reader.floats(), reader.floats(), reader.floats())
 
 
+def read_float_array(payload: bytes) -> tuple[float, ...]:
+    """Returns the numbers of a `std_msgs/msg/Float64MultiArray`, whatever its shape.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    reader = CdrReader(payload)
+    (dimensions,) = reader.numbers("I")
+    if dimensions > len(payload):
+        raise ValueError("ends in the middle of a field")
+    for _ in range(dimensions):
+        reader.text(), reader.numbers("I", 2)
+    reader.numbers("I")
+    return reader.floats()
+
+
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
     """Returns the frame of a `PoseStamped` (7 numbers) or a `WrenchStamped` (6), and its numbers.
 
