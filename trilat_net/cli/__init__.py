@@ -108,9 +108,12 @@ def _add_commands() -> None:
     for file in pkgutil.iter_modules(__path__):
         for name, run in vars(import_module(f"{__name__}.{file.name}")).items():
             if hasattr(run, "examples"):
-                first, _, rest = name.removesuffix("_command").partition("_")
-                within = f"{first} {_WITHIN.get(first, '')}{rest}"
-                _add_command(groups[first] if rest else app, within if rest else first, run)
+                words = name.removesuffix("_command").replace("_", "-")
+                first, _, rest = words.partition("-")
+                if first in groups:
+                    _add_command(groups[first], f"{first} {_WITHIN.get(first, '')}{rest}", run)
+                else:
+                    _add_command(app, words, run)
     for name, group in groups.items():
         app.add_typer(group, name=name)
 

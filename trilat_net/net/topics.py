@@ -16,8 +16,6 @@ STOP = "stop"
 SAMPLE = "sample"
 PAST, STATS = "past", "stats"
 MEASURED, HAND, ENABLE = "measured", "hand", "enable"
-
-
 STATS_PER_SECOND = 10
 
 
