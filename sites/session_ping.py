@@ -1,4 +1,4 @@
-"""Ping client: round trips to every member of a session, the links of its sites; latency of a topic of ROS 2.
+"""Ping client: round trips to every member of a session, the links of its sites; delays of a topic of ROS 2.
 
 Invariant: read-only. It announces no token in a session, which neither waits for it nor sees it.
 """
@@ -178,7 +178,7 @@ def ping_session(
 
 
 @dataclass(frozen=True, repr=False)
-class TopicLatency(Result):
+class TopicDelays(Result):
     """How long messages of a topic of ROS 2 were on their way, for each publisher of it.
 
     From the time of sending in the attachment of each to its arrival here: it contains the offset between the
@@ -200,7 +200,7 @@ class TopicLatency(Result):
 
 def ping_topic(
     graph: Ros2Graph, clock: Clock, topic: str, lasts_s: float, stopped: Callable[[], bool]
-) -> TopicLatency:
+) -> TopicDelays:
     """Listens to a topic of ROS 2 for some time, or until `stopped`.
 
     Raises:
@@ -225,13 +225,13 @@ def ping_topic(
         )
     publishers = [
         {"gid": gid.hex(), "type": types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")}
-        | _describe_latency(list(came), lasted_s)
+        | _describe_delays(list(came), lasted_s)
         for gid, came in list(heard.items())
     ]
-    return TopicLatency(topic, lasted_s, publishers)
+    return TopicDelays(topic, lasted_s, publishers)
 
 
-def _describe_latency(came: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
+def _describe_delays(came: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
     """Returns what is known of one publisher; a number that is missing between others was lost."""
     numbers = {number for number, _ in came}
     late_us = np.array([late_ns for _, late_ns in came]) / 1e3
@@ -241,6 +241,6 @@ def _describe_latency(came: Sequence[tuple[int, int]], lasted_s: float) -> dict[
         "messages": len(came),
         "lost": max(numbers) - min(numbers) + 1 - len(numbers),
         "rate_hz": len(came) / lasted_s,
-        "latency_us": {name: float(np.percentile(late_us, at)) for name, at in quantiles.items()},
+        "delay_us": {name: float(np.percentile(late_us, at)) for name, at in quantiles.items()},
         "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
     }

@@ -30,7 +30,7 @@ def test_what_a_key_completes_is_what_there_is() -> None:
 COUNTERPARTS = {
     "import_trace": ["trace import"],
     "run": ["demo"],
-    "start": ["live", "site", "record", "watch", "router", "replay"],
+    "start": ["live", "site", "record", "watch", "router", "ros2", "replay"],
     "session": ["ping", "stop", "enable", "reset", "set link", "set dominance"],
     "simulate": ["sim"],
     "compare": ["compare"],

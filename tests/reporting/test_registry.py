@@ -12,7 +12,7 @@ import trilat_net
 from tests.analysis import logs
 from trilat_net.errors import UsageError
 from trilat_net.reporting.figure_size import COLUMN_IN, PAGE_IN, make_print_size
-from trilat_net.reporting.figures import age_and_lateness, joint_motion, registry
+from trilat_net.reporting.figures import age_and_lateness, joint_motion
 from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
 from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
 
@@ -108,7 +108,7 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     )
     assert "contact" not in list_drawable_figures(logs.busy().log)
     reasons = {name: entry.absent(logs.simulated("free")) for name, entry in FIGURES.items()}
-    assert reasons["operator_torques"] == reasons["hands_moved"] == registry.NO_OPERATOR
+    assert reasons["operator_torques"] == reasons["hands_moved"] == joint_motion.NO_OPERATOR
     assert reasons["loop_timing"] == age_and_lateness.NO_LOOP_CLOCK
     assert not reasons["positions"]
     assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))

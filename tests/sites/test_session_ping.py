@@ -99,12 +99,12 @@ def test_its_json_is_as_documented() -> None:
     assert is_documented("ping", ping_sites().to_dict())
 
 
-def test_the_latency_of_a_topic_of_ros_is_that_of_every_publisher() -> None:
+def test_the_delays_of_a_topic_of_ros_is_that_of_every_publisher() -> None:
     found = ping_publishers()
     first, second = found.publishers
     assert first["messages"] == 201
     assert (first["lost"], second["lost"]) == (0, 66)  # the last that it sent is no loss
-    assert first["latency_us"] == {"min": 2000.0, "p50": 2000.0, "p99": 12000.0, "max": 12000.0}
+    assert first["delay_us"] == {"min": 2000.0, "p50": 2000.0, "p99": 12000.0, "max": 12000.0}
     assert sum(first["histogram"]["counts"]) == 201
     assert first["rate_hz"] == pytest.approx(100.0, rel=0.01)
     text = found.summary()

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
-from sites.session_ping import PingReport, SessionPing, TopicLatency, ping_topic
+from sites.session_ping import PingReport, SessionPing, TopicDelays, ping_topic
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Party
 from trilat_net.net import topics
@@ -72,7 +72,7 @@ class Publishers:
         return False
 
 
-def ping_publishers(lasts_s: float = 2.0) -> TopicLatency:
+def ping_publishers(lasts_s: float = 2.0) -> TopicDelays:
     """What is measured of these publishers, a message every 10 ms."""
     graph, clock = Publishers(), ManualClock(0, 10**18)
     stopped = partial(graph.publish, clock)

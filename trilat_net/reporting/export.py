@@ -60,7 +60,7 @@ class Exporter:
             raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
         self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
         name = log.name.removesuffix(".active").removesuffix(".mcap")
-        self.path, self._force = path or log.with_name(name + self._format.ending), force
+        self.path, self._force = path or log.parent / (name + self._format.ending), force
         self._manifest = EXPORT_MANIFEST if self._format.folder else None
         refuse_existing(self.path, force=force, manifest=self._manifest)
         if self._format.extra:

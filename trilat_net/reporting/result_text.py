@@ -54,7 +54,7 @@ _COMPOSERS = {
     "FileOverview": "overview_tables:compose_overview",
     "NetworkBenchmark": "session_text:compose_benchmark",
     "PingReport": "session_text:compose_ping",
-    "TopicLatency": "session_text:compose_topic_latency",
+    "TopicDelays": "session_text:compose_topic_delays",
     "Recovery": "summary_text:compose_recovery",
     "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "summary_text:compose_rerun",

@@ -38,13 +38,13 @@ def compose_ping(found: Result) -> Iterator[Block]:
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
-def compose_topic_latency(found: Result) -> Iterator[Block]:
-    """Yields a row per publisher, and how its latencies are spread from the least to the largest."""
+def compose_topic_delays(found: Result) -> Iterator[Block]:
+    """Yields a row per publisher, and how its delays are spread from the least to the largest."""
     facts = found.to_dict()
     yield f"/{facts['topic']}, {facts['lasted_s']:.3g} s; times in us, from sending to arrival here"
     rows, least = [], 0.0
     for one in facts["publishers"]:
-        times, counts = one["latency_us"], one["histogram"]["counts"]
+        times, counts = one["delay_us"], one["histogram"]["counts"]
         bars = "".join(_BARS[-(-8 * count // max(counts))] for count in counts)
         numbers = [str(one["messages"]), str(one["lost"]), f"{one['rate_hz']:.1f}"]
         rows.append([one["gid"][:8], one["type"], *numbers, *(f"{times[name]:.0f}" for name in times), bars])
@@ -52,7 +52,7 @@ def compose_topic_latency(found: Result) -> Iterator[Block]:
     headers = ("publisher", "type", "messages", "lost", "Hz", "min", "p50", "p99", "max", "min to max")
     yield TextTable(headers, rows, align="llrrrrrrrl")
     if least < 0.0:
-        yield "latencies below 0: the clock there is ahead of the one here"
+        yield "delays below 0: the clock there is ahead of the one here"
     yield "between two machines these contain the offset of their clocks"
 
 
