@@ -268,6 +268,7 @@ class Ros2Graph:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
             how |= {"cache": cache, "publisher_detection": True}
             advanced: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
+            self._kept.append(advanced)  # else who comes later would find nobody
             return TopicPublisher(advanced, gid, self._clock, heard=True)
         declared = self._session.declare_publisher(key, **how)
         made = TopicPublisher(declared, gid, self._clock)
