@@ -10,6 +10,7 @@ import numpy as np
 from trilat_net.log.log_reader import open_log
 
 from .sessions import SITES, paper
+from .stopwatch import cpu_s
 
 DURATION_S = 600
 WARM_S = 30.0
@@ -38,18 +39,13 @@ def _samples(pids: dict[str, int]) -> Iterator[list[float]]:
     """Yields, once a second: the time, s; of every process what it holds, MiB, and has taken, s."""
     begun = time.monotonic()
     while (t_s := time.monotonic() - begun) < DURATION_S - 2.0:
-        yield [t_s, *(figure for pid in pids.values() for figure in (_held_mib(pid), _taken_s(pid)))]
+        yield [t_s, *(figure for pid in pids.values() for figure in (_held_mib(pid), cpu_s(pid)))]
         time.sleep(1.0)
 
 
 def _held_mib(pid: int) -> float:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def _taken_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _line(name: str, t_s: np.ndarray, columns: np.ndarray) -> str:

@@ -5,7 +5,6 @@ are compared with two socket clients that take every frame and draw nothing, and
 """
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -26,6 +25,8 @@ from websockets.sync.client import connect
 
 import trilat_net
 from trilat_net.net.arm_client import Hand
+
+from .stopwatch import cpu_s
 
 RUN_S, PAIRS, MOVES = 10.0, 5, 60
 POINTER_P50_MS, POINTER_P95_MS, LATENESS_RATIO, SERVER_PERCENT = 60.0, 120.0, 1.3, 30.0
@@ -89,12 +90,6 @@ class SocketClient(threading.Thread):
                 self.t_s = message.get("t", 0.0)
                 n = message["hello"]["n"] if "hello" in message else message["n"]
                 self.socket.send(json.dumps({"do": "seen", "n": n}))
-
-
-def cpu_s(pid: int) -> float:
-    """Processor time of one process without its children, s."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure_once(pages: int) -> tuple[float, float]:

@@ -1,10 +1,8 @@
 """What a bridge to ROS 2 costs the loops: sessions with it, every topic heard at full rate, and without."""
 
 import json
-import os
 import time
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import zenoh
@@ -14,6 +12,7 @@ from trilat_net import open_log
 from trilat_net.net.connection import find_free_endpoints
 
 from .sessions import SITES, paper
+from .stopwatch import cpu_s
 
 RUN_S, PAIRS, RATE_HZ, LATENESS_RATIO = 12, 5, 1000, 1.1
 
@@ -64,9 +63,3 @@ def listen(router: str, pid: int, lasts_s: float = 6.0) -> tuple[float, float]:
                 came += 1
         took_s = time.monotonic() - begun
         return came / took_s, 100.0 * (cpu_s(pid) - before) / took_s
-
-
-def cpu_s(pid: int) -> float:
-    """The processor time of a process so far, s."""
-    fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
-    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")

@@ -10,7 +10,7 @@ import math
 import threading
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -42,7 +42,7 @@ from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators import find_live_hand
 
-from .running_session import RunningSession, meet_sites, open_hand, order_sites, stop_session
+from .running_session import RunningSession, meet_sites, open_hand, order_sites, read_replies, stop_session
 
 POLL_NS = 1_000_000
 """Least time between two looks at what has come."""
@@ -55,11 +55,8 @@ RAMP_S = 1.0
 RIVAL_NS = NS_PER_S
 """A publisher that was heard within this time has not gone."""
 T = TypeVar("T")
-POSE, WRENCH, TRIGGER = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/WrenchStamped",
-    "std_srvs/srv/Trigger",
-)
+POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
+TRIGGER = "std_srvs/srv/Trigger"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 RELIABLE, LATCHED = QualityOfService(), QualityOfService(latched=True, depth=1)
 _OK, _WARNING, _ERROR = 0, 1, 2
@@ -178,7 +175,7 @@ class TargetTopic:
     """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or `target_wrench`.
 
     Args:
-        hand: the hand, which it owns.
+        hand: the hand; its context is that of the bridge.
         topic: its name.
         read: returns the goal of a message; a ValueError says what is wrong with it.
         act: gives a goal to the hand.
@@ -194,7 +191,7 @@ class TargetTopic:
         clock: Clock,
         refusals: Refusals,
     ) -> None:
-        self._hand, self.topic, self._read, self._act = hand, topic, read, act
+        self.hand, self.topic, self._read, self._act = hand, topic, read, act
         self._clock, self._refusals = clock, refusals
         self._lock = threading.Lock()
         self._heard_ns: dict[bytes, int] = {}
@@ -227,7 +224,7 @@ class TargetTopic:
     def _let_go(self) -> None:
         if self._held_ns is not None:
             self._held_ns = None
-            self._hand.release()
+            self.hand.release()
 
 
 class DominanceTopic:
@@ -412,10 +409,7 @@ def list_services(
     orders: tuple[OrderName, ...] = ("stop", "enable", "reset")
 
     def give(order: OrderName, *sites: str) -> str:
-        replies = order_sites(bus, clock, session, sites, order)
-        if refused := [reply.text for reply in replies if not reply.accepted]:
-            raise TrilatError("; ".join(refused))
-        return "; ".join(reply.text for reply in replies)
+        return "; ".join(read_replies(order_sites(bus, clock, session, sites, order)))
 
     for order in orders:
         yield f"{session}/{order}", partial(give, order)
@@ -529,8 +523,10 @@ def serve_ros2(
         if graph is None:
             return
         scenario, epoch_unix_ns = begun
-        with graph:
+        with graph, ExitStack() as hands:
             bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called)
+            for target in bridge.targets:
+                hands.enter_context(target.hand)
             held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
             say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
             with _asking(bridge.dominance):

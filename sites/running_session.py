@@ -65,10 +65,7 @@ class RunningSession:
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
         with self.reach(operates=order != "stop") as bus:
-            replies = order_sites(bus, self._clock, self.name, sites, order)
-        if refused := [reply.text for reply in replies if not reply.accepted]:
-            raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
-        return [reply.text for reply in replies]
+            return read_replies(order_sites(bus, self._clock, self.name, sites, order))
 
     def stop(self, *sites: str) -> list[str]:
         """Stops arms at once, all or some, while the session goes on; as `trilat stop`."""
@@ -258,6 +255,17 @@ def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
         return place_end_effector(rows, tip)
 
     return place
+
+
+def read_replies(replies: Sequence[ChangeReply]) -> list[str]:
+    """Returns what sites replied to an order.
+
+    Raises:
+        RunFailed: one of them refused it.
+    """
+    if refused := [reply.text for reply in replies if not reply.accepted]:
+        raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
+    return [reply.text for reply in replies]
 
 
 def order_sites(

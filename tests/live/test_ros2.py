@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.net.waiting import until
 from trilat_net.net.connection import find_free_endpoints
 
-from .processes import PAPER, Session, Stage, assert_let_go, connections, executed_again, whole
+from .processes import PAPER, Session, Stage, assert_let_go, connections, executed_again, pause, whole
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 TRIGGER = (
@@ -131,7 +131,7 @@ def test_a_stranger_leads_an_arm_stops_it_and_the_log_is_verified(stage: Stage) 
         for n in range(150):
             goal = pose(start.x - 0.15 * min(1.0, n / 60.0), start.y)
             ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", goal)
-            time.sleep(1.0 / 60.0)
+            pause(1.0 / 60.0)
         led = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
         ros.publish("t/s/set_dominance", "std_msgs/msg/Float64MultiArray", shares(0.9, 0.1))
@@ -163,7 +163,7 @@ def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for _ in range(60):
             ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", pose(start.x - 0.1, start.y))
-            time.sleep(1.0 / 60.0)
+            pause(1.0 / 60.0)
         bridge.signal(signal.SIGKILL)
         log = session.is_reproduced()
     assert_let_go(log, "ros2")

@@ -11,12 +11,12 @@ delay its caller.
 """
 
 import hashlib
-import json
 import re
 import struct
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -25,8 +25,8 @@ from zenoh import CongestionControl, Reliability, handlers
 
 from ..errors import UsageError
 from .clock import Clock
-from .zenoh_bus import RouterSilent
-from .zenoh_config import Endpoint, make_zenoh_config
+from .zenoh_bus import open_zenoh
+from .zenoh_config import Endpoint
 
 TYPE_HASHES = {
     "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
@@ -42,7 +42,6 @@ TYPE_HASHES = {
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 _NO_HASH = "TypeHashNotSupported"
 """What Humble writes in place of a hash."""
-MAX_DOMAIN = 232
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
@@ -54,7 +53,6 @@ class EndpointKind(StrEnum):
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
     SERVER = "SS"
-    CLIENT = "SC"
 
 
 class QualityOfService(NamedTuple):
@@ -139,16 +137,16 @@ class GraphPlace(NamedTuple):
 
     def token(self) -> str:
         """Returns the token by which others see it."""
-        return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._place()}"
+        return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
     def endpoint_token(
         self, number: int, end: EndpointKind, name: str, kind: str, type_hash: str, qos: QualityOfService
     ) -> str:
         """Returns the token of one of its endpoints; its number is its own in the session."""
         about = f"{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
-        return f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._place()}/{about}"
+        return f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}/{about}"
 
-    def _place(self) -> str:
+    def _path(self) -> str:
         return f"%/{_mangle('/' + self.namespace) if self.namespace else '%'}/{self.name}"
 
 
@@ -238,16 +236,12 @@ class Ros2Graph:
         domain: int = 0,
         distro: str = "jazzy",
     ) -> None:
-        try:
-            config = make_zenoh_config([], routers, "client", _OWN)
-            self._session: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-        except zenoh.ZError as error:
-            if "Unable to connect" in str(error):
-                raise RouterSilent(f"no router of ROS answers at {', '.join(map(str, routers))}") from None
-            raise UsageError(f"cannot open a session with {', '.join(map(str, routers))}: {error}") from None
+        self._session = open_zenoh([], routers, "client", _OWN, "no router of ROS answers at {}")
         self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
         self._distro, self._clock, self._endpoints = distro, clock, 0
         self.refusals = refusals
+        # not Zenoh's own thread for it: one that waits there when the interpreter ends aborts the process
+        self._answers = ThreadPoolExecutor(1, "services")
         self._kept: list[Any] = [self._session.liveliness().declare_token(self._place.token())]
 
     def __enter__(self) -> "Ros2Graph":
@@ -256,8 +250,10 @@ class Ros2Graph:
     def __exit__(self, *_: object) -> None:
         if not self._session.is_closed():
             self._session.close()
+        self._kept.clear()
+        self._answers.shutdown(cancel_futures=True)
 
-    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> "TopicPublisher":
+    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
         """Returns what publishes messages of a type, in CDR, on a topic."""
         key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
         how: dict[str, Any] = {
@@ -291,15 +287,8 @@ class Ros2Graph:
         watcher = handlers.Callback(seen, indirect=False)
         self._kept.append(self._session.liveliness().declare_subscriber(others, watcher, history=True))
 
-        def heard(sample: zenoh.Sample) -> None:
-            attachment = _read_attachment(sample.attachment)
-            if attachment is None:
-                self.refusals.add(f"{topic}: a message without an attachment of ROS")
-            else:
-                take(sample.payload.to_bytes(), attachment)
-
         key = topic_key(self._place.domain, topic, kind, "*")
-        self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
+        self._listen(key, topic, lambda sample, attachment: take(sample.payload.to_bytes(), attachment))
 
     def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
         """Gives the type and the attachment of every message of a topic to `take`, in a thread of Zenoh's.
@@ -307,18 +296,25 @@ class Ros2Graph:
         It listens unseen: no subscription of it is in the graph.
         """
 
+        def heard(sample: zenoh.Sample, attachment: Attachment) -> None:
+            take(str(sample.key_expr).rsplit("/", 2)[1], attachment)
+
+        self._listen(f"{self._place.domain}/{topic}/*/*", topic, heard)
+
+    def _listen(self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]) -> None:
+        """Gives the messages of a key to `take`, each with its attachment; refuses those without."""
+
         def heard(sample: zenoh.Sample) -> None:
             attachment = _read_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
-                take(str(sample.key_expr).rsplit("/", 2)[1], attachment)
+                take(sample, attachment)
 
-        key = f"{self._place.domain}/{topic}/*/*"
         self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
 
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
-        """Answers the requests of a service, in a thread of its own."""
+        """Answers the requests of a service, one after another with those of others, in a thread for them."""
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
@@ -330,7 +326,7 @@ class Ros2Graph:
                 told = asked._replace(sent_unix_ns=self._clock.unix_ns())
                 query.reply(query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode())
 
-        handler = handlers.Callback(reply, indirect=True)
+        handler: Any = handlers.Callback(lambda query: self._answers.submit(reply, query), indirect=False)
         self._kept.append(self._session.declare_queryable(key, handler, complete=True))
 
     def _declare(self, end: EndpointKind, name: str, kind: str, qos: QualityOfService) -> tuple[str, bytes]:

@@ -82,6 +82,28 @@ class _ZenohQuery(NamedTuple):
             query.reply(self.key, payload)
 
 
+def open_zenoh(
+    listen: Sequence[Endpoint],
+    connect: Sequence[Endpoint],
+    mode: ZenohMode,
+    own: Mapping[str, Any] | None,
+    silent: str,
+) -> Any:
+    """Returns a Zenoh session with the settings of `make_zenoh_config`.
+
+    Raises:
+        UsageError: an endpoint is malformed, or cannot be listened at.
+        RouterSilent: a client's router does not answer: the text `silent`, with the endpoints in place of {}.
+    """
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # logs nothing without RUST_LOG
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own))))
+    except zenoh.ZError as error:
+        if mode == "client" and "Unable to connect" in str(error):
+            raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
+        raise UsageError(_open_problem(error, listen, connect)) from None
+
+
 class ZenohBus:
     """A `Bus` over a Zenoh session of its own, with the settings of a user's file.
 
@@ -101,15 +123,8 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         own: Mapping[str, Any] | None = None,
     ) -> None:
-        zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # logs nothing without RUST_LOG
-        try:
-            config = zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own)))
-            self._session: Any = zenoh.open(config)
-        except zenoh.ZError as error:
-            if mode == "client" and "Unable to connect" in str(error):
-                refused = ", or none lets this member in" if own else ""
-                raise RouterSilent(f"no router answers at {_endpoint_texts(connect)}{refused}") from None
-            raise UsageError(_open_problem(error, listen, connect)) from None
+        refused = ", or none lets this member in" if own else ""
+        self._session = open_zenoh(listen, connect, mode, own, f"no router answers at {{}}{refused}")
         self._kept: list[Any] = []
         self._tokens: set[str] = set()
 

@@ -229,16 +229,27 @@ class CdrReader:
             raise ValueError("ends in the middle of a field")
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
+    def count(self) -> int:
+        """Returns how many entries a list has, each of one byte at least."""
+        (count,) = self.numbers("I")
+        if count > len(self._data) - self._at:
+            raise ValueError("ends in the middle of a field")
+        return int(count)
+
     def text(self) -> str:
         """Returns a string."""
-        (length,) = self.numbers("I")
+        length = self.count()
         (data,) = self.numbers("s", length) if length else (b"",)
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
         """Returns a list of numbers."""
-        (count,) = self.numbers("I")
-        return self.numbers("d", count)
+        return self.numbers("d", self.count())
+
+    def header(self) -> str:
+        """Passes over the stamp of a header; returns its frame."""
+        self.numbers("I", 2)
+        return self.text()
 
 
 class RosJoints(NamedTuple):
@@ -257,11 +268,8 @@ def read_joint_state(payload: bytes) -> RosJoints:
         ValueError: it cannot be read.
     """
     reader = CdrReader(payload)
-    reader.numbers("i"), reader.numbers("I"), reader.text()
-    (count,) = reader.numbers("I")
-    if count > len(payload):
-        raise ValueError("ends in the middle of a field")
-    names = [reader.text() for _ in range(count)]
+    reader.header()
+    names = [reader.text() for _ in range(reader.count())]
     return RosJoints(names, reader.floats(), reader.floats(), reader.floats())
 
 
@@ -272,11 +280,9 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
         ValueError: it cannot be read.
     """
     reader = CdrReader(payload)
-    (dimensions,) = reader.numbers("I")
-    if dimensions > len(payload):
-        raise ValueError("ends in the middle of a field")
-    for _ in range(dimensions):
-        reader.text(), reader.numbers("I", 2)
+    for _ in range(reader.count()):
+        reader.text()
+        reader.numbers("I", 2)
     reader.numbers("I")
     return reader.floats()
 
@@ -288,5 +294,4 @@ def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ..
         ValueError: it cannot be read.
     """
     reader = CdrReader(payload)
-    reader.numbers("i"), reader.numbers("I")
-    return reader.text(), reader.numbers("d", count)
+    return reader.header(), reader.numbers("d", count)
