@@ -37,7 +37,7 @@ from trilat_net.net.messages import VERSION, PeerSample
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.delay_models import ConstantDelay
+from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
 from trilat_net.theory.linear_analysis import analyse_linear_loop
 
 SESSION = "benchmark"

@@ -16,7 +16,7 @@ from trilat_net.core.exogenous import (
     torque_on_arm,
     torque_source_rows,
 )
-from trilat_net.scenario.operators import Multisine
+from trilat_net.scenario.operators.kernel_operators import Multisine
 
 LENGTHS = np.array([1.0, 0.9])
 STEP = 1e-6

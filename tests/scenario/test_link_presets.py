@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.delay_models import HyperExponentialDelay
+from trilat_net.scenario.delay_models.kernel_delays import HyperExponentialDelay
 from trilat_net.scenario.resolve import _PRESETS_FILE, PRESETS
 
 ROUND_TRIPS_MS = {

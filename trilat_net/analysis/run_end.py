@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import LIVE_KINDS, TorqueKind
+from ..core.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -456,13 +456,13 @@ def _find_disagreement(
 def _is_held(scenario: Scenario, trace: RunTrace, n: int, joint: int, end_s: float) -> bool:
     """Returns if a joint is held at the end, by the stiffness of a hand, or of what it touches.
 
-    A hand at the place that it wants needs no torque, and holds all the same.
+    A hand at the place that it wants needs no torque, and holds all the same. An own kind is taken to hold.
     """
     spec = scenario.sites[scenario.names[n]]
     touched = spec.environment if np.abs(trace.tau_x[n]).max() > FORCE_NM else ()
     for actor in (one.actor for one in (*spec.hands, *touched)):
         stiffness = actor.K[joint : joint + 1] if actor.acts == TorqueKind.HAND else actor.K
-        if actor.start_s <= end_s < actor.end_s and any(stiffness):
+        if actor.start_s <= end_s < actor.end_s and (any(stiffness) or actor.acts in OWN_KINDS):
             return True
     return False
 
@@ -496,9 +496,11 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     """Returns when an operator last changed what it does before the end of a run, s; 0 if none ever did."""
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
-    for spec in scenario.sites.values():
+    for name, spec in scenario.sites.items():
+        start = np.array([spec.q0_rad])
+        J = build_arm_rows(scenario, name).place_end_effector(start, 0.0 * start).J[0]
         for source in (one.actor for one in spec.hands if one.actor.acts not in LIVE_KINDS):
-            script = compute_operator_script(source, t_s, np.eye(len(source.a)))
+            script = compute_operator_script(source, t_s, np.eye(len(source.a)) if source.a else J)
             changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
             edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
             last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))

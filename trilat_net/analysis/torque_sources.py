@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import LIVE_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.vectors import Array
 from ..scenario import Scenario, SiteSpec
-from ..scenario.operators import ActorBase
+from ..scenario.operators.interface import ActorBase
 from .aligned import AlignedRecords
 from .arm_rows import EndEffectorRows, build_arm_rows
 
@@ -64,7 +64,7 @@ def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Ar
 def compute_source_torque(
     source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a spring, damper or wall ON the arm, shape (K, n), N m.
+    """Returns the torque of a spring, a damper, a wall or an own kind ON the arm, shape (K, n), N m.
 
     Raises:
         ValueError: it is another source: a scripted torque is no function of the state.
@@ -78,6 +78,11 @@ def compute_source_torque(
         pushed = compute_spring_effort(source, t_s, q, qd)
     elif source.acts is TorqueKind.TASK_HAND:
         effort = compute_spring_effort(source, t_s, end_effector.at, end_effector.speed)
+        pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
+    elif source.acts is TorqueKind.OWN_JOINTS:
+        pushed = source.model.effort(t_s, q, qd)
+    elif source.acts is TorqueKind.OWN_TIP:
+        effort = source.model.effort(t_s, end_effector.at, end_effector.speed)
         pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
     else:
         raise ValueError(f"{source.acts.name} is no function of the state")
@@ -157,7 +162,8 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 
     A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the displacement of its
     target and B times the target's speed, of one of the end effector by the Jacobian J of one pose, shape
-    (2, 2) or (3, n). It moves if and only if the operator does.
+    (2, 2) or (3, n); of an own kind what it does to an arm at zero, at rest. It moves if and only if the
+    operator does.
     """
     if source.acts is TorqueKind.PULSE:
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
@@ -174,6 +180,11 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
     elif source.acts is TorqueKind.MULTISINE and source.table is not None:
         turns = np.outer(t_s - source.start_s, source.table[:, 0]) + source.table[:, 1]
         intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
+    elif source.acts in OWN_KINDS:
+        at_tip = source.acts is TorqueKind.OWN_TIP
+        origin = np.zeros((len(t_s), J.shape[0 if at_tip else 1]))
+        pull = source.model.effort(t_s, origin, origin)
+        intent = pull @ J if at_tip else pull
     else:
         origin = np.zeros((len(t_s), len(source.a)))
         pull = compute_spring_effort(source, t_s, origin, origin)

@@ -14,6 +14,7 @@ from .delay import (
     clamp_delay_us,
     draw_delay_us,
     next_correlated,
+    own_delay_us,
     sine_delay_us,
     trace_delay_us,
 )
@@ -26,7 +27,7 @@ LOST = -1
 """Stands for the time of a sample that is lost."""
 
 _AR1, _SINE = int(DelayKind.AR1), int(DelayKind.SINE)
-_TRACE, _MEASURED = int(DelayKind.TRACE), int(DelayKind.MEASURED)
+_TRACE, _MEASURED, _OWN = int(DelayKind.TRACE), int(DelayKind.MEASURED), int(DelayKind.OWN)
 
 
 @leaf
@@ -71,6 +72,8 @@ def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, po
     if model.kind == _AR1:
         link.memory = next_correlated(key, sample, model.weight, link.memory, fresh)
         return clamp_delay_us(model.location + model.scale * link.memory)
+    if model.kind == _OWN:
+        return clamp_delay_us(own_delay_us(key, sample, stamp_ns, model, points))
     return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
 
 

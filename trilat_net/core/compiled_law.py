@@ -17,7 +17,6 @@ import numba
 import numpy as np
 from numba.core import types
 from numba.core.errors import NumbaError
-from numba.extending import intrinsic
 
 from ..errors import LawFailed, ScenarioError
 from .control import limit_torque
@@ -25,6 +24,7 @@ from .jit import bind_leaf, compile_named, leaf
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
+from .plugged import call_at, digest_beside
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .user_law import LawInput, LawResults, check_results, describe_failure, law_name, list_remembered
@@ -59,22 +59,6 @@ def is_compiled(law: Any) -> bool:
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
 
 
-@intrinsic
-def _call_at(_context: Any, address: Any, law: Any, site: Any, links: Any, received: Any, sent: Any) -> Any:
-    """Calls the compiled function at an address with arrays; what it raises goes on to the caller."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        kinds = signature.args[1:]
-        form = context.call_conv.get_function_type(types.none, kinds)
-        place = builder.inttoptr(values[0], form.as_pointer())
-        status, _ = context.call_conv.call_function(builder, place, types.none, kinds, values[1:])
-        with builder.if_then(status.is_error, likely=False):
-            context.call_conv.return_status_propagate(builder, status)
-        return context.get_dummy_value()
-
-    return types.none(address, law, site, links, received, sent), generate
-
-
 @leaf
 def _all_finite(values: Array) -> bool:
     finite = True
@@ -99,7 +83,7 @@ def law_stage(
     update_law_view(k, t_ns, site, links, chain)
     s: Row = site[0]
     s.asked = 1
-    _call_at(address, law, site, links, channel.received, sent)  # type: ignore[call-arg]
+    call_at(address, (law, site, links, channel.received, sent))
     if not (_all_finite(s.tau[: s.joints]) and _all_finite(s.theta_hat) and _all_finite(sent)):
         raise FloatingPointError
     if not _all_finite(law[: s.remembered]):
@@ -146,15 +130,6 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 
 
 @cache
-def _digest_built_in(torque: Callable[..., Any]) -> str:
-    """Returns a hash of the sources of the laws of this package; empty for a law of somebody else's."""
-    file = Path(torque.__code__.co_filename)
-    if file.parent != Path(__file__).parents[1] / "laws":
-        return ""
-    return hashlib.sha256(b"".join(one.read_bytes() for one in sorted(file.parent.glob("*.py")))).hexdigest()
-
-
-@cache
 def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     """Returns a compiled function of the law's numbers, the site, its links, what came and what is sent."""
     law_dtype, received_dtype, to_all_dtype, sent_dtype = form.law, form.received, form.to_all, form.sent
@@ -177,7 +152,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     rows = [kinds.typeof(np.zeros(1, dtype)) for dtype in (form.site, form.link)]
     floats = types.float64
     signature = types.none(floats[::1], *rows, floats[:, ::1], floats[::1])
-    if made_of := _digest_built_in(torque):
+    if made_of := digest_beside(torque):
         name = hashlib.sha256(f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode())
         return compile_named(call, f"law_{name.hexdigest()[:32]}", signature, **_CHECKED)
     called = numba.njit(signature, **_CHECKED)(call)

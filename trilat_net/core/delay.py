@@ -13,6 +13,7 @@ import numpy as np
 
 from .jit import leaf
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
+from .plugged import call_at
 from .vectors import Points, Row
 
 MAX_DELAY_US = 10_000_000
@@ -27,7 +28,7 @@ class DelayKind(IntEnum):
     HYPER_EXPONENTIAL: `location` + Exp(`scale`), or with probability `weight` + Exp(`extra`).
     AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off at zero.
     SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none is
-    injected; a sample is used as soon as it has come.
+    injected; a sample is used as soon as it has come. OWN: a function of its own, never above `location`.
     """
 
     CONSTANT = 0
@@ -40,6 +41,7 @@ class DelayKind(IntEnum):
     SINE = 7
     TRACE = 8
     MEASURED = 9
+    OWN = 10
 
 
 class TraceEnd(IntEnum):
@@ -56,7 +58,7 @@ class LinkModel(NamedTuple):
         from_ns: the first stamp that it applies to, ns since the epoch.
         kind: a `DelayKind`, which gives `location`, `scale`, `extra` and `weight` their meaning.
         at_end: a `TraceEnd`, of a trace.
-        trace_first: where the points of a trace begin in the site's table.
+        trace_first: where the points of a trace, or the numbers of an own kind, begin in the site's table.
         trace_count: how many they are.
         loss_good: probability that a sample is lost in the good state.
         loss_bad: probability that it is lost in the bad state.
@@ -65,6 +67,8 @@ class LinkModel(NamedTuple):
         duplicate: probability that a sample has a copy, with a delay of its own.
         in_order: 1: no sample is released before an older one; 0: the newest wins.
         playout_us: every sample is held at least so long, us.
+        call: the address of an own kind's function, which sees `key`, `sample` and `stamp_ns`, and writes
+            `drawn_us`; see `plugged`.
     """
 
     from_ns: int = 0
@@ -83,6 +87,11 @@ class LinkModel(NamedTuple):
     duplicate: float = 0.0
     in_order: int = 0
     playout_us: int = 0
+    call: int = 0
+    key: int = 0
+    sample: int = 0
+    stamp_ns: int = 0
+    drawn_us: float = 0.0
 
 
 LINK_MODEL_DTYPE = np.dtype(
@@ -113,6 +122,7 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
         DelayKind.SINE: location + abs(scale),
         DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
         DelayKind.MEASURED: 0.0,
+        DelayKind.OWN: location,
     }[DelayKind(model.kind)]
 
 
@@ -189,6 +199,22 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     before = int(np.searchsorted(points[first : first + count, 0], t_us, side="right")) - 1
     delay_us: int = points[first + max(before, 0), 1]
     return delay_us
+
+
+@leaf
+def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
+    """Returns two uniform numbers for an own kind, a function of the link's key, an index and an attempt."""
+    return uniforms(np.uint64(now.key), index, DELAY, attempt)
+
+
+@leaf
+def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points) -> float:
+    """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a row."""
+    model.key, model.sample, model.stamp_ns = np.int64(key), sample, stamp_ns
+    first, count = model.trace_first, model.trace_count
+    call_at(model.call, (points[first : first + count].reshape(-1).view(np.float64), model))
+    drawn_us: float = model.drawn_us
+    return min(drawn_us, model.location)
 
 
 @leaf

@@ -9,13 +9,14 @@ Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtract
 import math
 from enum import IntEnum
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chain import Three, dot, place_end_effector, three
 from .jit import leaf
+from .plugged import call_at, list_numbers, plug
 from .sincos import sincos
 from .two_link_arm import end_effector_jacobian, forward_kinematics
 from .vectors import Array, Pair, Row, RowArray, Vector
@@ -28,7 +29,8 @@ class TorqueKind(IntEnum):
     target that moves along a minimum-jerk path, of the joints or of the end effector. RECORDED is torque by a
     table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-space, and never
     pulls. CHIRP is a sine whose frequency rises or falls in straight lines, again and again. MULTISINE is a
-    sum of sines of one amplitude. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that
+    sum of sines of one amplitude. OWN_JOINTS and OWN_TIP have a compiled function of their own, of the joints
+    or of the end effector. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that
     somebody moves while the run goes on, LIVE_FORCE is a force that somebody sets, see `live_hand`.
     """
 
@@ -40,15 +42,19 @@ class TorqueKind(IntEnum):
     WALL = 5
     CHIRP = 6
     MULTISINE = 7
-    LIVE_TIP = 8
-    LIVE_FORCE = 9
-    LIVE_JOINT = 10
+    OWN_JOINTS = 8
+    OWN_TIP = 9
+    LIVE_TIP = 10
+    LIVE_FORCE = 11
+    LIVE_JOINT = 12
 
 
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
 """The kinds whose torque is a function of time alone."""
 LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
 """The kinds that act only while somebody takes hold: they come last."""
+OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
+"""The kinds with a function of their own."""
 
 
 class TorqueSource(NamedTuple):
@@ -72,6 +78,7 @@ class TorqueSource(NamedTuple):
         limit: of a live hand: the largest norm of its force, N, or torque, N m.
         grip: of a live hand: how much of its force acts, 0 to 1. Its `a` is its target, or its force, and its
             `b` where the target would be a second later.
+        model: of an own kind what its numbers and its function `act` are of; see `plugged`.
     """
 
     acts: TorqueKind
@@ -87,6 +94,7 @@ class TorqueSource(NamedTuple):
     table: Array | None = None
     limit: float = math.inf
     grip: float = 0.0
+    model: Any = None
 
 
 _SCALARS = ("start_s", "end_s", "move_start_s", "move_end_s", "limit", "grip")
@@ -95,11 +103,14 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the layout of operators and environments whose vectors have up to so many numbers."""
+    """Returns the layout of operators and environments whose vectors have up to so many numbers.
+
+    A function of its own, at the address `call`, reads t_s, coordinates, at and speed, and writes effort.
+    """
     fields = [
-        *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count")),
-        *((name, "f8") for name in _SCALARS),
-        *((name, "f8", (width,)) for name in _NUMBERS),
+        *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count", "call", "coordinates")),
+        *((name, "f8") for name in (*_SCALARS, "t_s")),
+        *((name, "f8", (width,)) for name in (*_NUMBERS, "at", "speed", "effort")),
     ]
     return np.dtype((np.record, fields))
 
@@ -112,6 +123,7 @@ SourceTorque = tuple[float, float, float]
 _PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
 _RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
 _CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
+_OWN_JOINTS, _OWN_TIP = map(int, OWN_KINDS)
 _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 
 
@@ -132,12 +144,18 @@ def torque_source_rows(
         for name in _NUMBERS:
             row[name][: len(getattr(actor, name))] = getattr(actor, name)
         row.acts, row.sampled = int(actor.acts), int(actor.sampled)
-        if actor.table is not None:
-            table = np.zeros((len(actor.table), 1 + joints))
-            table[:, : np.shape(actor.table)[1]] = actor.table
+        row.coordinates = axes if actor.acts is TorqueKind.OWN_TIP else joints
+        given = actor.table
+        if actor.acts in OWN_KINDS:
+            row.call = plug(actor.model, "act", rows.dtype)
+            numbers = list_numbers(actor.model)
+            given = np.resize(numbers, (-(-len(numbers) // (1 + joints)), 1 + joints))
+        if given is not None:
+            table = np.zeros((len(given), 1 + joints))
+            table[:, : np.shape(given)[1]] = given
             tables.append(table)
-            row.table_first, row.table_count = first, len(actor.table)
-            first += len(actor.table)
+            row.table_first, row.table_count = first, len(table)
+            first += len(table)
     return rows, np.ascontiguousarray(np.concatenate(tables))
 
 
@@ -270,11 +288,32 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 @leaf
 def _is_at_end_effector(actor: Row) -> bool:
     acts: int = actor.acts
-    return acts in (_TASK_HAND, _WALL, _LIVE_TIP, _LIVE_FORCE)
+    return acts in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
 
 
 @leaf
-def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector) -> SourceTorque:
+def _ask_own(actor: Row, t_s: float, table: TorqueTable) -> None:
+    """Has the function of an own kind write its effort; `at` and `speed` are in its row."""
+    actor.t_s = t_s
+    for i in range(actor.coordinates):
+        actor.effort[i] = 0.0
+    first = actor.table_first
+    call_at(actor.call, (table[first : first + actor.table_count].reshape(-1), actor))
+
+
+@leaf
+def _own_pair(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
+    """Returns the effort of an own kind along two joints or axes."""
+    for i in range(2):
+        actor.at[i], actor.speed[i] = at[i], speed[i]
+    _ask_own(actor, t_s, table)
+    return actor.effort[0], actor.effort[1]
+
+
+@leaf
+def _end_effector_torque(
+    actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
+) -> SourceTorque:
     """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a wall."""
     _, at = forward_kinematics(lengths, q)
     x, y = end_effector_jacobian(lengths, q)
@@ -283,6 +322,8 @@ def _end_effector_torque(actor: Row, t_s: float, q: Vector, qd: Vector, lengths:
     if actor.acts == _WALL:
         force = _wall_force(actor, at, speed)
         wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
+    elif actor.acts == _OWN_TIP:
+        force = _own_pair(actor, t_s, at, speed, table)
     else:
         force = _spring_force(actor, t_s, at, speed)
     return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1], wall_n
@@ -301,8 +342,10 @@ def source_torque(
         torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
     elif actor.acts == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
+    elif actor.acts == _OWN_JOINTS:
+        torque = _own_pair(actor, t_s, q, qd, table)
     elif _is_at_end_effector(actor):
-        return _end_effector_torque(actor, t_s, q, qd, lengths)
+        return _end_effector_torque(actor, t_s, q, qd, lengths, table)
     else:
         size = _scripted_size(actor, t_s, table)
         torque = actor.a[0] * size, actor.a[1] * size
@@ -332,8 +375,13 @@ def torque_on_arm(
 
 
 @leaf
-def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three) -> Three:
-    """Returns the force of a spring or a wall on an end effector in three dimensions, N."""
+def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable) -> Three:
+    """Returns the force of a spring, a wall or an own kind on an end effector in three dimensions, N."""
+    if actor.acts == _OWN_TIP:
+        for i in range(3):
+            actor.at[i], actor.speed[i] = at[i], speed[i]
+        _ask_own(actor, t_s, table)
+        return three(actor.effort)
     if actor.acts != _WALL:
         progress, rate = _target_progress(actor, t_s)
         x = _spring_along(actor, 0, progress, rate, at[0], speed[0])
@@ -376,6 +424,12 @@ def _add_joint_torque(
         if low >= 0:
             for i in range(joints):
                 torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
+    elif actor.acts == _OWN_JOINTS:
+        for i in range(joints):
+            actor.at[i], actor.speed[i] = q[i], qd[i]
+        _ask_own(actor, t_s, table)
+        for i in range(joints):
+            torque[i] += actor.effort[i]
     else:
         size = _scripted_size(actor, t_s, table)
         for i in range(joints):
@@ -424,7 +478,7 @@ def put_torque_on_chain(
         if not placed:
             at, speed = _tip_motion(qd, tip, chain)
             placed = True
-        force = _force_in_space(actor, t_s, at, speed)
+        force = _force_in_space(actor, t_s, at, speed, table)
         for i in range(n):
             torque[i] += dot(three(chain[i].J_lin), force)
         if actor.acts == _WALL:

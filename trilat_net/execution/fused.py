@@ -37,7 +37,7 @@ from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode
 from ..core.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError
 from ..scenario import Scenario
-from ..scenario.operators import Wall
+from ..scenario.operators.kernel_operators import Wall
 from ..scenario.validate import refuse_external_arms
 
 

@@ -7,7 +7,7 @@ path of the key and the nearest valid name.
 from .arms import Arm as Arm
 from .delay_models import Link as Link
 from .expect import Expect as Expect
-from .operators import Pulse as Pulse
+from .operators.kernel_operators import Pulse as Pulse
 from .override import apply_overrides as apply_overrides
 from .run_changes import find_owner as find_owner
 from .run_changes import initial_link_tables as initial_link_tables

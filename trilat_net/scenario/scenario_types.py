@@ -28,7 +28,8 @@ from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel
 from .arms import Arm, ArmModel, Task, build_arm
-from .delay_models import Link, LinkBase
+from .delay_models import Link
+from .delay_models.interface import LinkBase
 from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw

@@ -5,11 +5,9 @@ refused before anything runs, with the reason.
 """
 
 import functools
-import math
 import operator
 import threading
 from collections.abc import Collection, Sequence
-from itertools import pairwise
 from typing import get_args
 
 import msgspec
@@ -23,7 +21,8 @@ from ..files import find_page
 from ..laws.sent_vectors import check_sends
 from . import operators
 from .arms import TASK_AXES
-from .delay_models import ConstantDelay, LinkBase, TraceDelay
+from .delay_models.interface import LinkBase
+from .delay_models.kernel_delays import ConstantDelay, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
 from .imported_law import ImportedLaw
@@ -371,31 +370,10 @@ def _check_task_poses(scenario: Scenario) -> None:
 
 
 def _check_actors(actors: Sequence[operators.Operator | operators.Environment], path: str) -> None:
-    """Refuses actors that end before they begin, walls without a side, and recorded torque out of order."""
+    """Refuses operators and environments with a problem that no single key shows."""
     for n, actor in enumerate(actors):
-        key, problem = "", ""
-        if isinstance(actor, operators.LiveHand):
-            continue
-        if isinstance(actor, operators.RecordedTorque):
-            if any(b[0] <= a[0] for a, b in pairwise(actor.points)):
-                key, problem = "points", "must be in the order of their times"
-        elif actor.end_s <= actor.start_s:
-            key, problem = "end_s", f"must be later than start_s = {actor.start_s:g}, is {actor.end_s:g}"
-        elif isinstance(actor, operators.Multisine) and len(actor.phases_rad) not in (
-            0,
-            len(actor.frequencies_hz),
-        ):
-            key, problem = "phases_rad", f"must be {len(actor.frequencies_hz)} angles, as many as frequencies"
-        elif isinstance(actor, operators.Wall) and math.hypot(*actor.normal) < 1e-6:
-            key, problem = "normal", "must point somewhere, is zero"
-        elif (
-            isinstance(actor, operators.JointSpring | operators.EndEffectorSpring)
-            and actor.move_end_s < actor.move_start_s
-        ):
-            start_s, end_s = actor.move_start_s, actor.move_end_s
-            key, problem = "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
-        if problem:
-            raise ScenarioError(problem, path=f"{path}[{n}].{key}")
+        if found := actor.find_problem():
+            raise ScenarioError(found.problem, path=f"{path}[{n}].{found.key}")
 
 
 def _check_live_hands(site: SiteSpec, path: str) -> None:

@@ -24,7 +24,7 @@ from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
-from ..scenario.delay_models import ConstantDelay
+from ..scenario.delay_models.kernel_delays import ConstantDelay
 from .characteristic_roots import compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows
 from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum

@@ -20,7 +20,7 @@ from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.imported_law import ImportedLaw
-from ..scenario.operators import Chirp, Multisine
+from ..scenario.operators.kernel_operators import Chirp, Multisine
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw

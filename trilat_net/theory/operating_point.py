@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.delay import DelayKind
-from ..core.exogenous import LIVE_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.philox import link_key
 from ..core.site_setup import Gains, Scheme, SiteSetup, StaleAction
 from ..core.ticks import NS_PER_S
@@ -25,7 +25,7 @@ from ..errors import ScenarioError
 from ..files import find_page
 from ..laws.linear_form import LinearForm, LinearSituation
 from ..scenario import Scenario
-from ..scenario.delay_models import LinkBase
+from ..scenario.delay_models.interface import LinkBase
 from ..scenario.imported_law import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
@@ -281,8 +281,9 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
     constant = [actor._replace(a=_scripted_torque(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):
         notes.append(f"a scripted torque acts on {name} at the end: taken to stay as it is then")
-    others = (actor for actor in present if actor.acts not in (*SCRIPTED_KINDS, *LIVE_KINDS))
-    return setup._replace(actors=(*others, *constant))
+    own = (actor._replace(move_end_s=end_s) for actor in present if actor.acts in OWN_KINDS)
+    others = (actor for actor in present if actor.acts not in (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS))
+    return setup._replace(actors=(*others, *own, *constant))
 
 
 _PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import SCRIPTED_KINDS, TorqueKind, TorqueSource
+from ..core.exogenous import OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .numeric_law import NumericLaw
@@ -243,7 +243,10 @@ def _sum_actors(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sa
 
 
 def _actor_torque(arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers, qd: Numbers) -> Numbers:
-    """Returns the torque of one actor: an operator's motion has ended, a scripted torque is constant, `a`."""
+    """Returns the torque of one actor: an operator's motion has ended, a scripted torque is constant, `a`.
+
+    One of an own kind stays as it is at `move_end_s`.
+    """
     if actor.acts in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
     stiffness, damping = _as_columns(actor.K, q), _as_columns(actor.B, q)
@@ -254,6 +257,11 @@ def _actor_torque(arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers,
         return torque
     J, position = arm.position_jacobian(), arm.end_effector_position()
     velocity = multiply_columns(J, qd)
+    if actor.acts in OWN_KINDS:
+        at_tip = actor.acts is TorqueKind.OWN_TIP
+        seen = (np.moveaxis(one, 0, -1) for one in ((position, velocity) if at_tip else (q, qd)))
+        effort = np.moveaxis(actor.model.effort(np.array(actor.move_end_s), *seen), -1, 0)
+        return multiply_columns(np.swapaxes(J, 0, 1), effort) if at_tip else effort
     if actor.acts is TorqueKind.TASK_HAND:
         force = stiffness * (_as_columns(actor.b, q) - position) - damping * velocity
     else:

@@ -26,7 +26,7 @@ from ...core.vectors import Array
 from ...errors import UsageError
 from ...files import make_results_folder, write_whole
 from ...scenario import Scenario
-from ...scenario.operators import ViscousEnvironment
+from ...scenario.operators.kernel_operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..record_batches import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program

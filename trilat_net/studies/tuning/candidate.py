@@ -39,7 +39,7 @@ from ...errors import ScenarioError
 from ...log.log_reader import Log
 from ...scenario import Scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
-from ...scenario.operators import JointSpring, Wall
+from ...scenario.operators.kernel_operators import JointSpring, Wall
 from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ...scenario.validate import refuse_live_only
 from ..commands import format_command, format_toml_value, set_options
