@@ -23,3 +23,17 @@ def drop(folder: Path, room: str, file: str, text: str) -> None:
     for one in (Path(trilat_net.__file__).parent / room).iterdir():
         (folder / room / one.name).symlink_to(one)
     (folder / room / file).write_text(text)
+
+
+def put_beside(folder: Path, room: str, file: str, text: str) -> None:
+    """Puts a file beside those of a room of the package, in a copy made of links below `folder`."""
+    at, of = folder / "trilat_net", Path(trilat_net.__file__).parent
+    for below in (*Path(room).parts, ""):
+        if at.is_symlink():  # of a file put beside others before
+            at.unlink()
+        at.mkdir(exist_ok=True)
+        for one in of.iterdir():
+            if one.name not in (below, "__pycache__") and not (at / one.name).exists():
+                (at / one.name).symlink_to(one)
+        at, of = at / below, of / below
+    (at / file).write_text(text)

@@ -1,6 +1,7 @@
 """What acts on an arm, Eq. (8), against closed forms, potentials and NumPy."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from scipy import signal
 
 from tests.core.physical_arms import Array, angles, speeds
 from trilat_net.core.exogenous import (
+    OWN_KINDS,
     TorqueKind,
     TorqueSource,
     minimum_jerk,
     torque_on_arm,
     torque_source_rows,
 )
+from trilat_net.scenario.operators.interface import OwnActor
 from trilat_net.scenario.operators.kernel_operators import Multisine
 
 LENGTHS = np.array([1.0, 0.9])
@@ -198,11 +201,18 @@ def test_what_is_sampled_and_what_is_not_are_asked_apart() -> None:
     assert torque(1.0, rest, rest, held, other, sampled=True).tolist() == [1.0, 1.0]
 
 
+class ConstantEffort(OwnActor, frozen=True, tag="constant_effort"):
+    def act(self, now: Any) -> None:
+        for i in range(now.coordinates):
+            now.effort[i] = 1.0
+
+
 @pytest.mark.parametrize("acts", list(TorqueKind))
 def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None:
     table = np.array([[0.0, 1.2, 1.0], [9.0, 1.0, 1.0]])
     vectors = {"a": (1.0, 0.0), "b": (-1.0, 0.0), "K": (9.0, 9.0), "B": (1.0, 1.0)}
-    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0)
+    model = ConstantEffort() if acts in OWN_KINDS else None
+    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0, model=model)
     q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
         assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]

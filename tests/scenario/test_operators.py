@@ -17,7 +17,11 @@ VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 1.0}
 WALL = {"kind": "wall", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m": 2000.0}
 CHIRP = {"kind": "chirp", "peak_nm": 1.0, "from_hz": 0.5, "to_hz": 5.0, "sweep_s": 4.0}
 MULTISINE = {"kind": "multisine", "amplitude_nm": 1.0, "frequencies_hz": [0.5, 1.25]}
-GROUPS = {"hands": [PULSE, SPRING, TIP, RECORDED, CHIRP, MULTISINE], "environment": [VISCOUS, WALL]}
+BODY = {"kind": "hunt_crossley", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m15": 2000.0}
+GROUPS = {
+    "hands": [PULSE, SPRING, TIP, RECORDED, CHIRP, MULTISINE],
+    "environment": [BODY, VISCOUS, WALL],
+}
 
 
 def refused(group: str, entry: Any) -> str:

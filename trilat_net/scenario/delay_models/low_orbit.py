@@ -6,8 +6,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from ...core.delay import draw_pair
-from ...fields import KeyProblem
-from .interface import MAX_DELAY_MS, Milliseconds, OwnDelay
+from .interface import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
@@ -42,8 +41,3 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _reach_ms(self) -> float:
         """The largest draws of both, -log 2^-53."""
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)
-
-    def _find_delay_problem(self) -> KeyProblem | None:
-        if (reach_ms := self._reach_ms()) > MAX_DELAY_MS:
-            return KeyProblem("path_ms", f"with its rarest draws the delay reaches {reach_ms:g} ms")
-        return None

@@ -96,14 +96,14 @@ class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
     """An operator at the end effector: a spring and a damper in the plane, towards a point that moves.
 
     Attributes:
-        words: ClassVar[Mapping[str, str]] = _AXES_WORDS
-
-    to_m: the point that it moves to, x and y, m.
+        to_m: the point that it moves to, x and y, m.
         from_m: the point before, m; left out: the end effector's start position.
         stiffness_n_m: along x and y, N/m.
         damping_n_s_m: along x and y, N s/m.
         move_start_s: as of `JointSpring`, like those that follow.
     """
+
+    words: ClassVar[Mapping[str, str]] = _AXES_WORDS
 
     to_m: fields.Point
     from_m: fields.Point
@@ -237,9 +237,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     in the period, as nothing but the arm resists it.
 
     Attributes:
-        words: ClassVar[Mapping[str, str]] = _AXES_WORDS
-
-    mode: "tip": a spring at the end effector, "joint": a spring at every joint, both towards a target
+        mode: "tip": a spring at the end effector, "joint": a spring at every joint, both towards a target
             that somebody moves; "force": a force at the end effector that somebody sets.
         stiffness_n_m: of "tip", along each axis, N/m.
         damping_n_s_m: of "tip", along each axis, N s/m.
@@ -250,6 +248,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         torque_limit_nm: of "joint", the largest norm of its torques, N m.
         speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
     """
+
+    words: ClassVar[Mapping[str, str]] = _AXES_WORDS
 
     mode: Literal["tip", "joint", "force"] = "tip"
     stiffness_n_m: fields.NotNegativeAxes = (300.0,)
