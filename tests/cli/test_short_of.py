@@ -61,6 +61,7 @@ def test_too_little_memory_is_said_in_one_line(mib: int, words: Sequence[str], t
     assert "error: there is too little memory" in done.stderr
 
 
+@pytest.mark.long
 def test_without_docstrings_commands_work_and_say_that_their_help_is_gone(tmp_path: Path) -> None:
     program = [sys.executable, "-OO", "-m", "trilat_net"]
     for words, said in (

@@ -131,7 +131,7 @@ def test_a_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str,
 
 
 LOSSY = [
-    ({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0),
+    pytest.param({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0, marks=pytest.mark.long),
     ({"model": "constant", "delay_ms": 68.0, "loss": 0.02}, 20.0),
     pytest.param({"preset": "4g"}, 240.0, marks=pytest.mark.long),
 ]
@@ -160,7 +160,13 @@ def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: fl
     assert np.abs(np.diff(tau[10000:])).max() < 0.03
 
 
-@pytest.mark.parametrize(("link", "reserve_J"), [(JITTER, 0.01), (JITTER, 0.0), (CONSTANT, 0.01)])
+@pytest.mark.parametrize(
+    ("link", "reserve_J"),
+    [
+        (JITTER, 0.01),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((JITTER, 0.0), (CONSTANT, 0.01))),
+    ],
+)
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
     """Where delays vary and nothing damps: two ends, two joints, a reserve in H and one in W."""
     control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}

@@ -202,6 +202,7 @@ def test_a_sine_over_whole_periods() -> None:
 ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 
 
+@pytest.mark.long
 def test_a_trace_that_is_looped_has_the_moments_of_one_pass() -> None:
     link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
     delays = delays_us(link, 1, 1250 * 800)

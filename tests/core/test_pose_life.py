@@ -81,6 +81,7 @@ def test_the_way_to_peers_at_rest_is_the_shortest_turn_at_the_speed_that_is_allo
     assert np.linalg.norm(run["rate"], axis=1).max() == pytest.approx(SPEED, rel=1e-6)
 
 
+@pytest.mark.long
 def test_neither_the_orientation_nor_its_velocity_jumps_while_peers_turn_and_fall_silent() -> None:
     """Waits, aligns, follows, holds, and is back over a long way: to the third order of the tick."""
     spin = (0.7, -1.1, 0.6)
@@ -105,6 +106,7 @@ def test_neither_the_orientation_nor_its_velocity_jumps_while_peers_turn_and_fal
     assert apart.magnitude().max() <= 1e-12
 
 
+@pytest.mark.long
 def test_farther_than_the_limit_is_not_gone_to_by_the_whole_turn() -> None:
     """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
     arrays = build(POSE)

@@ -50,7 +50,7 @@ def test_a_site_that_is_stopped_goes_on_learning() -> None:
     ("limits", "reason"),
     [
         ({"q_max_rad": [0.5, 1.2]}, LifeReason.LIMIT_Q),
-        ({"q_min_rad": [-0.2, -4.0]}, LifeReason.LIMIT_Q),
+        pytest.param({"q_min_rad": [-0.2, -4.0]}, LifeReason.LIMIT_Q, marks=pytest.mark.long),
         ({"qd_limit_rad_s": 0.4}, LifeReason.LIMIT_QD),
     ],
 )
@@ -165,6 +165,7 @@ def test_a_site_of_another_rule_knows_no_orders() -> None:
         make_site_order(load_scenario("free"), "s", "stop", 0)
 
 
+@pytest.mark.long
 def test_stops_and_returns_step_no_more_than_the_run_without_them() -> None:
     """Arms that begin 3 rad apart, without a limit of the torque's rate."""
     text = adaptive_text().replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]")

@@ -147,6 +147,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     assert found["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
 
 
+@pytest.mark.long
 def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
     fused = FusedRun(scenario, apart_rad=0.01)

@@ -59,6 +59,7 @@ def test_histograms_count_every_tick():
         assert age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
 
 
+@pytest.mark.long
 def test_a_log_without_events_has_no_markers():
     log = logs.simulated("paper")
     for name in registry.list_drawable_figures(log):

@@ -88,6 +88,7 @@ def test_a_site_waits_for_one_that_left_no_longer_than_it_is_told(tmp_path: Path
     assert 1.0 < end.ticks / 200 - lost.t_ns / S < 1.3
 
 
+@pytest.mark.long
 def test_a_site_that_left_in_order_may_come_back_and_leave_again(tmp_path: Path) -> None:
     session = Session.whole(gliding(9.0), tmp_path, ends={})
     session.interrupt("s", 3 * S, 15)
@@ -317,6 +318,7 @@ def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: P
     assert verify(log).differing == 0
 
 
+@pytest.mark.long
 def test_recorders_that_follow_each_other_agree_on_what_was_not_made(tmp_path: Path) -> None:
     """The first one is gone before a site comes back, the second begins while it is away."""
     stops_ns = 3 * S + 500_000_000

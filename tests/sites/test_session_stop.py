@@ -141,6 +141,7 @@ def test_a_session_that_is_not_there_is_not_stopped() -> None:
         stop_session(LocalNetwork().join(), ManualClock(), "t")
 
 
+@pytest.mark.long
 def test_who_watches_sees_a_site_come_back_and_stop_reaches_those_that_are_there(tmp_path: Path) -> None:
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "rate_hz": 200}
     session = Session.whole(load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={})

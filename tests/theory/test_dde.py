@@ -11,6 +11,7 @@ from tests.virtual_runs import sampled
 from trilat_net.scenario import load_scenario
 
 
+@pytest.mark.long
 def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
     """The hands-free start of Section IV: with theta_hat(0) = 0 both joints fall with (-g, +g)."""
     paper = exact("paper")
@@ -24,7 +25,10 @@ def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None
 
 @pytest.mark.parametrize(
     ("name", "bound"),
-    [("paper", 1e-5), pytest.param("paper_rods", 1e-5, marks=pytest.mark.long), ("free", 1.1e-5)],
+    [
+        ("paper", 1e-5),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (("paper_rods", 1e-5), ("free", 1.1e-5))),
+    ],
 )
 def test_second_order_is_within_1e_5_rad_of_the_exact_solution(name: str, bound: float) -> None:
     assert distance(name, "second_order", 1000) <= bound

@@ -35,6 +35,7 @@ def test_a_run_that_settles_rests_where_it_ends() -> None:
     assert "the run is at rest" in found.how
 
 
+@pytest.mark.long
 def test_a_run_that_diverges_rests_where_its_linear_loop_would_take_it() -> None:
     """Equal gains: what is kept is the mean of the start poses."""
     scenario = load_scenario("p_d_margin", {**TRIO, "control.d": 0.1, "link.delay_ms": 400.0})

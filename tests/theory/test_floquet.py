@@ -265,7 +265,9 @@ def test_what_drifts_at_any_delays_is_told_from_what_stays(monkeypatch: pytest.M
 
 def test_a_loop_that_grows_a_thousandfold_in_a_tick_has_its_root() -> None:
     control = {"law": "p_d", "K": 1.0, "d": 1e5}
-    loop = at_rest("two_sites", {"rate_hz": 1000, "scheme": "digital", "control": control}, 1)
+    loop = at_rest(
+        "two_sites", {"rate_hz": 1000, "scheme": "digital", "control": control, "link.delay_ms": 20.0}, 1
+    )
     recursion = build_recursion(
         derive_operating_conditions(loop.scenario), find_equilibrium(loop.scenario, POSE)
     )

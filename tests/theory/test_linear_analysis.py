@@ -115,6 +115,7 @@ def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
     )
 
 
+@pytest.mark.long
 def test_a_line_without_losses_has_no_margin() -> None:
     """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
     control = {"law": "wave", "b": 60.0, "K": 0.0}

@@ -279,6 +279,7 @@ def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     assert evaluate_criterion(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario) is None
 
 
+@pytest.mark.long
 def test_a_run_that_diverges_has_the_rest_that_its_start_predicts() -> None:
     """Of alike arms with alike gains it is near the mean of the start poses."""
     case = six("adaptive", 0.3 * OFF)

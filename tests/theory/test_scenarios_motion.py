@@ -40,7 +40,10 @@ def test_the_error_of_free_motion_grows_with_every_delay_and_each_run_learns_som
     assert np.ptp(inertia) > 0.1
 
 
-@pytest.mark.parametrize(("delay_ms", "rate_per_s"), [(0.0, -0.159), (200.0, -0.499), (1600.0, -0.171)])
+@pytest.mark.parametrize(
+    ("delay_ms", "rate_per_s"),
+    [(0.0, -0.159), (200.0, -0.499), pytest.param(1600.0, -0.171, marks=pytest.mark.long)],
+)
 def test_about_one_rest_with_true_estimates_some_delay_damps_common_motion(
     delay_ms: float, rate_per_s: float
 ) -> None:

@@ -84,6 +84,7 @@ def test_an_interrupted_suite_goes_on_to_the_same_bytes(whole: BenchResults, tmp
     assert files(again) == files(whole)
 
 
+@pytest.mark.long
 def test_what_runs_the_cells_enters_no_result(whole: BenchResults, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
         found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
@@ -345,6 +346,7 @@ def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> No
     assert words in str(refused.value)
 
 
+@pytest.mark.long
 def test_a_folder_takes_more_of_the_suite_and_nothing_from_elsewhere(
     whole: BenchResults, tmp_path: Path
 ) -> None:

@@ -34,7 +34,7 @@ NEAR_REST = ("sites.m1.q0_rad=[0.101,0.2]", "sites.m2.q0_rad=[0.1,0.2]", "sites.
 def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     """P+d near its edge; the arms start so close together that the motion is small."""
     over = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS}
-    plan = plan_sweep("p_d_margin", [*NEAR_REST, "duration_s=40"], over=over, judge="twins")
+    plan = plan_sweep("p_d_margin", [*NEAR_REST, "duration_s=40", "rate_hz=200"], over=over, judge="twins")
     folder = prepare_sweep_folder(plan, tmp_path_factory.mktemp("exponents") / "o")
     run_sweep(folder, 1)
     return read_results(folder.path)

@@ -202,7 +202,9 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
     return outcome.held
 
 
-@pytest.mark.parametrize(("three", "below", "above"), [(True, 0.9, 1.3), (False, 1.8, 2.5)])
+@pytest.mark.parametrize(
+    ("three", "below", "above"), [pytest.param(True, 0.9, 1.3, marks=pytest.mark.long), (False, 1.8, 2.5)]
+)
 def test_the_verdict_changes_at_the_margin_of_theory(three: bool, below: float, above: float) -> None:
     assert held(three, below, stable=False)
     assert not held(three, below, stable=True)
