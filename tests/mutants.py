@@ -230,7 +230,9 @@ def run_tests(tree: Path, files: list[str], workers: int) -> str:
         return ""
     named = re.search(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
     hangs = re.search(r"Timeout", ended.stdout + ended.stderr)
-    return named[1] if named else f"{'a test hangs' if hangs else 'the tests do not run'} ({ended.returncode})"
+    return (
+        named[1] if named else f"{'a test hangs' if hangs else 'the tests do not run'} ({ended.returncode})"
+    )
 
 
 def copy_tree(to: Path) -> None:

@@ -73,7 +73,7 @@ def test_a_run_is_not_stable_where_its_twins_grow() -> None:
     ("speed_rad_s", "rate_per_s"),
     [(1e-4, -0.55), *(pytest.param(*one, marks=pytest.mark.long) for one in ((5e-3, -0.55), (1e-4, 0.0)))],
 )
-def test_what_is_left_at_rest_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
+def test_a_slow_end_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
     """1e-4 rad/s are 1 mrad in 10 s; 5e-3 rad/s may be a drift, and what keeps a push may keep going."""
     end = classify_log_end(tn.simulate("two_sites"))
     slow = end._replace(behaviour=EndBehaviour.UNDECIDED, end_speed_rad_s=speed_rad_s)

@@ -99,7 +99,7 @@ def mean_felt(result: Any) -> float:
 
 
 @pytest.mark.long
-def test_books_of_steps_cost_no_stiffness_and_a_margin_of_acceleration_does() -> None:
+def test_books_of_steps_cost_no_stiffness_unlike_an_acceleration_margin() -> None:
     """34.9 N m/rad as it is published, 71.8 by spring and clamp alone; the margin costs two thirds."""
     assert mean_felt(contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
     by_step = contact(120.0)
@@ -129,7 +129,7 @@ TURNED = {
 
 
 @pytest.mark.long
-def test_a_change_of_dominance_is_paid_by_the_motion_that_follows() -> None:
+def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
     """The weighted pose jumps, the goal does not; while masters rest, nothing pays for what is left."""
     sites = {"m1": {"hands": [hand(0.3, 100.0, 15.0)]}, "m2": {"hands": [hand(-0.3, 100.0, 15.0)]}, "s": {}}
     for ramp_s in (0.0, 0.5):
@@ -190,6 +190,6 @@ def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
         assert least_energy(ticked(scenario, every=7)) >= -1e-12
 
 
-def test_books_of_a_torque_that_is_held_are_for_digital_alone() -> None:
+def test_books_of_torque_that_is_held_are_for_digital_alone() -> None:
     with pytest.raises(ScenarioError, match="choose 'digital'"):
         pair_of({"law": "tdpa"}, clamped=False, duration_s=1.0, scheme="second_order")

@@ -36,7 +36,7 @@ def test_invariants_hold_in_two_thousand_sessions(first: int) -> None:
     assert not set(SOMETIMES) - set(visited)
 
 
-def test_a_site_tells_a_peer_that_was_cut_off_as_it_came() -> None:
+def test_site_tells_peer_that_was_cut_off_as_it_came() -> None:
     cut, end = Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0), Fault("end", 1.453, 0.01, ("m2",), 0.0)
     assert_holds(judge_faults((cut, end)))
 

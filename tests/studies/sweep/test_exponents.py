@@ -66,7 +66,7 @@ def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -
         assert zero.crossings(n, chart.plane.y) == [pytest.approx(edge, rel=0.02)]
 
 
-def test_the_page_sets_the_zero_of_a_column_beside_verdicts_and_theory(chart: StabilityMap) -> None:
+def test_page_sets_zero_of_column_beside_verdicts_and_theory(chart: StabilityMap) -> None:
     table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
     assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
     assert [row[0] for row in table.rows] == ["200", "250"]
@@ -77,7 +77,7 @@ def test_the_page_sets_the_zero_of_a_column_beside_verdicts_and_theory(chart: St
         assert low < high
 
 
-def test_a_cell_is_white_where_nothing_grows_or_dies_and_the_bar_states_its_limits() -> None:
+def test_a_cell_without_growth_or_decay_is_white() -> None:
     """Four fifths of the exponents are paler than the ends of the bar."""
     made = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
     plane = build_plane(made, KEYS, P_D)
@@ -91,7 +91,7 @@ def test_a_cell_is_white_where_nothing_grows_or_dies_and_the_bar_states_its_limi
     assert red[0] > red[2]
 
 
-def test_a_place_has_the_mean_of_its_seeds_and_none_without_an_exponent() -> None:
+def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
     made = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
     made[0] |= {"exponent_per_s": None}
     exponents = build_plane(made, KEYS, P_D).panels[0].exponents_per_s
@@ -104,7 +104,7 @@ class _StopError(Exception):
     pass
 
 
-def test_an_interrupted_sweep_by_twins_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_interrupted_sweep_by_twins_goes_on_to_same_bytes(tmp_path: Path) -> None:
     plan = asked(tmp_path, "duration_s=2", over=[DELAYS], judge="twins")
     whole = run_sweep(prepare_sweep_folder(plan, tmp_path / "whole"), 1)
     assert all(row["exponent_per_s"] is not None for row in whole.results.rows)
