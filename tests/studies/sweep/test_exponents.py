@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 
 from trilat_net.errors import UsageError
 from trilat_net.reporting.figure_size import make_print_size
-from trilat_net.studies.sweep import SweepResults, open_sweep_folder, prepare_sweep_folder, run_sweep
+from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.map_page import draw_stability_map, tabulate_edges
 from trilat_net.studies.sweep.stability_map import (
     StabilityMap,
@@ -19,11 +19,11 @@ from trilat_net.studies.sweep.stability_map import (
     build_sweep_command,
 )
 from trilat_net.studies.sweep.sweep_plan import plan_from_json, plan_sweep
-from trilat_net.studies.sweep.sweep_run import RESULTS_FILE, read_results
+from trilat_net.studies.sweep.sweep_run import read_results
 from trilat_net.theory import compute_growth_column
 
 from .maps import KEYS, P_D, rows
-from .quick import DELAYS, asked
+from .quick import asked
 
 DELAYS_MS = (200.0, 250.0)
 DAMPINGS = (0.8, 1.0, 1.2, 1.4)
@@ -98,28 +98,6 @@ def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
     assert np.isnan(exponents[0, 0])
     assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
     assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins
-
-
-class _StopError(Exception):
-    pass
-
-
-def test_interrupted_sweep_by_twins_goes_on_to_same_bytes(tmp_path: Path) -> None:
-    plan = asked(tmp_path, "duration_s=2", over=[DELAYS], judge="twins")
-    whole = run_sweep(prepare_sweep_folder(plan, tmp_path / "whole"), 1)
-    assert all(row["exponent_per_s"] is not None for row in whole.results.rows)
-
-    def stop(_done: int, _total: int) -> None:
-        raise _StopError
-
-    folder = prepare_sweep_folder(plan, tmp_path / "parts")
-    with pytest.raises(_StopError):
-        run_sweep(folder, 1, stop)
-    again = open_sweep_folder(folder.path)
-    assert again.plan.judge == "twins"
-    swept = run_sweep(again, 1)
-    assert swept.runs == 2
-    assert (again.path / RESULTS_FILE).read_bytes() == (whole.folder.path / RESULTS_FILE).read_bytes()
 
 
 def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> None:
