@@ -158,7 +158,7 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sites", [(), pytest.param(("m2", "s"), marks=pytest.mark.long)])
+@pytest.mark.parametrize("sites", [(), ("m2", "s")])
 def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
     some = logs.timed(logs.simulated("paper"))

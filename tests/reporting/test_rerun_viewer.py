@@ -47,6 +47,7 @@ def never() -> Log:
     raise AssertionError("it was read")
 
 
+@pytest.mark.long
 def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> None:
     rerun = Rerun()
     open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)

@@ -125,7 +125,7 @@ def test_a_stepping_wall_clock_changes_only_labels(tmp_path: Path) -> None:
     assert log.session["epoch_unix_ns"] != steady.session["epoch_unix_ns"]
 
 
-@pytest.mark.parametrize("at_ns", [1_050_000_000, 1_250_000_000])
+@pytest.mark.parametrize("at_ns", [1_050_000_000, pytest.param(1_250_000_000, marks=pytest.mark.long)])
 def test_a_hanging_member_on_another_clock_is_waited_for(at_ns: int, tmp_path: Path) -> None:
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 0.3}), tmp_path, skews={"s": (S, 50_000)}

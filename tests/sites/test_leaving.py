@@ -258,7 +258,9 @@ def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) ->
     assert link.loss == 0.0
 
 
-@pytest.mark.parametrize(("dies_ms", "again_ms"), [(4300, 5000), (4050, 4060)])
+@pytest.mark.parametrize(
+    ("dies_ms", "again_ms"), [pytest.param(4300, 5000, marks=pytest.mark.long), (4050, 4060)]
+)
 def test_a_start_dead_before_tick_0_leaves_its_place(dies_ms: int, again_ms: int, tmp_path: Path) -> None:
     """Also if the other site admits it only when the next one is there already."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
@@ -289,7 +291,7 @@ def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> Non
     assert log.starts.keys() == {"m1"}
 
 
-@pytest.mark.parametrize("later_ms", [60, 140])
+@pytest.mark.parametrize("later_ms", [60, pytest.param(140, marks=pytest.mark.long)])
 def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: Path) -> None:
     """Who comes second learns of the first start from those that admit both, who know it only since."""
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})

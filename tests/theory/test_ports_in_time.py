@@ -42,7 +42,7 @@ def answered(
     return fitted(run.sites["m"].t_s[late], velocities, 2.0 * np.pi * hz) / AMPLITUDE_NM
 
 
-@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize("joint", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) -> None:
     overrides = {"control.d": 4.0, "sites.m.q0_rad": POSE, "sites.s.q0_rad": POSE}

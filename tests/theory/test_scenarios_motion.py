@@ -20,7 +20,10 @@ EDGE = {
 SETTLED_S = {0.0: 22.2, 20.0: 23.3, 50.0: 24.3, 100.0: 17.8, 200.0: 11.9, 400.0: 5.5, 800.0: 11.4}
 
 
-@pytest.mark.parametrize(("delay_ms", "settled_s"), SETTLED_S.items())
+@pytest.mark.parametrize(
+    ("delay_ms", "settled_s"),
+    [pytest.param(*one, marks=pytest.mark.long if n % 3 else ()) for n, one in enumerate(SETTLED_S.items())],
+)
 def test_settling_of_free_motion_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
     made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
     made.advance(30.0)

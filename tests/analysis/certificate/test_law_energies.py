@@ -83,8 +83,10 @@ def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("law", ["wave", "tdpa"])
-@pytest.mark.parametrize("link", [CONSTANT, JITTER], ids=["constant", "jitter"])
+@pytest.mark.parametrize("law", ["wave", pytest.param("tdpa", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "link", [pytest.param(CONSTANT, id="constant", marks=pytest.mark.long), pytest.param(JITTER, id="jitter")]
+)
 def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
     shares = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
     control = {**LAWS[law], **FOLLOWER}
