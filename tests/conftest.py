@@ -14,8 +14,12 @@ settings.load_profile("ci" if os.environ.get("CI") else "desk")
 
 def pytest_configure(config: pytest.Config) -> None:
     """On a push a property is tried with ten examples, else with a hundred."""
-    if "not long" in str(config.option.markexpr):
+    if _on_a_push(config):
         settings.load_profile("push")
+
+
+def _on_a_push(config: pytest.Config) -> bool:
+    return "not long" in str(config.option.markexpr)
 
 
 OTHER_LAYOUTS = {"seven_joints", "unlike_arms"}
@@ -35,9 +39,12 @@ LIKE_OTHERS = {
 """Scenarios beside which another one runs nearly the same: what all must pass, these pass in long tests."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the tests that run such a scenario."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks the tests that run such a scenario; on a push, ten examples are also the most of any property."""
     for item in items:
+        own = getattr(getattr(item, "function", None), "_hypothesis_internal_use_settings", None)
+        if own is not None and own.max_examples > 10 and _on_a_push(config):  # a test's own number precedes
+            item.function._hypothesis_internal_use_settings = settings(own, max_examples=10)
         values = item.callspec.params.values() if hasattr(item, "callspec") else ()
         runs = {"execution", "log", "golden"} & set(item.path.parts)
         if runs and (OTHER_LAYOUTS | LIKE_OTHERS).intersection(one for one in values if isinstance(one, str)):

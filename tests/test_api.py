@@ -164,7 +164,7 @@ def test_a_log_completes_its_sites_and_becomes_a_frame(file: Path) -> None:
     assert len(log.to_frame("events")) == len(log.events)
 
 
-def test_a_scenario_is_a_name_a_text_its_tables_or_itself(tmp_path: Path) -> None:
+def test_scenario_is_name_text_its_tables_or_itself(tmp_path: Path) -> None:
     named = tn.load_scenario("two_sites", ["duration_s=0.5"])
     text = named.text
     (tmp_path / "mine.toml").write_text(text)

@@ -227,7 +227,7 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
         assert known, name
 
 
-def test_every_operator_environment_and_law_stands_in_the_table_of_laws() -> None:
+def test_every_operator_environment_and_law_stands_in_table_of_laws() -> None:
     text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
     kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
     assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []

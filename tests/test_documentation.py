@@ -59,7 +59,7 @@ def test_a_command_parses_as_it_is_written(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_command_in_a_sentence_is_one_and_has_these_options(page: str) -> None:
+def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
     for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
         words = re.findall(r"[^\s\[\]|,()]+", text)
         (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
@@ -153,7 +153,7 @@ def prepare(page: str, folder: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", sorted(COMMAND_PAGES - {"docs/lab.md"}))
-def test_the_commands_of_a_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     for block in find_blocks(page):
         if block.language != "sh" or find_exception(block):
@@ -168,7 +168,7 @@ def test_the_commands_of_a_page_run_and_print_what_stands_there(page: str, tmp_p
 
 @pytest.mark.long
 @pytest.mark.live
-def test_the_code_of_a_hand_takes_hold_of_an_arm_and_lets_go(tmp_path: Path) -> None:
+def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
     words = ("--scenario", "play", "--set", "duration_s=600")
     sites = [Process(name, ["site", name, *words], tmp_path) for name in tn.load_scenario("play").names]
     try:
@@ -256,7 +256,7 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", sorted(PYTHON_PAGES - OF_THEIR_OWN))
-def test_the_code_of_a_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_code_of_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
     printed = run_python(page, tmp_path, names)
@@ -273,7 +273,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_the_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
+def test_what_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
     (shown,) = (b.text for b in find_blocks("docs/certificate.md") if b.text.startswith("ok   stable"))
     assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())

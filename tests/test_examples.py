@@ -95,7 +95,7 @@ def run_with_hand(name: str, arm: PinnedArm, monkeypatch: pytest.MonkeyPatch, *o
     runpy.run_path(str(LOOK.with_name(name)), run_name="__main__")
 
 
-def test_a_device_rests_where_the_spring_of_the_hand_is_as_strong_as_its_user(
+def test_a_device_rests_where_hand_and_user_balance(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """6 N at 300 N/m are 20 mm."""
@@ -146,7 +146,7 @@ class PressedSwitch:
         self.said.append(held)
 
 
-def test_a_switch_is_held_while_keys_come_and_let_go_after_a_gap() -> None:
+def test_a_switch_is_held_by_keys_until_gaps() -> None:
     """Rounds of 20 ms: a key in the 5th, another in the 30th; each counts for 0.6 s."""
     hold = runpy.run_path(str(LOOK.with_name("dead_man_switch.py")))["hold"]
     switch = PressedSwitch(100)
@@ -155,7 +155,7 @@ def test_a_switch_is_held_while_keys_come_and_let_go_after_a_gap() -> None:
     assert switch.said == [5 <= n < 60 for n in range(101)]
 
 
-def test_a_switch_is_let_go_at_once_when_the_program_before_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = os.pipe()
     os.write(ends[1], b"pressed\n")
     os.close(ends[1])

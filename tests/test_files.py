@@ -56,7 +56,7 @@ def test_whatever_goes_wrong_leaves_what_was_there(
     assert everything(tmp_path) == there
 
 
-def test_a_full_disk_is_told_with_its_exit_code_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_has_its_exit_code_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(LogRefused, match="No space left") as raised:
         break_off(tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False)
     assert raised.value.exit_code == 5
@@ -105,7 +105,7 @@ def test_a_file_is_written_whole_or_what_was_there_stays(
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_link_stays_a_link_and_a_device_is_written_to(tmp_path: Path) -> None:
+def test_link_stays_link_and_device_is_written_to(tmp_path: Path) -> None:
     (tmp_path / "linked").symlink_to(tmp_path / "real")
     write_whole(tmp_path / "linked", b"1")
     write_whole(Path("/dev/null"), b"1")

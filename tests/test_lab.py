@@ -18,7 +18,7 @@ SHORT_S = "0.2"
 
 
 @pytest.mark.long
-def test_every_experiment_runs_and_every_log_is_one_that_was_made(tmp_path: Path) -> None:
+def test_every_experiment_of_the_lab_runs(tmp_path: Path) -> None:
     logs = set()
     for _, command, *rest in COMMANDS:
         if command == "sim":

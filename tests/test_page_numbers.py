@@ -449,6 +449,7 @@ def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -
     check(page, words, make())
 
 
+@pytest.mark.long
 def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
     for words in CERTIFIED:
         check("docs/certificate.md", words, certified(tmp_path))

@@ -32,7 +32,7 @@ def test_handlers_are_put_back() -> None:
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_DFL, signal.SIG_IGN], ids=["as usual", "under nohup"])
-def test_the_end_of_a_terminal_is_a_signal_like_others_unless_it_is_ignored(handler: signal.Handlers) -> None:
+def test_a_terminals_end_is_a_signal_unless_ignored(handler: signal.Handlers) -> None:
     before = signal.signal(signal.SIGHUP, handler)
     try:
         with Interrupt() as interrupt:
@@ -109,7 +109,7 @@ def interrupted(pids: list[int]) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_an_interrupt_ends_workers_in_the_middle_of_something_that_never_ends() -> None:
+def test_interrupt_ends_workers_in_middle_of_something_that_never_ends() -> None:
     pids: list[int] = []
     with pytest.raises(KeyboardInterrupt):
         interrupted(pids)

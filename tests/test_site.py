@@ -37,7 +37,7 @@ class Page(HTMLParser):
         self.loads |= {given[key] for key in ("src", "href") if tag != "a" and key in given}
 
 
-def test_every_picture_and_page_that_the_first_page_names_is_there() -> None:
+def test_every_picture_and_page_that_first_page_names_is_there() -> None:
     text = MAKE.read_beside_docs("README.md")
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
     assert len(named) > 40

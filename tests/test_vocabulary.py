@@ -25,7 +25,7 @@ def _names() -> list[str]:
     return [name for name in names if not name.rpartition(".")[2].startswith("_")]
 
 
-def test_a_word_has_one_meaning_and_there_are_sixty_at_most() -> None:
+def test_word_has_one_meaning_and_there_are_sixty_at_most() -> None:
     words = [word for cell, _ in USED for word in cell.split(", ")]
     assert 30 < len(words) == len(set(words)) <= 60
 

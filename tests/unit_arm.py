@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tests.transmission import VARIANTS
-from tests.virtual_runs import Array, Run, sampled, trajectories
+from tests.virtual_runs import Array, sampled
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.law_consent import allow_own_laws
 
@@ -81,12 +81,6 @@ def unit_scenario(
 ) -> Scenario:
     """The scenario of `unit_text`."""
     return allow_own_laws(parse_scenario(unit_text(sites, control, **more), "unit"))
-
-
-def pair_run(control: Mapping[str, Any], *, clamped: bool, **more: Any) -> Run:
-    """A master with the hand H50 and a slave, held by CLAMP or free, in virtual time."""
-    sites = {"m": {"hands": [H50]}, "s": {"hands": [CLAMP] if clamped else []}}
-    return trajectories(unit_scenario(sites, control, **more))
 
 
 def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:

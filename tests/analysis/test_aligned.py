@@ -27,7 +27,7 @@ def test_a_gap_is_filled_straight_and_marked() -> None:
     assert np.array_equal(track.q[track.known], log["s"].q)
 
 
-def test_the_end_is_that_of_the_time_that_all_sites_have() -> None:
+def test_end_is_that_of_time_that_all_sites_have() -> None:
     log = logs.rewritten(
         logs.simulated("four"),
         lambda state: (state.site != "a" or state.t_ns >= 5e8) and (state.site != "d" or state.t_ns < 12e8),
@@ -41,7 +41,7 @@ def test_the_end_is_that_of_the_time_that_all_sites_have() -> None:
     )
 
 
-def test_a_record_that_diverged_is_left_out_and_none_is_no_track() -> None:
+def test_a_diverged_record_is_left_out_of_a_track() -> None:
     log = logs.diverged()
     last = {site: track.t_s[-1] for site, track in align_records(log, common=True).items()}
     gone = [site for site in log.sites if log[site].states[-1].mode == "diverged"]
@@ -50,7 +50,7 @@ def test_a_record_that_diverged_is_left_out_and_none_is_no_track() -> None:
     assert align_records(logs.rewritten(log, lambda state: state.site != "s"), common=True) == {}
 
 
-def test_the_past_is_the_records_at_ticks_and_rest_before_them() -> None:
+def test_past_is_records_at_ticks_and_rest_before_them() -> None:
     track = align_records(logs.simulated("four"), common=True)["b"]
     now, before = PeerTrajectory(track).at(track.t_s), PeerTrajectory(track).at(np.array([-0.5, -1e-3]))
     assert np.array_equal(now.q, track.q)

@@ -105,7 +105,7 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
         assert plane.hangs(np.array(pose)) is chain.hangs(np.array(pose)) is hangs
 
 
-def test_an_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
+def test_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
     """The links of a UR5 point along -x of their frames: shoulder_lift at +90 degrees is straight down."""
     arm = chain_of("arm6")
     down = np.array([0.4, 0.5 * np.pi, 0.0, 0.0, 0.0, 1.0])
@@ -128,7 +128,7 @@ def test_base_parameters_are_as_many_as_regressors_have_rank(name: str, count: i
 
 
 @each
-def test_what_base_parameters_leave_out_moves_no_estimate_and_makes_no_torque(name: str) -> None:
+def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
     """Pinocchio's Y'r has no part that is orthogonal to the rows of the combination."""
     arm = chain_of(name)
     B = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_)).combination
@@ -164,7 +164,7 @@ def body(places: Array, masses: Array) -> Array:
     return np.array([m, *mc, xx, xy, yy, xz, yz, zz])
 
 
-def test_a_body_of_masses_is_consistent_and_one_with_a_negative_mass_is_not() -> None:
+def test_a_body_with_a_negative_mass_is_not_consistent() -> None:
     random = np.random.default_rng(4)
     places, masses = random.normal(size=(6, 3)), random.uniform(0.5, 2.0, 6)
     sound = body(places, masses)

@@ -39,7 +39,7 @@ def test_a_fate_is_what_the_link_of_the_core_decides(peer, site):
 
 
 @pytest.mark.parametrize(("peer", "site"), LINKS)
-def test_a_fate_does_not_depend_on_how_many_are_asked_for(peer, site, monkeypatch):
+def test_fate_does_not_depend_on_how_many_are_asked_for(peer, site, monkeypatch):
     log = logs.busy().log
     whole = predict_delivery(log, peer, site, COUNT)
     monkeypatch.setattr(module, "_BLOCK", 64)
@@ -62,7 +62,7 @@ def test_order_and_playout_come_on_top_of_what_is_drawn():
     assert (late.drawn_ns - late.stamp_ns).min() < 70_000_000
 
 
-def test_what_is_lost_is_what_the_link_was_said_to_lose():
+def test_what_is_lost_is_what_link_was_said_to_lose():
     log = logs.busy().log
     cut = predict_delivery(log, "a", "b", COUNT)
     in_outage = (cut.stamp_ns >= 2 * 10**9) & (cut.stamp_ns < 3 * 10**9)

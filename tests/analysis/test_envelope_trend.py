@@ -83,9 +83,7 @@ def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, 
 
 @settings(max_examples=40)
 @given(decay=st.floats(0.05, 2.0), rate=st.floats(0.03, 0.3), share=st.floats(0.01, 1.0))
-def test_growth_under_a_start_that_dies_is_growth_once_it_has_gone_on(
-    decay: float, rate: float, share: float
-) -> None:
+def test_growth_under_a_dying_start_is_growth_in_time(decay: float, rate: float, share: float) -> None:
     """At the middle of the longer run the growing part is ten times the dying one."""
     t_s = np.linspace(0.0, 2.0 * max(4.0 / rate, math.log(10.0 / share) / (decay + rate)), 800)
     error = np.exp(-decay * t_s) + share * np.exp(rate * t_s)

@@ -74,7 +74,7 @@ def test_what_the_network_lost_and_doubled_is_counted():
     assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (0, None, 0.0)
 
 
-def test_what_a_missing_record_would_have_named_is_neither_lost_nor_come():
+def test_a_missing_records_samples_are_neither_lost_nor_arrived():
     log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
     found = uses(log)
     for link in ("m1->m2", "s->m2"):
@@ -84,7 +84,7 @@ def test_what_a_missing_record_would_have_named_is_neither_lost_nor_come():
     assert found["m2->s"].counts.missing == 0  # its samples came, though its own records are gone
 
 
-def test_a_link_that_is_cut_until_the_end_has_lost_all_that_was_sent():
+def test_a_link_cut_until_the_end_loses_all_samples():
     scenario = load_scenario("free", {"duration_s": 1.0, "rate_hz": 200, "link.delay_ms": 20.0})
     run = logs.driven(scenario, lost={("m1", 0, tick) for tick in range(100, 200)})
     cut = uses(run.log)["m2->m1"]
@@ -113,7 +113,7 @@ def test_a_stamp_out_of_range_is_refused_and_nothing_else():
     assert [use.counts.sent for use in found.values()] == [400] * 6
 
 
-def test_a_record_of_a_tick_that_is_never_made_costs_no_memory():
+def test_record_of_tick_that_is_never_made_costs_no_memory():
     """Ticks are the sender's word: a false one must not make tables as long as it says."""
 
     def far(state):
@@ -137,7 +137,7 @@ def test_without_jitter_the_effective_delay_is_the_stated_one():
 
 
 @pytest.mark.parametrize("link", ["a->b", "a->c", "b->a", "b->c", "c->a", "c->b"])
-def test_ages_in_the_records_are_what_the_fates_of_the_samples_make_them(link):
+def test_ages_in_records_are_what_fates_of_samples_make_them(link):
     peer, site = link.split("->")
     log, part = logs.busy().log, logs.busy().log[site]
     fate = predict_delivery(log, peer, site, log.scenario.ticks(peer))
@@ -234,7 +234,7 @@ def test_playout_makes_jitter_below_its_budget_constant():
 # -- spreads and histograms
 
 
-def test_a_histogram_counts_every_tick_in_few_bins_of_a_round_width():
+def test_histogram_counts_every_tick_in_few_bins_of_round_width():
     for use in busy().values():
         bins = use.ages
         assert sum(bins.ticks) == pytest.approx((6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz)

@@ -81,7 +81,7 @@ def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> No
 
 
 @pytest.mark.long
-def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
+def test_slow_loop_without_delay_sustains_what_faster_one_ends() -> None:
     """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
     held = {"scheme": "digital", "link.delay_ms": 0.0}
     slow = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
@@ -92,7 +92,7 @@ def test_a_slow_loop_without_delay_sustains_what_a_faster_one_ends() -> None:
     assert fast.end_speed_rad_s < 0.1
 
 
-def test_direct_force_reflection_hammers_on_a_wall_and_only_a_longer_record_shows_that_it_goes_on() -> None:
+def test_hammering_on_a_wall_shows_only_in_a_longer_record() -> None:
     short, long = (
         classify_log_end(trilat_net.simulate("contact", {"rate_hz": 100, "duration_s": s}))
         for s in (15.0, 30.0)
@@ -135,7 +135,7 @@ def test_a_log_without_records_is_undecided() -> None:
     assert classify_log_end(empty).behaviour is EndBehaviour.UNDECIDED
 
 
-def test_a_joint_that_grows_is_not_hidden_by_a_larger_one_that_decays() -> None:
+def test_a_growing_joint_is_not_hidden_by_a_decaying_one() -> None:
     """Joint 2 of s alone grows, at a thousandth of what everything else does."""
 
     def changed(state):
@@ -172,7 +172,7 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
         (0.01, 0.0, 0.0, Stability.STABLE, ""),
     ],
 )
-def test_sites_at_rest_must_agree_where_no_force_holds_them_apart(angle, e, tau_x, stability, says) -> None:
+def test_sites_at_rest_must_agree_unless_a_force_separates_them(angle, e, tau_x, stability, says) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
         return logs.replaced(state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0])
@@ -193,9 +193,7 @@ def test_arms_that_hang_or_were_thrown_are_not_called_stable(pose: list[float], 
 
 
 @pytest.mark.parametrize(("wide", "motion"), [(0.5, EndBehaviour.UNDECIDED), (0.1, EndBehaviour.BOUNDED)])
-def test_a_joint_is_no_oscillation_while_a_faster_one_that_may_feed_it_falls(
-    wide: float, motion: EndBehaviour
-) -> None:
+def test_a_joint_fed_by_a_faster_one_does_not_oscillate(wide: float, motion: EndBehaviour) -> None:
     """Joint 2 of s is steady at 0.05 rad/s; all else falls, to 0.15 rad/s at the end, or to 0.03."""
 
     def changed(state):

@@ -44,7 +44,7 @@ def test_numbers_agree_with_the_records():
     assert facts["settle_s"] is None  # two seconds are not enough
 
 
-def test_the_run_has_settled_when_its_last_site_has_and_at_0_if_it_never_was_off():
+def test_a_run_settles_with_its_last_site():
     def settle(state):
         off = 0.02 * (state.tick == 250 and state.site == "m2")
         return msgspec.structs.replace(state, q=[q + off for q in state.q_des])

@@ -19,7 +19,7 @@ MODES = ("run", "hold", "brake", "return", "diverged")
 
 
 @given(st.lists(st.sampled_from(MODES), max_size=60))
-def test_spans_are_the_ticks_at_which_a_site_did_not_follow(modes):
+def test_spans_are_ticks_at_which_site_did_not_follow(modes):
     part = logs.in_modes(modes)
     away = [(mode, k) for k, mode in enumerate(modes) if mode not in FOLLOWING_MODES]
     found = [
@@ -44,7 +44,7 @@ def test_what_is_stated_of_a_link_changes_with_it():
 
 
 @pytest.mark.parametrize("text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}'])
-def test_a_record_that_names_a_change_that_is_none_of_its_sites_is_refused(text):
+def test_a_record_that_names_a_foreign_change_is_refused(text):
     def spoiled(state):
         return logs.replaced(state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd)
 

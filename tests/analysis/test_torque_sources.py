@@ -47,7 +47,7 @@ def test_every_actor_does_what_the_core_says(
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_hands_and_environment_are_told_apart_and_make_up_the_record() -> None:
+def test_hands_and_environment_are_told_apart_and_make_up_record() -> None:
     log = runs.run("rich").log
     for site, track in align_records(log).items():
         by = attribute_torque(track, log.scenario)
@@ -66,7 +66,7 @@ def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
 
 
 @pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])
-def test_a_script_is_the_torque_at_a_pose_that_does_not_move_but_for_a_constant(acts: TorqueKind) -> None:
+def test_a_script_is_its_torque_at_a_fixed_pose(acts: TorqueKind) -> None:
     actor = TorqueSource(acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0))
     t_s = np.linspace(0.0, 4.0, 41)
     still = np.tile([0.3, 1.1], (len(t_s), 1))

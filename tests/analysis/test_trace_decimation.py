@@ -46,7 +46,7 @@ def test_a_spike_of_one_tick_in_a_million_survives():
     assert trace.t_s[trace.values[:, 0].argmin()] == 654.321
 
 
-def test_a_line_is_broken_in_a_gap_that_can_be_seen():
+def test_line_is_broken_in_gap_that_can_be_seen():
     tick = np.concatenate([np.arange(100), np.arange(900, 1000)])
     trace = decimate(tick, tick * 1e-3, np.ones((200, 2)), 50)
     (gap,) = np.flatnonzero(np.isnan(trace.values).any(axis=1))

@@ -69,8 +69,11 @@ def test_a_run_is_not_stable_where_its_twins_grow() -> None:
     assert judged == {-0.55: Stability.STABLE, 0.0: Stability.OPEN, 0.2: Stability.NOT_STABLE}
 
 
-@pytest.mark.parametrize(("speed_rad_s", "rate_per_s"), [(1e-4, -0.55), (5e-3, -0.55), (1e-4, 0.0)])
-def test_what_is_left_at_rest_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
+@pytest.mark.parametrize(
+    ("speed_rad_s", "rate_per_s"),
+    [(1e-4, -0.55), *(pytest.param(*one, marks=pytest.mark.long) for one in ((5e-3, -0.55), (1e-4, 0.0)))],
+)
+def test_a_slow_end_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
     """1e-4 rad/s are 1 mrad in 10 s; 5e-3 rad/s may be a drift, and what keeps a push may keep going."""
     end = classify_log_end(tn.simulate("two_sites"))
     slow = end._replace(behaviour=EndBehaviour.UNDECIDED, end_speed_rad_s=speed_rad_s)
@@ -79,6 +82,7 @@ def test_what_is_left_at_rest_needs_no_trend_where_pushes_die(speed_rad_s: float
     assert judged is (Stability.STABLE if settled else Stability.OPEN)
 
 
+@pytest.mark.long
 def test_twins_tell_what_is_linear_from_what_is_not() -> None:
     """A pendulum's swing of 1 rad is another motion than a thousand of 1 mrad."""
     log = tn.simulate("p_d_margin", duration_s=8.0)

@@ -42,13 +42,11 @@ CHEAP = (
     "P+d, 1.6 s, d 2.7",
     "gravity known",
     "the same, d 2",
-    "at 1.75 s, other shares",
     "40 and 30 Hz, K 50",
     "40 and 30 Hz, d 5",
     "a reserve of 1 J, the same",
     "by 20 ms",
     "a wave line that nobody holds",
-    "two hands hold 0.4 rad apart",
 )
 
 

@@ -188,7 +188,7 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(command: str, tmp_path: Path) -
     trilat(*command.split(), name, cwd=tmp_path).refuses("k:" if "--key" in command else "a pipe or a device")
 
 
-def test_other_files_that_a_command_is_given_are_no_pipes_either(tmp_path: Path) -> None:
+def test_other_files_that_command_is_given_are_no_pipes_either(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
     for given in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
@@ -220,9 +220,7 @@ def test_odd_words_are_refused_in_one_line_without_their_controls(words: list[st
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "9" * 4000, "0x" + "f" * 5000])
-def test_a_number_that_no_message_holds_is_refused_before_anybody_is_asked(
-    number: str, tmp_path: Path
-) -> None:
+def test_an_unsendable_number_is_refused_before_anybody_is_asked(number: str, tmp_path: Path) -> None:
     order = ["link", "m1->s", "--to", f"deviation_ms={number}"]
     trilat("set", "--session", "x", *order, cwd=tmp_path).refuses("to.deviation_ms: must be a")
 

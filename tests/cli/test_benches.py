@@ -14,7 +14,7 @@ from .running import trilat
 SOME = ("--study", "round-trips", "--task", "contact", "--law", "p_d", "--link", "rtt8,rtt68-loss10")
 
 
-def test_a_part_of_the_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
+def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
     done = trilat("bench", *SOME, "--seeds", "2", "--jobs", "1", "--json", cwd=tmp_path)
     assert done.code == 0
     assert "note: 2 cells, 3 runs, into runs/bench-round-trips" in done.err

@@ -208,7 +208,7 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
         (None, "mylaws.py", ScenarioError, "cannot be read"),
     ],
 )
-def test_a_file_that_may_not_be_it_is_refused_before_it_runs(
+def test_a_file_that_differs_is_refused_before_it_runs(
     text: str | None, name: str, error: type[Exception], fact: str, place: Path
 ) -> None:
     if text is not None:
@@ -221,7 +221,7 @@ def test_a_file_that_may_not_be_it_is_refused_before_it_runs(
     assert not imports(place)
 
 
-def test_a_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> None:
+def test_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> None:
     file = place / "mylaws.py"
     file.write_text(LAW)
     log = tn.open_log("run.mcap", law=file)
@@ -253,7 +253,7 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_compiled_law_and_its_neighbours_run_from_the_file_that_was_named(place: Path) -> None:
+def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
     folder = place / "laws"
     folder.mkdir()
     (place / "gains.py").write_text(WITNESS)  # of the working directory

@@ -56,7 +56,7 @@ def test_json_is_for_programs(logs: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_search_says_its_time_and_its_procedure_and_writes_a_folder(logs: Path) -> None:
+def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) -> None:
     options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "12", "--out", "fronts"]
     printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
     assert "18 runs on 1 core: about " in printed

@@ -17,7 +17,7 @@ def printed(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_every_command_has_help_with_an_example_and_explains_its_options(command: list[str]) -> None:
+def test_every_command_has_help_with_example_and_explains_its_options(command: list[str]) -> None:
     text = printed(*command, "-h")
     assert text == printed(*command, "--help")
     assert re.search(f"Example: trilat {'.* '.join(command)}", text)

@@ -37,7 +37,7 @@ def test_a_log_is_exported_beside_itself(form: str, folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == sorted(["run.mcap", FORMS[form]])
 
 
-def test_an_export_goes_where_it_is_told_and_replaces_only_what_it_may(folder: Path) -> None:
+def test_an_export_replaces_only_what_it_may(folder: Path) -> None:
     command = ("log", "export", "run.mcap", "--to", "csv", "-o", "tables")
     trilat(*command, cwd=folder).succeeds()
     trilat(*command, cwd=folder).refuses("tables: exists", "--force")
@@ -66,7 +66,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> No
 @pytest.mark.parametrize(
     ("form", "module", "name"), [("parquet", "polars", "frames"), ("mat", "scipy.io", "mat")]
 )
-def test_a_package_that_is_missing_is_named_with_what_installs_it(
+def test_package_that_is_missing_is_named_with_what_installs_it(
     form: str, module: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -103,7 +103,7 @@ def no_file_longer_than(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_disk_that_is_full_is_one_sentence_and_leaves_nothing_behind(form: str, folder: Path) -> None:
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(form: str, folder: Path) -> None:
     with no_file_longer_than(10_000):
         done = trilat("log", "export", "run.mcap", "--to", form, cwd=folder)
     done.refuses("cannot be written: File too large", code=5)

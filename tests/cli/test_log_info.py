@@ -64,7 +64,7 @@ def test_info_of_a_file_of_others_tells_its_channels(tmp_path: Path) -> None:
     assert "/t" in trilat("log", "info", path, cwd=tmp_path).succeeds()
 
 
-def test_info_of_a_log_that_cannot_be_opened_says_why_and_tells_the_rest(tmp_path: Path) -> None:
+def test_info_of_an_unreadable_log_says_why(tmp_path: Path) -> None:
     path = written(tmp_path, edited(WHOLE, scenario=lambda _: "not toml ["))
     text = trilat("log", "info", path, cwd=tmp_path).succeeds()
     assert "cannot be opened" in text
@@ -89,14 +89,14 @@ def test_a_log_that_lacks_records_fails_and_names_them(tmp_path: Path) -> None:
     assert {place["text"] for place in sequence["places"]} == {"missing s/state 7-9", "missing s/state 40"}
 
 
-def test_a_file_of_others_is_checked_for_how_it_is_built_and_that_is_said(tmp_path: Path) -> None:
+def test_a_foreign_mcap_file_is_checked_for_its_structure(tmp_path: Path) -> None:
     done = trilat("log", "check", written(tmp_path, foreign()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
     assert "no log of trilat-net" in done.err
 
 
-def test_what_is_no_mcap_file_is_bad_input_for_info_and_a_finding_for_check(tmp_path: Path) -> None:
+def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:
     for command in ("info", "check"):
         trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
     path = written(tmp_path, b"text")

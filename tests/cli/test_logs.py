@@ -13,7 +13,7 @@ from trilat_net.log.log_reader import open_log
 from .running import trilat
 
 
-def test_two_runs_of_one_scenario_and_seed_are_the_same_file(tmp_path: Path) -> None:
+def test_two_runs_of_one_scenario_and_seed_are_same_file(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         trilat("sim", "two_sites", "--duration", "1", "-o", name, cwd=tmp_path).succeeds()
     trilat("sim", "two_sites", "--duration", "1", "-o", "c.mcap", "--seed", "2", cwd=tmp_path).succeeds()
@@ -75,7 +75,7 @@ def test_verify_notices_another_gain_in_the_scenario(log_file: Path, short_log: 
     assert "scenario" in done.err
 
 
-def test_a_torn_log_is_verified_as_far_as_it_is_whole_and_says_so(tmp_path: Path) -> None:
+def test_a_torn_log_is_verified_as_far_as_whole(tmp_path: Path) -> None:
     path = tmp_path / "torn.mcap"
     trilat("sim", "paper", "--duration", "2", "-o", path, cwd=tmp_path).succeeds()
     whole = path.read_bytes()
@@ -94,7 +94,7 @@ def test_a_torn_log_is_verified_as_far_as_it_is_whole_and_says_so(tmp_path: Path
     trilat("verify", path, "--min-coverage", "2", cwd=tmp_path).refuses("--min-coverage", "from 0 to 1")
 
 
-def test_a_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path, short_log: bytes) -> None:
+def test_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path, short_log: bytes) -> None:
     log_file.write_bytes(short_log[: len(short_log) * 2 // 3])  # inside its only chunk
     done = trilat("verify", log_file, cwd=log_file.parent)
     done_text = done.out + done.err
@@ -107,7 +107,7 @@ JITTER = ("--set", "link.model=uniform", "--set", "link.delay_ms=50", "--set", "
 
 
 @pytest.mark.long
-def test_a_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> None:
+def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> None:
     sim = ("sim", "two_sites", "--duration", "1", "--set", "rate_hz=200", "-o", "run.mcap")
     trilat(*sim, *JITTER, cwd=tmp_path).succeeds()
     before = (tmp_path / "run.mcap").read_bytes()
@@ -138,7 +138,7 @@ def test_a_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) ->
 
 
 @pytest.mark.long
-def test_a_report_into_the_folder_of_its_log_keeps_the_log(log_file: Path) -> None:
+def test_report_into_folder_of_its_log_keeps_log(log_file: Path) -> None:
     before = log_file.read_bytes()
     done = trilat("report", log_file, "-o", log_file.parent, "--force", cwd=log_file.parent)
     assert done.code == 0, done

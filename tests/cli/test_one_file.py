@@ -72,7 +72,7 @@ print(json.dumps({
 """
 
 
-def test_a_file_beside_the_others_is_a_command_and_its_study(tmp_path: Path) -> None:
+def test_file_beside_others_is_command_and_its_study(tmp_path: Path) -> None:
     drop(tmp_path, "cli", "lag.py", STUDY)
     found = look(LOOK, tmp_path)
     assert "Measures how far the slave lags, seed by seed." in found["listed"]

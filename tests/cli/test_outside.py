@@ -46,9 +46,7 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_law_of_the_page_holds_the_arms_together_as_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_law_of_page_holds_arms_together_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "holding_laws.py").write_text(block("python"))
     log = tn.simulate("paper", {"control.law": "holding_laws:Spring", "control.K": 80})
@@ -61,7 +59,7 @@ def test_the_law_of_the_page_holds_the_arms_together_as_it_says(
     assert np.ptp(rest, axis=0).max() < 1e-6
 
 
-def test_what_a_page_says_of_a_law_is_what_a_law_gets() -> None:
+def test_what_page_says_of_law_is_what_law_gets() -> None:
     from trilat_net.core.user_law import LawContext, LawInput
 
     page = DOC.read_text(encoding="utf-8")
@@ -121,7 +119,7 @@ def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path)
     assert done.code == 0
 
 
-def test_a_run_whose_law_fails_is_one_sentence_and_a_finished_log(tmp_path: Path) -> None:
+def test_run_whose_law_fails_is_one_sentence_and_finished_log(tmp_path: Path) -> None:
     done = trilat("sim", "two_sites", *SHORT, *FAILING, cwd=tmp_path)
     done.refuses("tests.laws:Failing of s failed at tick 40: torque[1] is nan", code=1)
     assert open_log(tmp_path / "two_sites.mcap").complete

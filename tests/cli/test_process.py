@@ -46,6 +46,7 @@ assert not imported & {{"zenoh", "sites", "recorder"}}, imported
 """
 
 
+@pytest.mark.long
 def test_virtual_time_and_files_need_neither_posix_nor_zenoh(tmp_path: Path) -> None:
     program = BLOCKED.format(
         blocked=["fcntl", "resource", "pwd", "grp", "zenoh", "termios"],

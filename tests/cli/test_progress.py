@@ -22,7 +22,7 @@ def work() -> None:
 
 
 @pytest.mark.parametrize(("interactive", "patience_s"), [(False, -1.0), (True, 1e6)])
-def test_nothing_is_drawn_where_nobody_looks_or_of_what_is_done_at_once(
+def test_no_bar_is_drawn_off_a_terminal_or_at_once(
     interactive: bool, patience_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream = terminal(monkeypatch, interactive=interactive)

@@ -198,7 +198,7 @@ def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
     trilat(*RECORD, made / "k", cwd=tmp_path).refuses("holds the keys of all; name the folder of one member")
 
 
-def test_a_folder_of_many_where_nobody_changes_files_of_others_will_do(keys: Path) -> None:
+def test_a_folder_shared_with_the_sticky_bit_will_do(keys: Path) -> None:
     """As the volumes of containers are: sticky."""
     (keys / "m1").chmod(0o1777)
     assert read_member_keys(keys / "m1").member == "m1"
@@ -275,7 +275,7 @@ def test_keys_are_made_whole_or_not_at_all(
         assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_made_nobody_else_can_read_or_write_whatever_the_umask(tmp_path: Path) -> None:
+def test_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
         create_keys(tmp_path / "k", ["m1", "recorder"], ["192.0.2.1", "robot.example", "2001:db8::1"])

@@ -20,7 +20,7 @@ def test_nothing_changed_says_that_it_is_the_log(log_file: Path) -> None:
     assert "note" not in text
 
 
-def test_a_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None:
+def test_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None:
     done = trilat("rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent)
     text = done.succeeds()
     for words in (
@@ -35,7 +35,7 @@ def test_a_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> No
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_a_closed_loop_has_a_row_for_every_site_and_tells_of_its_links(log_file: Path) -> None:
+def test_a_closed_loop_has_a_row_for_every_site(log_file: Path) -> None:
     options = ("--closed-loop", "--set", "link.delay_ms=300")
     text = trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds()
     assert "closed loop: m1, m2, s executed afresh\n" in text
@@ -73,7 +73,7 @@ def test_a_site_that_diverges_is_an_answer_and_a_failure(log_file: Path) -> None
     assert "s: diverged at 0." in done.out
 
 
-def test_a_log_that_is_not_what_it_says_is_a_failure(log_file: Path, short_log: bytes) -> None:
+def test_log_that_is_not_what_it_says_is_failure(log_file: Path, short_log: bytes) -> None:
     def record(r: dict[str, object]) -> dict[str, object]:
         if (r["site"], r["tick"]) == ("s", 300):
             r["tau"] = [1.0, 2.0]

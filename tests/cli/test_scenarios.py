@@ -17,7 +17,7 @@ def test_list_names_every_shipped_scenario_in_80_columns(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_what_show_says_of_a_scenario_fits_a_terminal_of_80_columns(name: str) -> None:
+def test_what_show_says_of_scenario_fits_terminal_of_80_columns(name: str) -> None:
     """The same words as in its file: `show` prints them as they stand there."""
     scenario = load_scenario(name)
     assert f'about = """\n{scenario.about}"""' in scenario.text
@@ -56,7 +56,7 @@ def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     assert "assumed: " in text
 
 
-def test_new_writes_a_commented_template_that_is_valid_and_keeps_what_exists(tmp_path: Path) -> None:
+def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("precious")
     trilat("scenario", "new", path, cwd=tmp_path).refuses("mine.toml", "exists", "--force")

@@ -35,7 +35,7 @@ def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.
 @pytest.mark.parametrize(
     "form", ["pdf", *(pytest.param(one, marks=pytest.mark.long) for one in ("svg", "png"))]
 )
-def test_a_figure_that_the_disk_refuses_is_named_and_not_there(form: str, tmp_path: Path) -> None:
+def test_figure_that_disk_refuses_is_named_and_not_there(form: str, tmp_path: Path) -> None:
     done = limited(
         resource.RLIMIT_FSIZE, 1000, "figure", LOG, "positions", "--format", form, "-o", "f", cwd=tmp_path
     )
@@ -61,7 +61,8 @@ def test_too_little_memory_is_said_in_one_line(mib: int, words: Sequence[str], t
     assert "error: there is too little memory" in done.stderr
 
 
-def test_without_docstrings_commands_work_and_say_that_their_help_is_gone(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_without_docstrings_commands_work_but_have_no_help(tmp_path: Path) -> None:
     program = [sys.executable, "-OO", "-m", "trilat_net"]
     for words, said in (
         (["keys", "new", "--help"], "left out by python -OO"),
@@ -116,7 +117,7 @@ def test_what_a_foreign_file_says_is_not_repeated(words: tuple[str, ...], tmp_pa
 @pytest.mark.parametrize(
     "words", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
 )
-def test_a_cold_start_says_that_it_compiles_and_ends_at_once(
+def test_cold_start_says_that_it_compiles_and_ends_at_once(
     words: tuple[str, ...], number: signal.Signals, tmp_path: Path
 ) -> None:
     """Python takes a signal between two instructions, and one call of the compiler takes minutes."""
@@ -133,7 +134,7 @@ def test_a_cold_start_says_that_it_compiles_and_ends_at_once(
         started.stderr.close()
 
 
-def test_signals_kill_while_the_compiler_runs_where_they_may_break_off_work_and_nowhere_else() -> None:
+def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
     ours = [name for name in ENDING_SIGNALS if signal.getsignal(name) is not signal.SIG_IGN]  # as under nohup
 
     def handlers() -> list[object]:
@@ -157,7 +158,7 @@ def test_signals_kill_while_the_compiler_runs_where_they_may_break_off_work_and_
         assert released()
 
 
-def test_a_signal_that_broke_off_an_inner_part_is_that_of_the_whole() -> None:
+def test_signal_that_broke_off_inner_part_is_that_of_whole() -> None:
     with Interrupt() as outer:
         with pytest.raises(KeyboardInterrupt), Interrupt() as inner, inner.raising():
             os.kill(os.getpid(), signal.SIGTERM)

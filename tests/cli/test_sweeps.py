@@ -23,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_sweep_says_what_it_does_what_came_of_it_and_what_is_next(folder: Path, tmp_path: Path) -> None:
+def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Path) -> None:
     text = trilat("sweep", folder / "trio.toml", *OVER, "--jobs", "1", cwd=tmp_path).succeeds()
     lines = text.splitlines()
     assert lines[0] == "trio: 12 cells (3 x 4), seed 1"
@@ -48,7 +48,7 @@ def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
     assert (folder / "cell-6.mcap").exists()
 
 
-def test_what_is_done_is_gone_on_with_and_not_made_again(folder: Path) -> None:
+def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
     before = (folder / "done" / "results.parquet").read_bytes()
     for how in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
         text = trilat("sweep", *how, cwd=folder).succeeds()
@@ -102,7 +102,7 @@ def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
     assert sorted(folder.rglob("*")) == before
 
 
-def test_a_map_lies_beside_the_results_and_names_the_command_that_makes_it(folder: Path) -> None:
+def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -> None:
     names = sorted(path.name for path in (folder / "done").iterdir())
     assert {"map.md", "map.png", "map.svg", "results.parquet"} <= set(names)
     text = (folder / "done" / "map.md").read_text()

@@ -34,7 +34,7 @@ def test_what_holds_is_0_with_a_table(folder: Path) -> None:
     assert "3 runs, 1.5 s simulated in " in text
 
 
-def test_what_does_not_hold_is_1_with_the_commands_that_repeat_it(folder: Path) -> None:
+def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) -> None:
     done = trilat("test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder)
     assert done.code == 1, done
     assert done.err == ""

@@ -51,7 +51,7 @@ def test_the_command_never_runs_as_root_of_the_host(mark: Path, tmp_path: Path) 
 
 
 @needs_root
-def test_root_of_a_rootless_engine_is_the_person_who_started_it(mark: Path, tmp_path: Path) -> None:
+def test_root_of_rootless_engine_is_person_who_started_it(mark: Path, tmp_path: Path) -> None:
     rootless = user_map(tmp_path, "0 1000 1\n1 100000 65536\n")
     assert entry.heir(mark, rootless) == Owner(0, 0)
 
@@ -120,7 +120,7 @@ def test_a_mark_that_is_not_there_is_told(
     assert "No such file" in capsys.readouterr().err
 
 
-def test_a_cache_is_copied_and_a_missing_one_is_no_failure(tmp_path: Path) -> None:
+def test_cache_is_copied_and_missing_one_is_no_failure(tmp_path: Path) -> None:
     held, own = tmp_path / "held", tmp_path / "own"
     entry.warm(held, own)
     assert not own.exists()
@@ -174,7 +174,7 @@ def hand_out(volumes: Path, user: Any) -> None:
 
 
 @needs_root
-def test_every_member_gets_its_own_keys_and_the_authority_is_gone(volumes: Path) -> None:
+def test_every_member_gets_its_own_keys_and_authority_is_gone(volumes: Path) -> None:
     hand_out(volumes, SOMEBODY)
     for name, whose in (("recorder", SOMEBODY), ("m1", Owner(entry.SITES, entry.SITES))):
         for file in ("members.json", "private.key"):
@@ -198,7 +198,7 @@ def test_keys_that_hold_are_kept_and_old_ones_made_anew(volumes: Path) -> None:
     assert made_by(4323) == {"4323"}
 
 
-def test_a_site_waits_for_its_keys_and_says_so_if_there_are_none(
+def test_a_site_waits_for_its_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter(range(0, 1000, 10))

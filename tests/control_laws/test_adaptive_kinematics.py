@@ -120,7 +120,7 @@ WRONG = {"Gamma": 1.0, "first_m": 0.7, "second_m": 1.4, "slave_m": 1.2, "duratio
 
 
 @pytest.mark.long
-def test_of_unknown_lengths_v_falls_by_what_is_dissipated_and_the_places_meet() -> None:
+def test_with_unknown_lengths_v_falls_by_the_dissipation() -> None:
     log = run(UNKNOWN, gain=LENGTH_GAIN, **WRONG)
     V, lost = functional(log)
     assert np.abs(V + lost - V[0]).max() <= 1e-5 * V[0]

@@ -73,7 +73,7 @@ def test_the_residue_is_the_largest_of_its_function() -> None:
 
 
 @pytest.mark.long
-def test_what_it_dissipates_stays_below_its_bound_and_that_of_the_box_does_not() -> None:
+def test_dissipation_stays_below_its_bound_unlike_that_of_the_box() -> None:
     def bound(log: Log) -> float:
         balance = compute_energy_balance(compute_site_energies(log))
         robust_w = ROBUST_RESIDUE * float(balance.beta[0].sum()) * 2 * RHO_NM * WIDTH_RAD_S

@@ -35,10 +35,10 @@ def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "seeds",
-    [range(4), range(4, 8), range(8, 12), pytest.param(range(12, 200), marks=pytest.mark.long)],
+    [range(2), pytest.param(range(2, 200), marks=pytest.mark.long)],
     ids=str,
 )
-def test_no_energy_is_below_zero_at_any_tick_of_drawn_runs(law: str, seeds: range) -> None:
+def test_no_energy_is_negative_at_any_tick_of_drawn_runs(law: str, seeds: range) -> None:
     """Half lost, 4g, jitter; contact and pushes; ramps of dominance; drift compensation is on."""
     least = {seed: least_energy(ticked(drawn(law, seed))) for seed in seeds}
     assert {seed: one for seed, one in least.items() if one < -1e-9} == {}

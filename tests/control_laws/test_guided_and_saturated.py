@@ -65,7 +65,7 @@ def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
     assert mean["q"][:, 0] == pytest.approx([0.135, -0.015, 0.120], abs=5e-4)
 
 
-def test_lee_and_spong_feel_the_clamp_and_drag_a_common_motion() -> None:
+def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
     """The drag of both arms at one speed is 2 d + 2 K T = 4 K T at the bound."""
     law = {"law": "lee_spong", "K": 100.0, "Kd": 3.0, "T_max_ms": 200.0}
     clamped = last_rows(two(law, clamped=True), 30.0)[0]
@@ -84,9 +84,7 @@ def test_lee_and_spong_feel_the_clamp_and_drag_a_common_motion() -> None:
         ("digital", 0.0, 0.09, False),
     ],
 )
-def test_the_bound_of_lee_and_spong_is_met_at_the_edge(
-    scheme: str, more_ms: float, P_e: float, holds: bool
-) -> None:
+def test_bound_of_lee_and_spong_is_met_at_edge(scheme: str, more_ms: float, P_e: float, holds: bool) -> None:
     """As published, and with K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
@@ -164,7 +162,7 @@ def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
         load_scenario("unlike_arms", {"control": SATURATED})
 
 
-def test_a_saturated_pull_and_gravity_must_fit_below_the_torque_limit() -> None:
+def test_saturated_pull_and_gravity_must_fit_below_torque_limit() -> None:
     """The largest gravity over all poses of the textbook's arm."""
     changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
     scenario = load_scenario("paper", changes)

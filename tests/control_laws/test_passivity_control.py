@@ -98,7 +98,8 @@ def mean_felt(result: Any) -> float:
     return float(abs(result["m"].tau_x[half:, 0]).mean() / result["m"].q[half:, 0].mean())
 
 
-def test_books_of_steps_cost_no_stiffness_and_a_margin_of_acceleration_does() -> None:
+@pytest.mark.long
+def test_books_of_steps_cost_no_stiffness_unlike_an_acceleration_margin() -> None:
     """34.9 N m/rad as it is published, 71.8 by spring and clamp alone; the margin costs two thirds."""
     assert mean_felt(contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
     by_step = contact(120.0)
@@ -107,7 +108,9 @@ def test_books_of_steps_cost_no_stiffness_and_a_margin_of_acceleration_does() ->
     assert mean_felt(contact(120.0, acceleration_rad_s2=100.0)) < 0.4 * 34.9
 
 
-@pytest.mark.parametrize(("loss", "published"), [(0.0, 0.032), (0.5, 0.040)])
+@pytest.mark.parametrize(
+    ("loss", "published"), [(0.0, 0.032), pytest.param(0.5, 0.040, marks=pytest.mark.long)]
+)
 def test_contact_chatters_less_by_books_of_steps(loss: float, published: float) -> None:
     """Mean step of the master's torque; N m."""
     chatter = {}
@@ -125,7 +128,8 @@ TURNED = {
 }
 
 
-def test_a_change_of_dominance_is_paid_by_the_motion_that_follows() -> None:
+@pytest.mark.long
+def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
     """The weighted pose jumps, the goal does not; while masters rest, nothing pays for what is left."""
     sites = {"m1": {"hands": [hand(0.3, 100.0, 15.0)]}, "m2": {"hands": [hand(-0.3, 100.0, 15.0)]}, "s": {}}
     for ramp_s in (0.0, 0.5):
@@ -186,6 +190,6 @@ def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
         assert least_energy(ticked(scenario, every=7)) >= -1e-12
 
 
-def test_books_of_a_torque_that_is_held_are_for_digital_alone() -> None:
+def test_books_of_torque_that_is_held_are_for_digital_alone() -> None:
     with pytest.raises(ScenarioError, match="choose 'digital'"):
         pair_of({"law": "tdpa"}, clamped=False, duration_s=1.0, scheme="second_order")

@@ -103,7 +103,7 @@ def test_a_run_of_the_six_channel_law_transmits_as_much(a: float, user: int, fel
         ("no forces", 0.02, 0.0, 0.1912),
     ],
 )
-def test_a_run_of_the_four_channel_law_transmits_as_its_loop_says(
+def test_run_of_four_channel_law_transmits_as_its_loop_says(
     variant: str, delay_s: float, acceleration: float, felt: float
 ) -> None:
     """With a part of the acceleration, as all of it is unstable; a held torque counts as what it is."""

@@ -105,9 +105,7 @@ def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio:
 
 
 @pytest.mark.parametrize(("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)])
-def test_an_outage_leaves_nothing_behind_but_where_waves_are_held_or_dropped(
-    reception: str, end: float
-) -> None:
+def test_an_outage_leaves_an_offset_only_where_waves_are_held(reception: str, end: float) -> None:
     slave = ticked(received(reception, CUT), every=20000)["s"]
     assert slave.q[-1, 0] == pytest.approx(end, rel=2e-3)
 
@@ -123,7 +121,7 @@ def varying(period_s: float = 2.0) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)])
-def test_a_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str, least: float) -> None:
+def test_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str, least: float) -> None:
     push = {**hand(0.3, damping=0.0), "move_end_s": 1.5}
     env = [{**CLAMP, "stiffness_nm_rad": 200.0}]
     waves, _ = stored(ticked(received(reception, varying(), 4.0, env, push)))
@@ -131,7 +129,7 @@ def test_a_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str,
 
 
 LOSSY = [
-    ({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0),
+    pytest.param({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0, marks=pytest.mark.long),
     ({"model": "constant", "delay_ms": 68.0, "loss": 0.02}, 20.0),
     pytest.param({"preset": "4g"}, 240.0, marks=pytest.mark.long),
 ]
@@ -144,7 +142,7 @@ def held_torque(link: dict[str, Any], push: dict[str, Any], duration_s: float) -
 
 
 @pytest.mark.parametrize(("link", "duration_s"), LOSSY)
-def test_a_line_under_a_constant_force_plays_it_at_ticks_without_a_wave(
+def test_line_under_constant_force_plays_it_at_ticks_without_wave(
     link: dict[str, Any], duration_s: float
 ) -> None:
     push = {"kind": "recorded", "points": [[0.0, 2.2, 1.1], [1e4, 2.2, 1.1]]}
@@ -160,7 +158,13 @@ def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: fl
     assert np.abs(np.diff(tau[10000:])).max() < 0.03
 
 
-@pytest.mark.parametrize(("link", "reserve_J"), [(JITTER, 0.01), (JITTER, 0.0), (CONSTANT, 0.01)])
+@pytest.mark.parametrize(
+    ("link", "reserve_J"),
+    [
+        (JITTER, 0.01),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((JITTER, 0.0), (CONSTANT, 0.01))),
+    ],
+)
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
     """Where delays vary and nothing damps: two ends, two joints, a reserve in H and one in W."""
     control = {"law": "wave", "K": 0.0, "B": 0.0, "reserve_J": reserve_J}
@@ -221,7 +225,7 @@ def test_weights_say_who_feels_whom() -> None:
     assert min(float(site.to_all.H.min()) for site in run.values()) >= -1e-9
 
 
-def test_a_law_of_ones_own_is_the_same_to_the_last_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_law_of_ones_own_is_same_to_last_digits(monkeypatch: pytest.MonkeyPatch) -> None:
     """examples/wave_law.py."""
     monkeypatch.chdir(Path(__file__).parents[2] / "examples")
     ours, theirs = (

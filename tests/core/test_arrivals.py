@@ -42,7 +42,7 @@ arrivals = st.lists(st.lists(st.integers(0, 250), max_size=8), min_size=1, max_s
 @every_kind
 @quick
 @given(came=arrivals, rates=st.sampled_from([(1000, 1000), (1000, 333), (700, 1000)]))
-def test_in_use_is_the_newest_sample_that_is_due_and_has_come(
+def test_in_use_is_the_newest_due_sample_that_arrived(
     name: str, came: list[list[int]], rates: tuple[int, int]
 ) -> None:
     """Permuted, dropped, duplicated, late and early arrivals, against a list; the step never goes back."""
@@ -180,7 +180,7 @@ def test_an_ancient_sample_counts_as_lost(name: str) -> None:
 # Single kinds.
 
 
-def test_newest_wins_under_jitter_shortens_the_age_and_in_order_lengthens_it() -> None:
+def test_newest_wins_shortens_the_age_and_in_order_lengthens_it() -> None:
     """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
 
     def mean_age(in_order: int) -> float:
@@ -198,9 +198,7 @@ def test_newest_wins_under_jitter_shortens_the_age_and_in_order_lengthens_it() -
     came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
     rates=st.sampled_from([(1000, 1000), (400, 900)]),
 )
-def test_a_measured_sample_is_in_use_from_the_tick_it_came_in_and_never_late(
-    came: list[int], rates: tuple[int, int]
-) -> None:
+def test_a_measured_sample_is_in_use_from_its_arrival(came: list[int], rates: tuple[int, int]) -> None:
     """But not at its own stamp: one that comes from ahead waits for the first tick behind it."""
     site = linked(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
@@ -211,7 +209,7 @@ def test_a_measured_sample_is_in_use_from_the_tick_it_came_in_and_never_late(
     assert site.measures(0)
 
 
-def test_a_measured_link_may_have_a_play_out_buffer_of_its_own() -> None:
+def test_measured_link_may_have_play_out_buffer_of_its_own() -> None:
     """Real jitter below the budget becomes a constant delay."""
     site = linked(1000, 1000, [LinkModel(kind=DelayKind.MEASURED, playout_us=20_000)])
     jitter = [1, 7, 3, 19, 12, 5, 20, 2]
@@ -222,7 +220,7 @@ def test_a_measured_link_may_have_a_play_out_buffer_of_its_own() -> None:
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
 
-def test_a_copy_with_an_earlier_delay_makes_its_sample_due_earlier() -> None:
+def test_copy_with_earlier_delay_makes_its_sample_due_earlier() -> None:
     alone, twice = (linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0))
     pairs = [(twice.release_tick(0, m), alone.release_tick(0, m)) for m in range(300)]
     assert all(a is not None and b is not None and a <= b for a, b in pairs)

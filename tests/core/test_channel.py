@@ -65,7 +65,7 @@ def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: i
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_first_sample_is_as_likely_to_be_lost_as_any(seed: int) -> None:
+def test_first_sample_is_as_likely_to_be_lost_as_any(seed: int) -> None:
     """A chain begins in its stationary distribution, over links of one seed."""
     model = NoDelay(loss=0.4, loss_burst=50).core()
     first = [due(channel([model], seed, f"a{n}->s"), 1)[0] == LOST for n in range(4000)]
@@ -82,7 +82,7 @@ def test_directions_and_seeds_lose_independently() -> None:
         assert abs(np.corrcoef(series[a], series[b])[0, 1]) < SIGMAS / math.sqrt(100_000)
 
 
-def test_what_is_lost_and_how_long_the_others_take_are_independent() -> None:
+def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
     """So the delays of what comes through are those of the link without loss."""
     link = UniformDelay(delay_ms=100, half_width_ms=50)
     whole = due(channel([link.core()]), 10_000)
@@ -125,7 +125,7 @@ def test_an_outage_takes_the_samples_stamped_within_it() -> None:
     assert lost.tolist() == [*range(10, 26), 40]
 
 
-def test_in_order_no_sample_overtakes_an_older_one_and_none_comes_earlier() -> None:
+def test_in_order_no_sample_overtakes_an_older_one() -> None:
     keys = {"delay_ms": 50.0, "deviation_ms": 30.0, "loss": 0.1}
     free = due(channel([GammaDelay(**keys).core()]), 20_000)
     ordered = due(channel([GammaDelay(**keys, order="in_order").core()]), 20_000)
@@ -135,7 +135,7 @@ def test_in_order_no_sample_overtakes_an_older_one_and_none_comes_earlier() -> N
     assert (np.diff(free[kept]) < 0).any()
 
 
-def test_a_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
+def test_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
     first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
     made = due(channel([first.core(), then.core(10_000_000)]), 80)
     assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
@@ -160,7 +160,7 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
     assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
 
 
-def test_a_delay_without_memory_does_not_notice_that_the_loss_changed() -> None:
+def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
     whole = due(channel([GammaDelay(**keys).core()]), 2000)
     changed = due(channel([GammaDelay(**keys).core(), GammaDelay(**keys, loss=0.2).core(500 * 10**6)]), 2000)

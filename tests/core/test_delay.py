@@ -165,7 +165,7 @@ def test_correlated_delays_have_their_moments_and_correlations(link: CorrelatedD
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_correlated_delays_that_are_cut_off_at_zero_have_their_moments(seed: int) -> None:
+def test_correlated_delays_cut_at_zero_have_their_moments(seed: int) -> None:
     """A quarter of them is; a cut sequence is correlated less than the one it was cut from."""
     link = CorrelatedDelay(delay_ms=10, deviation_ms=15, correlation=0.8)
     delays = delays_us(link, seed, COUNT)
@@ -202,7 +202,8 @@ def test_a_sine_over_whole_periods() -> None:
 ROWS = [(0.0, 10.0), (0.5, 40.25), (0.75, 0.0), (1.0, 7.5)]
 
 
-def test_a_trace_that_is_looped_has_the_moments_of_one_pass() -> None:
+@pytest.mark.long
+def test_trace_that_is_looped_has_moments_of_one_pass() -> None:
     link = TraceDelay(trace=format_trace(ROWS), at_end="loop")
     delays = delays_us(link, 1, 1250 * 800)
     assert delays.mean() / 1e3 == pytest.approx(link.moments().mean_ms, rel=1e-12)

@@ -54,7 +54,7 @@ def test_beta_is_numpys_null_vector(a: Array) -> None:
 
 
 @given(a=matrices())
-def test_a_matrix_is_irreducible_just_where_its_graph_is_strongly_connected(a: Array) -> None:
+def test_matrix_is_irreducible_just_where_its_graph_is_strongly_connected(a: Array) -> None:
     assert is_irreducible(a) == strongly_connected(a)
 
 

@@ -149,7 +149,7 @@ def test_more_commands_than_a_run_takes_are_refused() -> None:
         made.order(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
 
 
-def test_a_run_takes_any_number_of_ramps_and_each_begins_where_the_one_before_was() -> None:
+def test_each_ramp_begins_where_the_one_before_was() -> None:
     """Those that are over are folded into one row: the same bits as of a site that was given all of them."""
     ramps = []
     for n in range(MAX_RAMPS + 50):

@@ -51,7 +51,7 @@ def still(q: Array) -> Array:
     return np.zeros_like(q)
 
 
-def test_a_pulse_is_zero_at_its_ends_full_in_the_middle_and_symmetric() -> None:
+def test_a_pulse_is_symmetric_full_in_the_middle_zero_outside() -> None:
     pulse = TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0))
 
     def at(t_s: float) -> list[float]:
@@ -92,7 +92,7 @@ def test_a_hand_that_stays_is_a_spring(q: Array, K: Pair, target: Pair) -> None:
 
 
 @given(q=angles, K=stiff, target=pairs)
-def test_a_hand_at_the_tip_is_a_spring_in_the_plane(q: Array, K: Pair, target: Pair) -> None:
+def test_hand_at_tip_is_spring_in_plane(q: Array, K: Pair, target: Pair) -> None:
     hand = TorqueSource(TorqueKind.TASK_HAND, K=K, a=target, b=target)
 
     def potential(at: Array) -> float:
@@ -220,7 +220,7 @@ def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None
 
 
 @pytest.mark.parametrize(("acts", "like"), [("LIVE_TIP", "TASK_HAND"), ("LIVE_JOINT", "HAND")])
-def test_a_live_hand_is_a_spring_whose_target_stands_where_somebody_put_it(acts: str, like: str) -> None:
+def test_a_live_hand_is_a_spring_to_its_target(acts: str, like: str) -> None:
     """As far as it is held, and within its limit: then the direction stays and the size is the limit."""
     q, qd = np.array([0.1, 0.2]), np.zeros(2)
     vectors = {"a": (1.2, 0.3), "b": (1.2, 0.3), "K": (50.0, 50.0), "B": (4.0, 4.0)}

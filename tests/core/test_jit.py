@@ -19,7 +19,7 @@ for n in {}:
 """
 
 
-def test_symbols_of_leaves_tell_layouts_apart_whatever_a_process_has_met_before() -> None:
+def test_symbols_of_leaves_tell_layouts_apart() -> None:
     """As Numba numbers them, the first layout of any process has the symbols of any other's."""
     one, other = (
         dict(line.split() for line in printed(SYMBOLS.format(order), compiled=True).splitlines())
@@ -42,7 +42,7 @@ for factor in map(float, sys.argv[1:]):
 """
 
 
-def test_closures_of_one_form_that_two_processes_compiled_are_told_apart(
+def test_equal_closures_of_two_processes_are_told_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As built-in laws are: the same numbers in and out, another torque; one process loads them all."""

@@ -52,7 +52,7 @@ class SampleList:
     delay_us=st.one_of(st.just(0), st.integers(0, 50_000), st.integers(0, 10_000_000)),
     tick=st.integers(0, 10_000),
 )
-def test_a_sample_is_released_by_the_first_tick_at_or_after_its_due_time_and_never_at_its_stamp(
+def test_a_sample_is_released_when_due_never_at_its_stamp(
     rate_hz: int, peer_rate_hz: int, delay_us: int, tick: int
 ) -> None:
     released = one_link(rate_hz, peer_rate_hz, delay_us * 1000).release_tick(0, tick)
@@ -74,7 +74,7 @@ def test_no_delay_means_one_period() -> None:
     delay_us=st.integers(0, 20_000),
     data=st.data(),
 )
-def test_what_is_in_use_is_the_newest_sample_that_is_due_and_has_come(
+def test_the_newest_due_sample_is_in_use(
     rate_hz: int, peer_rate_hz: int, delay_us: int, data: st.DataObject
 ) -> None:
     """Any order, late ones, duplicates, and stamps of the future: all against the list."""
@@ -160,7 +160,7 @@ def test_each_link_of_asymmetric_has_its_own_delay() -> None:
 # The initial history (L7).
 
 
-def test_until_the_first_sample_is_due_a_peer_rests_at_its_start_pose() -> None:
+def test_before_its_first_sample_a_peer_rests_at_its_start() -> None:
     made = run("free", {"duration_s": 1.0})
     starts = {name: np.array(spec.q0_rad) for name, spec in made.scenario.sites.items()}
     for name, site in made.sites.items():

@@ -77,7 +77,7 @@ ORDERS = st.one_of(
 
 @pytest.mark.parametrize("rates", [(1000, 1000), (400, 900), (50, 1001)], ids=str)
 @given(data=st.data())
-def test_a_site_whose_links_widen_makes_the_records_of_one_with_the_widest(
+def test_site_whose_links_widen_makes_records_of_one_with_widest(
     rates: tuple[int, int], data: st.DataObject
 ) -> None:
     """Senders up to ten seconds ahead and late by as much, out of order and twice, delays that change."""
@@ -153,7 +153,7 @@ def test_what_virtual_time_takes_a_recorder_takes(count: int, rate_hz: int) -> N
     assert taken(Site(scenario.setup("a0"))._arrays) <= MAX_LINKS_BYTES
 
 
-def test_the_limit_has_the_same_words_wherever_a_scenario_comes_from() -> None:
+def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
     text = many(12, 20_000, 9000.0)
     problems = []
     for read in (parse_scenario, parse_embedded):
@@ -166,7 +166,7 @@ def test_the_limit_has_the_same_words_wherever_a_scenario_comes_from() -> None:
     assert problems[0][0] == "sites.a0"
 
 
-def test_a_change_that_would_need_more_than_the_limit_is_refused() -> None:
+def test_change_that_would_need_more_than_limit_is_refused() -> None:
     scenario = parse_scenario(many(12, 20_000, 1.0))
     present = initial_link_tables(scenario)
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
@@ -175,7 +175,7 @@ def test_a_change_that_would_need_more_than_the_limit_is_refused() -> None:
         resolve_change(scenario, present, {**change, "to": {"delay_ms": 9000.0}}, 10**9)
 
 
-def test_links_never_grow_beyond_the_limit_and_what_does_not_fit_is_counted() -> None:
+def test_links_stay_within_the_limit_and_count_the_rest() -> None:
     """Of a site that is given less: stamps from further ahead are refused, all others come into use."""
     setup = load_scenario("paper").setup("m1")
     assert LinkRoom(setup).most_pages == calendar_pages(1000) > needed_pages(setup)

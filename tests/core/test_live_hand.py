@@ -52,7 +52,7 @@ def at(k: int, target: tuple[float, ...], n: int | None = None, **fields: Any) -
     return {k: [HandCommand(**{**one, **fields})]}
 
 
-def test_it_begins_at_the_arm_without_force_and_its_grip_grows() -> None:
+def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
     steps = run(at(10, (1.2, 0.5)), 150)
     before, first, *rest = hands(steps)[9:]
     assert before == HandInForce.read(free_hand(2))
@@ -110,7 +110,7 @@ def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
 
 @pytest.mark.parametrize("source", [7, 9], ids=["the same", "another"])
 @pytest.mark.parametrize("from_arm", [True, False], ids=["a target", "a force"])
-def test_who_takes_hold_of_a_fading_grip_goes_on_from_it(source: int, from_arm: bool) -> None:
+def test_who_takes_hold_of_fading_grip_goes_on_from_it(source: int, from_arm: bool) -> None:
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
     rules = RULES._replace(from_arm=from_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
@@ -133,7 +133,7 @@ def test_a_message_that_was_overtaken_changes_nothing() -> None:
     assert steps[-1].vector == free_hand(2)
 
 
-def test_a_hand_that_wakes_up_takes_hold_again_with_the_same_goal() -> None:
+def test_hand_that_wakes_up_takes_hold_again_with_same_goal() -> None:
     steps = run(at(0, (1.1, 0.5)) | at(400, (1.1, 0.5), n=0), 402)
     assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
 
@@ -157,7 +157,7 @@ COMMANDS = st.builds(
 
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
-def test_whatever_comes_in_the_grip_never_jumps_and_the_target_keeps_its_limit(messages: Any) -> None:
+def test_a_grip_never_jumps_and_its_target_keeps_its_limit(messages: Any) -> None:
     steps = hands(run(messages, 500))
     most = 1e6 / GRIP_NS + 1e-12
     for before, now in pairwise(steps):

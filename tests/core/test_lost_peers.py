@@ -34,7 +34,7 @@ def master_lost() -> Log:
     return trilat_net.simulate(scenario("m1->s", "m1->m2"))
 
 
-def test_what_a_lost_master_had_goes_to_the_others_and_comes_back_with_it() -> None:
+def test_a_lost_masters_shares_go_to_the_others_and_return() -> None:
     """The last sample of before comes into use at 3.099 s, the first of after at 4.1 s."""
     log = master_lost()
     part, other = log["s"], log["m2"]
@@ -56,7 +56,7 @@ def test_what_a_lost_master_had_goes_to_the_others_and_comes_back_with_it() -> N
     assert set(log["m1"].mode[400:]) == {"run"}  # it hears everybody
 
 
-def test_the_reference_does_not_jump_when_a_master_is_lost_and_back() -> None:
+def test_reference_does_not_jump_when_master_is_lost_and_back() -> None:
     part, h_s = master_lost()["s"], 1e-3
     stale = slice(3099, 3120)  # what is in use stays meanwhile, and so does its rate
     steps = np.diff(part.q_des, axis=0) - 0.5 * h_s * (part.qd_des[1:] + part.qd_des[:-1])
@@ -82,7 +82,7 @@ def test_it_is_executed_again_and_its_energies_close() -> None:
     assert "s without m1 3.12 to 4.35 s; those that are left follow each other" in premise.text
 
 
-def test_the_last_that_is_followed_and_a_slave_are_waited_for() -> None:
+def test_last_that_is_followed_and_slave_are_waited_for() -> None:
     for cuts in (("m1->s", "m2->s"), ("s->m1", "s->m2")):
         log = trilat_net.simulate(scenario(*cuts, duration_s=5.0))
         for site in {cut.partition(">")[2] for cut in cuts}:

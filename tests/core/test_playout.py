@@ -28,7 +28,7 @@ def same_bits(a: Run, b: Run) -> bool:
 
 
 @pytest.mark.parametrize("name", BELOW)
-def test_jitter_below_the_budget_is_the_constant_delay_bit_for_bit(name: str) -> None:
+def test_jitter_below_budget_is_constant_delay_bit_for_bit(name: str) -> None:
     over = {"duration_s": 2.0}
     constant = run("free", {**over, "link.delay_ms": BUDGET_MS})
     made = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})

@@ -65,7 +65,7 @@ class Watching:
             now.tau[i] = 3.0 * (i + 1) + now.k
 
 
-def test_a_law_sees_its_peers_its_external_torque_and_its_own_past() -> None:
+def test_a_law_sees_peers_external_torque_and_its_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
     scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
     made: list[Watching] = []
@@ -128,7 +128,7 @@ def test_what_numba_does_not_take_is_refused_with_its_reason(law: str) -> None:
     assert caught.value.path == "sites.s.control.law"
 
 
-def test_a_law_without_memory_says_nothing_of_it_and_its_vectors_have_arithmetic() -> None:
+def test_a_law_may_lack_memory_and_its_vectors_have_arithmetic() -> None:
     whole, parts = (
         trilat_net.simulate("two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.2)
         for law in ("Arithmetic", "ByNumbers")
@@ -189,7 +189,7 @@ def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
 
 
 @pytest.mark.long
-def test_on_a_chain_plain_compiled_and_fused_have_the_same_bits() -> None:
+def test_on_chain_plain_compiled_and_fused_have_same_bits() -> None:
     """Its inertia, bias and gravity are used."""
     scenarios = [linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")]
     a, b = (run_by_hand(scenario, 30) for scenario in scenarios)  # soon after that the arms diverge

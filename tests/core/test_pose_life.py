@@ -68,7 +68,7 @@ def steps(turns: Array) -> Array:
 
 
 @pytest.mark.long
-def test_the_way_to_peers_at_rest_is_the_shortest_turn_at_the_speed_that_is_allowed() -> None:
+def test_the_way_to_peers_is_the_shortest_allowed_turn() -> None:
     run = drive((0.0, 0.0, 0.0), [(50, 5000)], 4000)
     aligning = np.flatnonzero(run["mode"] == Mode.RETURN)
     way = (OWN * PEERS.inv()).magnitude()
@@ -81,7 +81,8 @@ def test_the_way_to_peers_at_rest_is_the_shortest_turn_at_the_speed_that_is_allo
     assert np.linalg.norm(run["rate"], axis=1).max() == pytest.approx(SPEED, rel=1e-6)
 
 
-def test_neither_the_orientation_nor_its_velocity_jumps_while_peers_turn_and_fall_silent() -> None:
+@pytest.mark.long
+def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> None:
     """Waits, aligns, follows, holds, and is back over a long way: to the third order of the tick."""
     spin = (0.7, -1.1, 0.6)
     run = drive(spin, [(50, 3500), (4600, 9000), (9100, 12000)], 12000)
@@ -105,7 +106,8 @@ def test_neither_the_orientation_nor_its_velocity_jumps_while_peers_turn_and_fal
     assert apart.magnitude().max() <= 1e-12
 
 
-def test_farther_than_the_limit_is_not_gone_to_by_the_whole_turn() -> None:
+@pytest.mark.long
+def test_farther_than_limit_is_not_gone_to_by_whole_turn() -> None:
     """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
     arrays = build(POSE)
     s: Row = arrays.site[0]
@@ -138,7 +140,7 @@ def posed() -> Log:
 
 
 @pytest.mark.long
-def test_arms_that_hold_a_pose_hold_their_joints_and_follow_again() -> None:
+def test_arms_that_hold_pose_hold_their_joints_and_follow_again() -> None:
     """The elbow of the slave is on its way to a posture on the other side as the links are cut.
 
     What is left is gravity that is not learnt yet.
@@ -158,7 +160,7 @@ def test_arms_that_hold_a_pose_hold_their_joints_and_follow_again() -> None:
 
 
 @pytest.mark.long
-def test_a_held_arm_of_seven_joints_comes_back_when_it_is_pushed_where_the_task_leaves_it_free() -> None:
+def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
     """By the motion in which its end effector stays; it goes back by 3/s, less what its law damps."""
     text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
@@ -179,7 +181,7 @@ def test_a_held_arm_of_seven_joints_comes_back_when_it_is_pushed_where_the_task_
 
 
 @pytest.mark.long
-def test_references_of_poses_in_a_session_are_integrals_of_their_velocities() -> None:
+def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> None:
     """Where the reference is that of peers alone it is so only once these agree, see `task_space`."""
     log = posed()
     for site in log.sites:
@@ -217,7 +219,7 @@ def test_energies_close_over_a_hold_in_task_space() -> None:
 
 
 @pytest.mark.long
-def test_arms_that_agree_on_a_pose_are_stopped_in_fault_cut_off_and_back_without_a_step() -> None:
+def test_arms_of_one_pose_stop_and_return_without_a_step() -> None:
     text = posed_arms(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}

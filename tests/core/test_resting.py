@@ -40,7 +40,7 @@ def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
     assert np.abs(part.qd_des[2000:3500] - wanted[1]).max() <= 1e-12
 
 
-def test_the_torque_of_a_stop_is_the_law_and_what_rests() -> None:
+def test_torque_of_stop_is_law_and_what_rests() -> None:
     """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s, and no step where it begins."""
     log = stopped_log(TEXT)
     part, rows = log["s"], slice(2000, 3500)

@@ -50,7 +50,7 @@ def test_a_site_that_is_stopped_goes_on_learning() -> None:
     ("limits", "reason"),
     [
         ({"q_max_rad": [0.5, 1.2]}, LifeReason.LIMIT_Q),
-        ({"q_min_rad": [-0.2, -4.0]}, LifeReason.LIMIT_Q),
+        pytest.param({"q_min_rad": [-0.2, -4.0]}, LifeReason.LIMIT_Q, marks=pytest.mark.long),
         ({"qd_limit_rad_s": 0.4}, LifeReason.LIMIT_QD),
     ],
 )
@@ -88,7 +88,7 @@ def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) ->
     assert verify(log).identical == 28_000
 
 
-def test_without_a_limit_a_reference_that_jumps_makes_the_torque_jump_and_with_one_it_does_not() -> None:
+def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
     """A peer 3 rad away that is used at once: of today's rule, with and without its limits."""
     text = TEXT.replace('action = "glide"', 'action = "use"').replace(
         "q0_rad = [0.1, 0.4]", "q0_rad = [2.6, 0.4]"
@@ -135,9 +135,7 @@ def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
         (201, "fault"),
     ],
 )
-def test_ticks_that_were_not_made_are_held_or_a_fault_and_nothing_is_made_up_for(
-    missed: int, mode: str
-) -> None:
+def test_missed_ticks_are_held_or_a_fault_never_repeated(missed: int, mode: str) -> None:
     """A simulated arm stands still meanwhile. The log is whole, and is executed again without them."""
     scenario = guarded(text=adaptive_text(), duration_s=4.0)
     at = 2000 + missed
@@ -165,7 +163,8 @@ def test_a_site_of_another_rule_knows_no_orders() -> None:
         make_site_order(load_scenario("free"), "s", "stop", 0)
 
 
-def test_stops_and_returns_step_no_more_than_the_run_without_them() -> None:
+@pytest.mark.long
+def test_stops_and_returns_step_no_more_than_run_without_them() -> None:
     """Arms that begin 3 rad apart, without a limit of the torque's rate."""
     text = adaptive_text().replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]")
     text = text.replace("q0_rad = [0.1, 0.4]", "q0_rad = [-0.1, 1.9]")
@@ -204,7 +203,7 @@ def with_own_law(name: str) -> Log:
     return trilat_net.simulate(guarded({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0))
 
 
-def test_a_law_of_ones_own_gives_way_to_gravity_while_its_site_holds() -> None:
+def test_a_users_law_yields_to_gravity_while_its_site_holds() -> None:
     """The slave holds from 2.12 to 2.7 s."""
     log = with_own_law("Pull")
     part = log["s"]

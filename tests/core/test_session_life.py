@@ -70,7 +70,7 @@ def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -
 
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])
-def test_the_way_to_the_peers_is_no_faster_than_it_may_be(speed: float) -> None:
+def test_way_to_peers_is_no_faster_than_it_may_be(speed: float) -> None:
     log = trilat_net.simulate(glide(12.0, outages_s="[]", speed=speed))
     part, other = log["s"], log["m"]
     aligning = np.flatnonzero(part.mode == "return")

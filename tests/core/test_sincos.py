@@ -10,14 +10,14 @@ from trilat_net.core.sincos import LARGEST_RAD, sincos
 
 
 @given(st.floats(-1e5, 1e5))
-def test_they_are_right_to_a_unit_in_the_last_place_of_one(x: float) -> None:
+def test_they_are_right_to_unit_in_last_place_of_one(x: float) -> None:
     s, c = sincos(x)
     assert abs(s - math.sin(x)) <= 2.3e-16
     assert abs(c - math.cos(x)) <= 2.3e-16
 
 
 @given(st.floats(-LARGEST_RAD, LARGEST_RAD))
-def test_further_out_they_are_as_good_as_the_angle_is_known(x: float) -> None:
+def test_further_out_they_are_as_good_as_angle_is_known(x: float) -> None:
     s, c = sincos(x)
     assert abs(s - math.sin(x)) <= 2.3e-16 + math.ulp(x)
     assert abs(c - math.cos(x)) <= 2.3e-16 + math.ulp(x)

@@ -35,15 +35,13 @@ arrivals = st.lists(
 
 @settings(max_examples=40)
 @given(came=st.lists(arrivals, min_size=1, max_size=40), scheme=st.sampled_from(["second_order", "digital"]))
-def test_two_fresh_sites_fed_the_same_ticks_give_the_same_bits(
-    came: list[list[Arrival]], scheme: str
-) -> None:
+def test_two_fresh_sites_fed_same_ticks_give_same_bits(came: list[list[Arrival]], scheme: str) -> None:
     ticks = [TickInput(k, c) for k, c in enumerate(came)]
     one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
     assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
 
 
-def test_a_record_holds_the_state_at_its_tick_and_its_inputs() -> None:
+def test_record_holds_state_at_its_tick_and_its_inputs() -> None:
     """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm, Eq. (8)."""
     site = Site(setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]))
     first = site.step(TickInput(0))
@@ -70,7 +68,7 @@ def test_without_the_compiler_a_run_has_the_same_bits() -> None:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("k", [1, 2, 21, 150])
-def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(scheme: str, k: int) -> None:
+def test_site_resumed_from_two_records_goes_on_with_same_bits(scheme: str, k: int) -> None:
     """Every record is a key-frame: records k-2 and k-1 and what waits in the links."""
     built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
     ticks = [TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)]
@@ -131,7 +129,7 @@ def test_the_torque_limit_cuts(scheme: str) -> None:
     assert site.step(TickInput(400)).mode is Mode.RUN
 
 
-def test_a_site_beyond_its_speed_limit_diverges_once_and_stays_where_it_is() -> None:
+def test_a_site_beyond_its_speed_limit_diverges_once_and_stays() -> None:
     site = Site(setup("m1", "free", limits__qd_limit_rad_s=0.5))
     outputs = stepped(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
@@ -175,9 +173,7 @@ LARGEST = 1e9
     [f"control.{gain}" for gain in ("Gamma", "Lambda", "theta_hat0", "Kp", "Kd")]
     + ["arm.g_m_s2", "sites.m1.q0_rad", "sites.m1.qd0_rad_s", "limits.tau_limit_nm"],
 )
-def test_absurd_scenarios_are_refused_or_end_in_a_stop_but_never_in_numbers_that_are_none(
-    key: str, scheme: str
-) -> None:
+def test_absurd_scenarios_are_refused_or_stop_with_finite_numbers(key: str, scheme: str) -> None:
     with pytest.raises(ScenarioError, match=key.rpartition(".")[2]):
         load_scenario("paper", {key: 1e308})
     ran = list(

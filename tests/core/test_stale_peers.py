@@ -68,7 +68,7 @@ def followed(output: TickRecord, shares: Sequence[float] = (0.5, 0.5)) -> tuple[
 
 
 @pytest.mark.parametrize(("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)])
-def test_a_cut_leads_to_hold_or_brake_and_back_by_a_return(action: StaleAction, mode: Mode) -> None:
+def test_cut_leads_to_hold_or_brake_and_back_by_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
     outputs = cut(RULE._replace(action=action))
     assert runs_of(outputs) == [(Mode.RUN, 0), (mode, 70), (Mode.RETURN, 95), (Mode.RUN, 125)]
@@ -78,7 +78,7 @@ def test_to_use_is_to_go_on() -> None:
     assert runs_of(cut(RULE._replace(action=StaleAction.USE))) == [(Mode.RUN, 0)]
 
 
-def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() -> None:
+def test_a_peer_stale_again_during_the_return_is_held() -> None:
     ticks = [
         TickInput(
             k, [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])] if k else []
@@ -91,12 +91,12 @@ def test_a_peer_that_becomes_stale_again_during_the_return_is_held_from_there() 
     assert outputs[110].q_des != outputs[70].q_des
 
 
-def test_a_peer_that_was_never_heard_is_as_old_as_the_run() -> None:
+def test_peer_that_was_never_heard_is_as_old_as_run() -> None:
     outputs = stepped(site(RULE), [TickInput(k) for k in range(40)])
     assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 21)]
 
 
-def test_a_peer_without_a_share_may_be_as_stale_as_it_likes() -> None:
+def test_peer_without_share_may_be_as_stale_as_it_likes() -> None:
     ticks = [TickInput(k, [moving(0, k - 1)] if k else []) for k in range(100)]
     assert runs_of(stepped(site(RULE, (1.0, 0.0)), ticks)) == [(Mode.RUN, 0)]
     assert runs_of(stepped(site(RULE, (0.9, 0.1)), ticks))[1] == (Mode.HOLD, 21)
@@ -171,7 +171,7 @@ def test_modes_and_references_are_those_of_the_law(
 
 
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own(action: StaleAction) -> None:
+def test_the_returning_reference_has_no_step(action: StaleAction) -> None:
     """Central differences of the reference from the last tick of holding to well within RUN."""
     outputs = cut(StaleRule(action, 20 * MS, 400 * MS), 700)
     q, qd = (np.array([getattr(o, field) for o in outputs]) for field in ("q_des", "qd_des"))
@@ -185,7 +185,7 @@ def test_on_the_way_back_the_reference_has_no_step_and_its_derivative_is_its_own
 
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: StaleAction, k: int) -> None:
+def test_site_resumed_from_two_records_goes_on_with_same_bits(action: StaleAction, k: int) -> None:
     """Whatever its mode was: the records hold what it remembers."""
     rule = RULE._replace(action=action)
     whole = cut(rule)
@@ -202,7 +202,7 @@ def test_a_site_resumed_from_two_records_goes_on_with_the_same_bits(action: Stal
 
 
 @pytest.mark.long
-def test_a_ramped_return_takes_the_kick_out_of_a_healed_link() -> None:
+def test_ramped_return_takes_kick_out_of_healed_link() -> None:
     """Scenario `outage`: the slave is cut off while its master moves, and hears of it all at once."""
 
     def kick(action: str) -> float:

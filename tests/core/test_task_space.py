@@ -55,7 +55,7 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
 
 
 @given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 1e-6]))
-def test_the_velocity_of_a_turn_is_the_limit_of_differences_and_is_undone(
+def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
     vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
 ) -> None:
     turn = (shorter * vector[0], shorter * vector[1], shorter * vector[2])
@@ -71,7 +71,7 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 
 
 @given(seed=seeds)
-def test_velocities_and_the_rate_of_the_jacobian_are_limits_of_differences(seed: int) -> None:
+def test_velocities_and_rate_of_jacobian_are_limits_of_differences(seed: int) -> None:
     arrays, q, qd = draw(seed)
     h, m = 1e-6, arrays.site[0].shared
     before, after = (np.array(place(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0))
@@ -86,7 +86,7 @@ def test_velocities_and_the_rate_of_the_jacobian_are_limits_of_differences(seed:
 
 
 @given(seed=seeds)
-def test_r_is_what_the_task_asks_and_the_posture_does_not_disturb_it(seed: int) -> None:
+def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
     """J r = x' + Lambda e wherever nothing is damped."""
     arrays, q, qd = draw(seed)
     s = place(arrays, q, qd)

@@ -12,7 +12,7 @@ DAY_NS = 86_400 * 10**9
 
 
 @given(rate_hz=rates, tick=st.integers(0, 86_400 * 20_000))
-def test_tick_k_lies_at_k_periods_rounded_down_to_a_nanosecond(rate_hz: int, tick: int) -> None:
+def test_tick_k_lies_at_k_periods_rounded_down_to_nanosecond(rate_hz: int, tick: int) -> None:
     tick = min(tick, 86_400 * rate_hz)
     assert tick_ns(tick, rate_hz) == int(Fraction(tick, rate_hz) * 10**9)
 

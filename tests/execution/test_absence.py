@@ -223,7 +223,7 @@ def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:
     assert first[:3] == ("s", 45, "boot")
 
 
-def test_a_log_that_only_claims_to_be_a_rerun_is_executed_as_a_whole() -> None:
+def test_a_log_claiming_to_be_a_rerun_is_executed_whole() -> None:
     def zeroed(r: dict) -> dict:
         return r if r["site"] == "s" else {**r, "tau": [0.0, 0.0]}
 
@@ -236,7 +236,7 @@ def test_a_log_that_only_claims_to_be_a_rerun_is_executed_as_a_whole() -> None:
     assert not worse.passed
 
 
-def test_an_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> None:
+def test_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(recorded("free"))
     made = tmp_path / "again.mcap"
     rerun(tmp_path / "run.mcap", ["s"], {"control.Kd": 5}).save(made)
@@ -252,7 +252,7 @@ def test_an_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> 
     assert "not beside it" in "".join(line.text for line in alone.findings)
 
 
-def test_samples_lost_on_the_way_excuse_plain_virtual_time_and_nothing_before_them() -> None:
+def test_lost_samples_excuse_virtual_time_only_after_them() -> None:
     lost = frozenset({("m2", 1, tick) for tick in range(40, 60)})
     log = opened(delivered({}, lost))
     report = run_log_checks(log, virtual=True)
@@ -269,7 +269,7 @@ def test_samples_lost_on_the_way_excuse_plain_virtual_time_and_nothing_before_th
     assert not changed.findings[-1].passed
 
 
-def test_a_gap_does_not_fail_virtual_time_fed_with_what_can_have_arrived() -> None:
+def test_a_gap_fails_no_virtual_time_fed_with_possible_arrivals() -> None:
     lines = run_log_checks(without_records({"m2": [50, 51]}), virtual=True).findings
     fed = next(line for line in lines if "fed" in line.check)
     assert fed.passed, fed
@@ -285,7 +285,7 @@ def test_coverage_is_that_of_the_site_with_the_least() -> None:
     assert options.MIN_COVERAGE == MIN_COVERAGE
 
 
-def test_a_site_that_others_lost_ends_where_it_was_last_seen() -> None:
+def test_site_that_others_lost_ends_where_it_was_last_seen() -> None:
     whole = opened(recorded("paper"))
     assert {whole.expected_ticks(site) for site in SITES} == {TICKS}
     data = edited(recorded("paper"), chunk_bytes=2048)

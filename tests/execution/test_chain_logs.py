@@ -39,7 +39,7 @@ def changed(field: str, numbers: int) -> Log:
     return opened(edited(made(), record=change))
 
 
-def test_every_record_of_six_joints_is_executed_again_and_virtual_time_is_the_same() -> None:
+def test_six_joints_executed_again_are_virtual_time() -> None:
     log = opened(made())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
@@ -95,7 +95,7 @@ PLANAR |= {"l2_m": 0.9, "m2_kg": 0.8, "lc2_m": 0.3, "I2_kg_m2": 0.07}
 
 
 @pytest.mark.long
-def test_the_planar_arm_written_as_a_chain_makes_the_same_run() -> None:
+def test_planar_arm_written_as_chain_makes_same_run() -> None:
     """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators that push."""
     for law in ({"law": "adaptive", "Gamma": 0.0}, {"law": "p_d", "K": 30.0, "d": 4.0}):
         logs = []

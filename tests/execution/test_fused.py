@@ -93,7 +93,7 @@ def test_whatever_the_links_the_rates_and_the_scheme(
     agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
 
-def test_a_run_that_diverges_ends_with_the_ticks_of_that_instant() -> None:
+def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
     agree(scenario)
     fused = FusedRun(scenario)
@@ -147,6 +147,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     assert found["effort_nm"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
 
 
+@pytest.mark.long
 def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
     fused = FusedRun(scenario, apart_rad=0.01)
@@ -210,7 +211,7 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
-def test_a_law_that_fails_in_a_fused_run_is_named_with_its_tick(law: str) -> None:
+def test_a_law_that_fails_in_a_fused_run_is_named(law: str) -> None:
     control = {"law": f"tests.plugged_laws:{law}", "fail_at": 42}
     run = FusedRun(load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control}))
     problem = f"{law} of m2 failed at tick 41: ZeroDivisionError"

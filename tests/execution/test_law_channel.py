@@ -31,7 +31,7 @@ def talk(**more: Any) -> bytes:
     return recorded("paper", {**SHORT, **more})
 
 
-def test_each_peer_gets_its_own_vector_and_all_get_that_for_all() -> None:
+def test_each_peer_gets_its_own_vector_and_the_common_one() -> None:
     """The energy that a site states, from the records of its peers alone: what is for others is not in it."""
     log = opened(talk())
     alpha = log.scenario.dominance
@@ -90,7 +90,7 @@ def test_a_changed_number_shows_at_its_own_tick(
 
 
 @pytest.mark.parametrize(("place", "differing"), [(0, 3), (1, 2), (3, 2)])
-def test_the_sum_of_arrivals_covers_what_comes_to_a_site_and_nothing_else(place: int, differing: int) -> None:
+def test_the_sum_of_arrivals_covers_exactly_what_a_site_gets(place: int, differing: int) -> None:
     """A number that comes too late to be used shows where it came: at both peers, or at the one."""
 
     def record(r: Record) -> Record:
@@ -101,7 +101,7 @@ def test_the_sum_of_arrivals_covers_what_comes_to_a_site_and_nothing_else(place:
     assert verify(opened(edited(talk(), record=record))).differing == differing
 
 
-def test_a_record_whose_law_sent_more_or_less_cannot_be_read() -> None:
+def test_record_whose_law_sent_more_or_less_cannot_be_read() -> None:
     def record(r: Record) -> Record:
         return {**r, "ch": r["ch"][:-1]}
 

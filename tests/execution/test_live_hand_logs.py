@@ -65,7 +65,7 @@ def test_a_log_of_people_is_verified_and_repeated(held: Log) -> None:
     assert np.abs(held["m1"].tau_x).max() > 1.0
 
 
-def test_the_force_begins_and_ends_at_zero_and_its_work_is_the_operators(held: Log) -> None:
+def test_the_force_is_zero_at_both_ends(held: Log) -> None:
     """The torque by the definition, from the log's own numbers, is the record's, to rounding."""
     part = held["m1"]
     grip = part.hand[:, 0]
@@ -120,7 +120,7 @@ def test_a_live_hand_that_cannot_be_is_refused(changes: dict[str, object], probl
         load_scenario("paper", changes)
 
 
-def test_the_certificate_books_the_work_of_people_as_that_of_scripted_hands(held: Log) -> None:
+def test_certificate_books_work_of_people_as_that_of_scripted_hands(held: Log) -> None:
     """V changes by what its terms say, to 2e-5 of its largest value: `paper` itself closes to 1e-5."""
     balance = compute_energy_balance(compute_site_energies(held))
     assert np.abs(balance.external_work).max() > 0.1

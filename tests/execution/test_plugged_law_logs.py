@@ -24,9 +24,7 @@ def plugged(law: str) -> bytes:
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_a_plugged_law_is_verified_whole_tick_by_tick_and_behind_a_gap(
-    law: str, session: dict[str, str] | None
-) -> None:
+def test_a_plugged_law_is_verified_whole_and_behind_gaps(law: str, session: dict[str, str] | None) -> None:
     data = plugged(law)
     verdict = verify(opened(data))
     assert verdict.whole_run
@@ -56,7 +54,7 @@ def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
                 assert record._replace(x=[], xd=[], wrench=[]) == read_output(state, part.peers)
 
 
-def test_a_rerun_changes_what_a_changed_gain_changes_and_nothing_else() -> None:
+def test_rerun_changes_what_changed_gain_changes_and_nothing_else() -> None:
     log = opened(plugged("CompiledLine"))
     same = rerun(log, closed_loop=True)
     assert all(effect.identical == effect.executed == TICKS for effect in same.sites.values())

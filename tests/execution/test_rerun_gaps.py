@@ -23,7 +23,7 @@ from .logs import all_identical, motion, without_records
 
 @settings(max_examples=15)
 @given(lost=gaps(25), replace=site_sets, delays=under_way)
-def test_behind_a_gap_it_is_the_log_again_and_what_cannot_be_known_stands(
+def test_behind_a_gap_a_rerun_is_the_log_again(
     lost: dict[str, set[int]], replace: list[str], delays: dict[Sample, int]
 ) -> None:
     log = without_records(lost, delivered(first_in_first_out(delays)))
@@ -37,7 +37,7 @@ def test_behind_a_gap_it_is_the_log_again_and_what_cannot_be_known_stands(
 @pytest.mark.long
 @settings(max_examples=15)
 @given(replace=site_sets, lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50), data=st.data())
-def test_a_changed_site_goes_through_gaps_as_if_there_were_none(
+def test_changed_site_goes_through_gaps_as_if_there_were_none(
     replace: list[str], lost: set[int], data: st.DataObject
 ) -> None:
     """Samples that came where no record is are inferred; as long as none was late, rightly."""
@@ -52,7 +52,7 @@ def test_a_changed_site_goes_through_gaps_as_if_there_were_none(
 
 
 @pytest.mark.parametrize("changes", [{}, {"control.Kd": 5.0}], ids=["nothing changed", "changed"])
-def test_a_log_that_begins_late_is_executed_from_where_it_can_be(changes: dict[str, float]) -> None:
+def test_a_log_that_begins_late_is_executed_where_possible(changes: dict[str, float]) -> None:
     """Every recorder began at tick 40: with samples 20 ms old, from tick 61 on all in use are known."""
     log = without_records({site: range(40) for site in SITES}, recorded("free"))
     again = rerun(log, ["s"], changes)
@@ -68,7 +68,7 @@ def test_a_log_that_begins_late_is_executed_from_where_it_can_be(changes: dict[s
         assert effect.first.tick == first  # the gain acts from there
 
 
-def test_a_sample_that_came_and_is_not_in_the_log_is_told() -> None:
+def test_sample_that_came_and_is_not_in_log_is_told() -> None:
     again = rerun(without_records({"m1": range(30, 35)}), ["s"], {"control.Kd": 5.0})
     assert again.sites["s"].lacking == 5
     assert any("5 samples that arrived are not in the log" in note for note in again.notes)

@@ -28,7 +28,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None:
+def test_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None:
     after = rerun(file, ["s"], {"control.Kd": 5}).after
     session = after.session
     assert after.driver == "rerun"
@@ -97,7 +97,7 @@ def test_an_older_log_becomes_one_of_this_version() -> None:
     assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))
 
 
-def test_a_rerun_can_be_rerun_and_says_what_it_cannot_be(file: Path, tmp_path: Path) -> None:
+def test_rerun_can_be_rerun_and_says_what_it_cannot_be(file: Path, tmp_path: Path) -> None:
     made = tmp_path / "again.mcap"
     rerun(file, ["s"], {"control.Kd": 5}).save(made)
     again = rerun(made, ["s"])

@@ -51,7 +51,7 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
     ],
     ids=str,
 )
-def test_what_is_otherwise_is_told_in_lines_of_what_is_executed(
+def test_differences_are_told_in_lines_of_the_executed_scenario(
     overrides: list[str], words: list[str]
 ) -> None:
     assert describe_rerun_changes(asked(["s"], overrides)) == words

@@ -70,7 +70,7 @@ damping_n_s_m = 20
 """
 
 
-def test_a_wall_is_felt_at_the_end_effector_as_shares_say() -> None:
+def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
     """P+d holds e by K along each axis, so that the wrenches of two sites that rest cancel."""
     text = planar_task(8.0)
     head, rest = text.split("[control]")

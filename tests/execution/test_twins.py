@@ -67,6 +67,7 @@ def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
     assert reached.tolist() == [True] * 4 + [False] * 4
 
 
+@pytest.mark.long
 def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
     scenario = at_rest(0.5)
     free = aim_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)

@@ -81,7 +81,7 @@ def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
     assert verdict.identical == verdict.records == 900
 
 
-def test_what_a_law_keeps_besides_its_memory_shows_where_it_starts_afresh() -> None:
+def test_hidden_memory_of_a_law_shows_at_a_fresh_start() -> None:
     log = opened(own("tests.laws:Forgetful"))
     assert verify(log).passed
     assert verify(log, resume_every=1000).passed
@@ -120,7 +120,7 @@ def log_of(file: Path) -> io.BytesIO:
     return stream
 
 
-def test_a_changed_file_is_judged_if_one_asks_for_that_version(file: Path) -> None:
+def test_changed_file_is_judged_if_one_asks_for_that_version(file: Path) -> None:
     stream = log_of(file)
     log = open_log(stream)
     (law,) = find_user_laws(log.scenario)
@@ -152,7 +152,7 @@ def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
     assert verify(log).withheld == ["m", "s"]
 
 
-def test_a_law_that_fails_only_now_is_a_difference_and_the_other_sites_are_judged(file: Path) -> None:
+def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
     stream = log_of(file)
     wrong = "1 / 0 if now.k == 7 and self._facts.site == 's'"
     failing = f"def torque(self, now): return {wrong} else super().torque(now)"
@@ -177,7 +177,7 @@ FAILURES = {
 
 @pytest.mark.parametrize("how", FAILURES)
 @pytest.mark.parametrize("at", [0, 30])
-def test_a_law_that_fails_ends_the_run_with_a_finished_log_that_says_why(how: str, at: int) -> None:
+def test_a_failing_law_ends_the_run_with_a_finished_log(how: str, at: int) -> None:
     law = {"law": "tests.laws:Failing", "how": how, "at": at}
     stream = io.BytesIO()
     with pytest.raises(LawFailed) as caught:

@@ -230,7 +230,7 @@ def test_samples_out_of_order_late_or_never_are_no_difference(
 
 @settings(max_examples=20)
 @given(delays=under_way, never=never, lost=gaps(30, least=0), whole_run=st.booleans())
-def test_gaps_where_samples_come_late_or_never_are_no_false_alarm(
+def test_gaps_with_late_or_lost_samples_raise_no_false_alarm(
     delays: dict[Sample, int], never: frozenset[Sample], lost: dict[str, set[int]], whole_run: bool
 ) -> None:
     """On links that keep their order, as those of a session do."""
@@ -265,7 +265,7 @@ def test_a_record_that_stands_twice_is_found() -> None:
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_on_another_platform_each_tick_follows_from_the_two_before_it(name: str) -> None:
+def test_on_another_platform_each_tick_follows_from_two_before_it(name: str) -> None:
     data = recorded(name, {"duration_s": 0.5})
     verdict = verify(opened(edited(data, session=OTHER_PLATFORM)))
     assert not verdict.whole_run
@@ -292,7 +292,7 @@ def test_on_another_platform_rounding_is_no_difference() -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
-def test_a_torn_log_is_verified_as_far_as_it_is_whole(share: float) -> None:
+def test_torn_log_is_verified_as_far_as_it_is_whole(share: float) -> None:
     data = edited(recorded("paper"), chunk_bytes=2048)
     log = opened(data[: int(share * len(data))])
     assert not log.complete

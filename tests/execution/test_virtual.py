@@ -26,7 +26,7 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
 
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
-def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: Rates) -> None:
+def test_sites_step_in_order_of_time_and_then_of_scenario(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     ran = [
         (o.t_ns, scenario.names.index(site.name), o.tick) for site, _, o in virtual.execute_virtual(scenario)
@@ -40,7 +40,7 @@ def test_sites_step_in_order_of_time_and_then_of_the_scenario(rate_hz: Rates) ->
 
 @settings(max_examples=15)
 @given(rate_hz=st.tuples(rates, rates, rates))
-def test_every_sample_arrives_once_in_order_at_the_first_tick_after_its_stamp(rate_hz: Rates) -> None:
+def test_every_sample_arrives_once_right_after_its_stamp(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     stamps: dict[tuple[str, int], int] = {}
     ran = list(virtual.execute_virtual(scenario))
@@ -79,7 +79,7 @@ def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
 
 @settings(max_examples=8)
 @given(slack=st.lists(st.integers(0, 17), min_size=1, max_size=12))
-def test_the_network_decides_nothing_as_long_as_samples_come_before_they_are_due(slack: list[int]) -> None:
+def test_the_network_decides_nothing_while_samples_come_before_due(slack: list[int]) -> None:
     scenario = small((1000, 1000, 1000))
     scattered = virtual.execute_virtual(scenario, ScatteredNetwork(scenario, slack))
     assert without_arrivals(list(scattered)) == without_arrivals(list(virtual.execute_virtual(scenario)))

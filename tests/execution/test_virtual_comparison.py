@@ -53,7 +53,7 @@ def test_plain_virtual_time_differs_from_the_first_late_sample_on() -> None:
     assert 0 < twins.plain.identical < twins.plain.records == 360
 
 
-def test_a_late_sample_that_a_newer_one_overtakes_at_once_is_counted_and_harmless_later() -> None:
+def test_an_overtaken_late_sample_is_counted_and_harmless() -> None:
     """It is missed for one tick; from then on the newest is in use as ever, but the state has moved."""
     twins = compare_with_virtual(opened_delivered({("m1", 0, 30): 39}))
     assert [sample.tick for sample in twins.late] == [30]

@@ -79,7 +79,7 @@ def test_of_a_whole_log_it_is_what_the_records_list() -> None:
 
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
-def test_on_a_steady_network_what_is_missing_is_found_at_its_own_ticks(lost: set[int], ticks: int) -> None:
+def test_on_a_steady_network_missing_records_are_found(lost: set[int], ticks: int) -> None:
     whole, came = short(steady(ticks)), complete_deliveries(short(steady(ticks), lost), *SENDERS)
     assert came.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.at.items() if at}
@@ -87,9 +87,7 @@ def test_on_a_steady_network_what_is_missing_is_found_at_its_own_ticks(lost: set
 
 
 @given(under_way=delays, lost=lost_ticks)
-def test_on_any_network_every_sample_that_came_is_there_once_and_no_record_is_touched(
-    under_way: Way, lost: set[int]
-) -> None:
+def test_on_any_network_every_arrived_sample_is_there_once(under_way: Way, lost: set[int]) -> None:
     """In order, of samples older than the newest that a record lists: of later ones nobody knows."""
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
     came = complete_deliveries(gapped, *SENDERS)
@@ -115,9 +113,7 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
-def test_at_other_rates_every_sample_is_under_way_for_as_long(
-    ticks: int, rate_hz: int, peer_rate_hz: int
-) -> None:
+def test_at_other_rates_every_sample_travels_as_long(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
     came = recorded_deliveries(short(steady(ticks)))
     there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
     assert there.last == 119 * rate_hz // 1000

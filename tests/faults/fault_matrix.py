@@ -126,7 +126,7 @@ ROWS = (
         "a wall clock steps by up to an hour",
         "no bit changes",
         ("wall clock",),
-        (SITES + "test_clocks.py::test_a_wall_clock_that_steps_changes_nothing_but_what_time_it_was",),
+        (SITES + "test_clocks.py::test_a_stepping_wall_clock_changes_only_labels",),
         gap="for real it takes a machine whose clock may be set",
     ),
     Row(
@@ -144,7 +144,7 @@ ROWS = (
         ("freeze",),
         (
             SITES + "test_loop.py::test_missed_ticks_run_back_to_back_and_are_counted",
-            SITES + "test_loop.py::test_a_loop_that_cannot_catch_up_leaves_out_the_ticks_that_it_missed",
+            SITES + "test_loop.py::test_a_loop_that_cannot_catch_up_skips_missed_ticks",
         ),
         gap="for real by a process that is stopped (F2); no load is put on the processors",
     ),
@@ -188,7 +188,7 @@ ROWS = (
         "refused before they are read",
         ("stranger",),
         (),
-        (NET + "test_zenoh_bus.py::test_a_message_that_no_member_sends_is_not_taken_in_at_all",),
+        (NET + "test_zenoh_bus.py::test_a_message_of_no_member_is_not_taken_in",),
     ),
     Row(
         "F20",

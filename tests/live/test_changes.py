@@ -25,7 +25,7 @@ timeline=[
 
 
 @pytest.mark.long
-def test_a_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
+def test_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
     """With a stale peer at the end, that a site holds for."""
     options = ("--set", SCRIPT.strip().replace("\n", ""), "--set", "on_stale.action=hold", "--duration", "6")
     session = Session(stage, "paper", PAPER, *options)
@@ -36,7 +36,7 @@ def test_a_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Sta
 
 
 @pytest.mark.long
-def test_what_is_set_while_it_runs_is_answered_recorded_and_reproduced(stage: Stage) -> None:
+def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "6")
     session.all()
     session.begun()
@@ -55,7 +55,7 @@ def test_what_is_set_while_it_runs_is_answered_recorded_and_reproduced(stage: St
 
 
 @pytest.mark.long
-def test_python_changes_stops_measures_and_ends_a_session_as_the_commands_do(stage: Stage) -> None:
+def test_python_changes_stops_measures_and_ends_session_as_commands_do(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
     running = Session(stage, "paper", PAPER, "--duration", "60", *glide)
     running.all()

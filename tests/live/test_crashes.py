@@ -18,7 +18,7 @@ from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 @pytest.mark.parametrize("durable", [False, True])
 @pytest.mark.long
-def test_a_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool, stage: Stage) -> None:
+def test_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool, stage: Stage) -> None:
     done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
     assert done.recovery.lossless, done.recovery.lost
     assert done.kept == done.flushed
@@ -30,7 +30,7 @@ def test_a_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool,
 
 
 @pytest.mark.long
-def test_a_full_disk_ends_the_recording_in_order_and_no_site_loses_a_sample(stage: Stage) -> None:
+def test_a_full_disk_ends_recording_and_no_site_loses_samples(stage: Stage) -> None:
     folder = stage.folder / "disk"
     folder.mkdir()
     try:
@@ -68,7 +68,7 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
 
 
 @pytest.mark.long
-def test_a_recorder_that_is_started_again_writes_the_next_part_and_all_is_there(stage: Stage) -> None:
+def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
     session = Session(stage, "paper", SITES, "--duration", "60")
     session.all()
     session.recording()

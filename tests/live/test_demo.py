@@ -36,7 +36,7 @@ def recording(stage: Stage) -> Path:
 
 
 @pytest.mark.long
-def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Stage) -> None:
+def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
     children = running.children()
@@ -54,7 +54,7 @@ def test_a_killed_site_is_named_with_its_signal_and_the_rest_is_ended(stage: Sta
     assert [event.about for event in log.events if event.kind == "lost"] == ["s"]
 
 
-def test_ctrl_c_during_the_run_ends_all_and_finishes_the_file(stage: Stage) -> None:
+def test_ctrl_c_during_run_ends_all_and_finishes_file(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
     children = running.children()
@@ -76,7 +76,7 @@ def test_ctrl_c_during_the_run_ends_all_and_finishes_the_file(stage: Stage) -> N
         pytest.param(signal.SIGINT, "", id="before any child", marks=pytest.mark.long),
     ],
 )
-def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
+def test_signal_before_session_begins_ends_all_and_leaves_no_log(
     number: int, when: str, stage: Stage
 ) -> None:
     running = demo(stage)
@@ -90,7 +90,7 @@ def test_a_signal_before_the_session_begins_ends_all_and_leaves_no_log(
     assert not (stage.folder / "out" / "run.mcap").exists()
 
 
-def test_a_demo_bears_the_name_of_its_scenario_and_shows_errors_and_torques(stage: Stage) -> None:
+def test_a_demo_bears_its_scenarios_name_and_shows_errors(stage: Stage) -> None:
     """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
     running = stage.start("demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out"))
     recording(stage)
@@ -104,7 +104,7 @@ def test_a_demo_bears_the_name_of_its_scenario_and_shows_errors_and_torques(stag
 
 
 @pytest.mark.long
-def test_ctrl_c_while_the_results_are_drawn_is_130_and_leaves_the_log(stage: Stage) -> None:
+def test_ctrl_c_while_drawing_is_130_and_leaves_the_log(stage: Stage) -> None:
     running = demo(stage, duration="0.5")
     running.prints("checking the log and drawing")
     children = running.children()

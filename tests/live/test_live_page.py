@@ -146,7 +146,7 @@ def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("killed", ["browser", "server"])
-def test_an_arm_in_grip_is_free_soon_after_its_page_is_killed(killed: str, stage: Stage) -> None:
+def test_an_arm_in_grip_is_free_after_its_page_dies(killed: str, stage: Stage) -> None:
     """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
     session = Session(stage, "play", PAPER, "--duration", "25")
     session.all()
@@ -238,7 +238,7 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_an_arm_that_is_stopped_or_whose_peer_is_gone_cannot_be_overlooked(stage: Stage) -> None:
+def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
     running = live(stage, "two_sites", "--duration", "60", *glide)
     with browser_page(page_address(running)) as page:

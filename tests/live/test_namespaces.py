@@ -94,7 +94,7 @@ def heard(log: Log, site: str, peer: str) -> Heard:
 
 
 @pytest.mark.long
-def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: Machines) -> None:
+def test_way_that_is_cut_heals_and_loops_never_stop(stage: Stage, apart: Machines) -> None:
     """Once for less than Zenoh's lease, so that what waited comes in a burst, and once for longer.
 
     One direction measures, the other delays by 200 ms.
@@ -130,9 +130,7 @@ def test_a_way_that_is_cut_heals_and_the_loops_never_stop(stage: Stage, apart: M
 
 
 @pytest.mark.long
-def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_when_killed(
-    stage: Stage, apart: Machines
-) -> None:
+def test_separate_machines_hold_during_a_cut_and_return_after_kills(stage: Stage, apart: Machines) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
     bridged(apart, ALL)
     session = Apart.following(stage, apart, 40)
@@ -163,7 +161,7 @@ def test_on_machines_of_their_own_sites_hold_while_a_way_is_cut_and_come_back_wh
 
 
 @pytest.mark.long
-def test_a_way_that_is_cut_in_one_direction_is_held_at_both_ends(stage: Stage, apart: Machines) -> None:
+def test_a_one_way_cut_is_held_at_both_ends(stage: Stage, apart: Machines) -> None:
     """Packets of m1 reach m2 no more, those of m2 go on: for less than Zenoh's lease, and for longer.
 
     m2 holds at once. Nor do TCP's acknowledgements reach it: what it sends goes on for 0.1 to 0.2 s, until

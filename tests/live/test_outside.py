@@ -43,9 +43,7 @@ class Law(Adaptive):
 
 
 @pytest.mark.long
-def test_a_law_that_is_too_slow_ends_the_session_in_order(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_law_that_is_too_slow_ends_session_in_order(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     (stage.folder / "slow_law.py").write_text(SLOW)
     monkeypatch.chdir(stage.folder)
     law = ("--set", "sites.s.control.law=slow_law:Law")
@@ -63,7 +61,7 @@ def test_a_law_that_is_too_slow_ends_the_session_in_order(
     executed_again(log)
 
 
-def test_an_arm_that_is_none_of_ours_in_a_session_with_two_sites(stage: Stage) -> None:
+def test_a_foreign_arm_joins_a_session_of_two_sites(stage: Stage) -> None:
     """All with a law that is none of ours either, and that sends to all and to each."""
     options = (*OUTSIDE, "--duration", "2", "--set", "control.law=tests.channel_law:Talking")
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
@@ -94,7 +92,7 @@ def drive_arm(session: Session, scenario: str, *options: str) -> str:
 
 
 @pytest.mark.long
-def test_an_arm_of_seven_joints_that_feels_a_push_after_one_of_six_was_told_its_mistake(stage: Stage) -> None:
+def test_seven_measured_joints_run_after_six_were_refused(stage: Stage) -> None:
     """The wrong arm goes on sending until it is ended; the right one may begin where it did not."""
     next(execute_virtual(load_scenario("seven_joints")))  # compiles, once for all processes
     options = (*OUTSIDE, "--duration", "3")

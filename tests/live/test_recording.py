@@ -48,7 +48,7 @@ def from_the_start(path: Path) -> Log:
 
 
 @pytest.mark.long
-def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_end(stage: Stage) -> None:
+def test_a_frozen_recorder_has_every_record_in_the_end(stage: Stage) -> None:
     """With small buffers on the way, so that the network drops what it cannot deliver."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "7")
     session.endpoints = [f"{endpoint}#so_sndbuf=8192;so_rcvbuf=8192" for endpoint in session.endpoints]
@@ -63,9 +63,7 @@ def test_a_recorder_that_stands_still_for_four_seconds_has_every_record_in_the_e
 
 
 @pytest.mark.parametrize("law", [(), pytest.param(TALKING, marks=pytest.mark.long)])
-def test_a_recorder_that_is_killed_is_followed_by_another_that_has_all_from_the_start(
-    law: tuple[str, ...], stage: Stage
-) -> None:
+def test_a_killed_recorders_successor_has_all_records(law: tuple[str, ...], stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "50", *law)
     session.all()
     session.recording()

@@ -40,9 +40,7 @@ def numbered(log: Path) -> dict[str, list[bytes]]:
 
 
 @pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.long)])
-def test_a_log_that_is_played_and_recorded_again_is_the_same_bytes_in_the_same_order(
-    live: bool, stage: Stage
-) -> None:
+def test_a_replayed_and_recorded_log_is_the_same_bytes(live: bool, stage: Stage) -> None:
     path = virtual_log(stage.folder)
     if live:
         session = Session(stage, "two_sites", ("m", "s"), "--duration", "1.5")
@@ -69,7 +67,7 @@ def virtual_log(folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(stage: Stage) -> None:
+def test_a_latecomer_to_a_replay_gets_all_of_it(stage: Stage) -> None:
     """Round after round, so that nobody is too late; until Ctrl-C."""
     path = virtual_log(stage.folder)
     again = Again(stage, path)
@@ -92,7 +90,7 @@ def test_who_comes_in_the_middle_finds_a_session_that_runs_and_gets_all_of_it(st
 
 
 @pytest.mark.long
-def test_read_by_another_process_and_as_fast_as_can_be_nothing_is_lost(stage: Stage) -> None:
+def test_a_fast_replay_to_another_process_loses_nothing(stage: Stage) -> None:
     path = virtual_log(stage.folder)
     again = Again(stage, path)
     second = stage.folder / "second.mcap"
@@ -103,7 +101,7 @@ def test_read_by_another_process_and_as_fast_as_can_be_nothing_is_lost(stage: St
 
 
 @pytest.mark.long
-def test_a_log_in_which_a_site_began_anew_is_played_whole(stage: Stage) -> None:
+def test_log_in_which_site_began_anew_is_played_whole(stage: Stage) -> None:
     """Each start numbers its events from 0; they are played start after start, and none is lost."""
     session = Sites.whole(gliding(5.0), stage.folder, ends={})
     session.clocks["m"].dies_ns = 3_000_000_000

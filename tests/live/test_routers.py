@@ -69,7 +69,7 @@ def test_a_session_over_tls_that_both_sides_prove_themselves_in(stage: Stage) ->
 
 
 @pytest.mark.long
-def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stage) -> None:
+def test_router_that_is_killed_and_started_again_heals_session(stage: Stage) -> None:
     """The loops never stop; what was made meanwhile comes into the log from the sites' memory."""
     session = Keyed(stage, "8")
     router = session.router()
@@ -100,7 +100,7 @@ def test_a_router_that_is_killed_and_started_again_heals_the_session(stage: Stag
 
 
 @pytest.mark.long
-def test_with_keys_every_member_stops_an_arm_and_the_operator_alone_enables_it(stage: Stage) -> None:
+def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
     session = Session(stage, "two_sites", SITES, "--duration", "60", *glide)
     create_keys(stage.folder / "keys", [*SITES, RECORDER, OPERATOR], [], 1)

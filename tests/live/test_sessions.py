@@ -47,9 +47,7 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, 
 @pytest.mark.parametrize(
     ("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20), ("unlike_arms", 5)]
 )
-def test_arms_of_many_joints_live_are_virtual_time_bit_for_bit(
-    scenario: str, duration_s: int, stage: Stage
-) -> None:
+def test_arms_of_many_joints_live_are_virtual_time(scenario: str, duration_s: int, stage: Stage) -> None:
     for name in ("m1", "s"):  # compiled once for all sites of as many joints
         warm_up(load_scenario(scenario), name)
     session = Session(stage, scenario, PAPER, "--duration", str(duration_s))
@@ -102,7 +100,7 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
 
 
 @pytest.mark.long
-def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(stage: Stage) -> None:
+def test_a_frozen_site_on_slow_links_loses_no_bit(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3", "--set", "link.delay_ms=2000")
     session.all()
     session.recording()
@@ -116,7 +114,7 @@ def test_a_site_stopped_for_a_second_on_links_of_two_loses_nothing_and_no_bit(st
 
 
 @pytest.mark.long
-def test_a_recorder_that_comes_last_is_waited_for_where_it_is_needed(stage: Stage) -> None:
+def test_a_needed_recorder_that_comes_last_is_waited_for(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "0.5")
     for name in ("s", "m", "recorder"):
         session.all(name)
@@ -130,7 +128,7 @@ def test_a_recorder_that_comes_last_is_waited_for_where_it_is_needed(stage: Stag
 
 
 @pytest.mark.long
-def test_separate_terminals_without_endpoints_and_two_sessions_that_do_not_meet(stage: Stage) -> None:
+def test_two_sessions_without_endpoints_do_not_meet(stage: Stage) -> None:
     seed = SystemClock().monotonic_ns()  # names of this test's own, hence ports of its own
     names = [f"terminals-{seed}", f"others-{seed}"]
     members = []
@@ -152,7 +150,7 @@ def test_separate_terminals_without_endpoints_and_two_sessions_that_do_not_meet(
 
 
 @pytest.mark.long
-def test_a_recorder_that_is_interrupted_finishes_its_file_and_the_sites_go_on(stage: Stage) -> None:
+def test_an_interrupted_recorder_finishes_its_file_and_sites_continue(stage: Stage) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "2")
     session.all()
     recorder = session.processes["recorder"]
@@ -169,7 +167,7 @@ def test_a_recorder_that_is_interrupted_finishes_its_file_and_the_sites_go_on(st
 
 
 @pytest.mark.long
-def test_a_site_that_leaves_its_limits_ends_the_session_and_says_so(stage: Stage) -> None:
+def test_site_that_leaves_its_limits_ends_session_and_says_so(stage: Stage) -> None:
     session = Session(stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10")
     session.all()
     assert session.codes() == {"recorder": 0, **dict.fromkeys(PAPER, 1)}
@@ -185,7 +183,7 @@ def test_a_site_that_leaves_its_limits_ends_the_session_and_says_so(stage: Stage
 
 
 @pytest.mark.long
-def test_who_waits_in_vain_says_for_whom_and_leaves_no_file(stage: Stage) -> None:
+def test_waiting_in_vain_names_the_missing_and_leaves_no_file(stage: Stage) -> None:
     site = Session(stage, "paper", PAPER).site("m2", "--join-timeout", "1")
     apart = Session(stage, "paper", PAPER)
     recorder = apart.recorder("--join-timeout", "1")

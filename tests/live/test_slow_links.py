@@ -40,9 +40,7 @@ def delays_ms(log: Log, site: str, peer: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.long
-def test_sites_hold_while_a_delay_is_longer_than_the_links_and_then_follow_again(
-    queue: str, stage: Stage, apart: Machines
-) -> None:
+def test_sites_hold_while_a_delay_is_too_long_then_follow(queue: str, stage: Stage, apart: Machines) -> None:
     """All that m1 sends comes later and later, or 0.4 s later; then what waits comes at once."""
     slow = {"netem": ("netem", "delay", "400ms", "limit", "100000")}
     slow["tbf"] = ("tbf", "rate", "400kbit", "burst", "16kb", "latency", "2s")

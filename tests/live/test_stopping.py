@@ -77,9 +77,7 @@ def enabled(stage: Stage, page: PageClient) -> None:
 
 
 @pytest.mark.parametrize("scenario", HELD)
-def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again(
-    scenario: str, stage: Stage
-) -> None:
+def test_every_held_arm_is_stopped_from_everywhere_and_follows_again(scenario: str, stage: Stage) -> None:
     running = live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
@@ -102,7 +100,7 @@ def test_every_arm_that_people_hold_is_stopped_from_everywhere_and_follows_again
 
 @needs_browser
 @pytest.mark.long
-def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
+def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
     running = live(stage, "play")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
     with browser_page(page_address(running), gl=False) as page:
@@ -120,7 +118,7 @@ def test_the_button_and_the_key_of_a_page_stop_every_arm(stage: Stage) -> None:
 
 @needs_browser
 @pytest.mark.long
-def test_whoever_holds_an_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
+def test_whoever_holds_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
     running = live(stage, "play")
     address = page_address(running)
     with browser_page(address, gl=False) as first:

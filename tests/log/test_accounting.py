@@ -59,7 +59,7 @@ def test_gaps_are_bounded_and_missing_is_exact_all_the_same(stream: list[int], t
     stream=st.lists(st.tuples(st.sampled_from(["came", "from memory"]), st.integers(0, 40)), max_size=80),
     hopeless=st.integers(0, 50),
 )
-def test_what_comes_from_memory_is_there_once_and_is_no_disorder(
+def test_records_from_memory_are_there_once_and_in_order(
     stream: list[tuple[str, int]], hopeless: int
 ) -> None:
     account, there, newest, reordered, refilled, duplicate = Account(), set[int](), -1, 0, 0, 0
@@ -85,7 +85,7 @@ def test_what_comes_from_memory_is_there_once_and_is_no_disorder(
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30).map(sorted), st.booleans())
-def test_the_longest_silence_is_the_longest_time_between_two_that_came(came: list[int], again: bool) -> None:
+def test_longest_silence_is_longest_time_between_two_that_came(came: list[int], again: bool) -> None:
     account = Account()
     for number, at_ns in enumerate(came):
         account.take(0 if again else number, at_ns)
@@ -123,7 +123,7 @@ def test_of_very_many_gaps_the_first_are_named() -> None:
         ((), 0, 0, 10),  # it was never there
     ],
 )
-def test_what_lies_between_two_starts_is_not_made_and_not_missing(
+def test_ticks_between_two_starts_are_not_made_and_not_missing(
     first_start: Sequence[int], made: int, missing: int, unmade: int
 ) -> None:
     for told_first in (True, False):
@@ -143,7 +143,7 @@ def test_what_lies_between_two_starts_is_not_made_and_not_missing(
         assert account.unmade == unmade
 
 
-def test_what_was_under_way_as_its_sender_was_killed_is_not_made() -> None:
+def test_records_under_way_at_a_kill_are_not_made() -> None:
     account = Account()
     gap = StartGap(account, 2)
     account.take(4)
@@ -155,7 +155,7 @@ def test_what_was_under_way_as_its_sender_was_killed_is_not_made() -> None:
 
 
 @pytest.mark.parametrize("order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join)
-def test_what_others_heard_of_a_killed_start_is_missing_in_whatever_order_it_is_learnt(
+def test_what_others_heard_of_a_killed_start_is_missing(
     order: Sequence[str],
 ) -> None:
     """0 to 4 came; others heard of 5 and 6; the next start begins with 10."""

@@ -136,7 +136,7 @@ def test_a_string_is_read_as_it_was_written(text: str) -> None:
 
 
 @given(stamps_ns, st.sampled_from(RosLogLevel), words, words)
-def test_a_line_of_a_log_is_read_as_it_was_written(
+def test_line_of_log_is_read_as_it_was_written(
     stamp_ns: int, level: RosLogLevel, name: str, text: str
 ) -> None:
     data = pack_log(stamp_ns, level, name, text)
@@ -149,7 +149,7 @@ def test_a_line_of_a_log_is_read_as_it_was_written(
     assert data == serialized(cdr.LOG, own)
 
 
-def test_a_stamp_beyond_what_ros_2_can_say_is_its_last_second() -> None:
+def test_a_stamp_beyond_ros_2_is_its_last_second() -> None:
     message = by_rosbags(cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
     assert message.header.stamp.sec == 2**31 - 1
 
@@ -167,9 +167,7 @@ def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
 
 
 @given(stamps_ns, words, st.lists(floats, min_size=7, max_size=7))
-def test_poses_and_wrenches_are_those_of_rosbags_and_are_read_back(
-    stamp_ns: int, frame: str, numbers: list[float]
-) -> None:
+def test_poses_and_wrenches_are_those_of_rosbags(stamp_ns: int, frame: str, numbers: list[float]) -> None:
     for kind, make, count in (("PoseStamped", pose, 7), ("WrenchStamped", wrench, 6)):
         data = cdr.pack_frame_vectors(stamp_ns, frame, *numbers[:count])
         assert data == serialized(f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count]))
@@ -208,7 +206,7 @@ def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, 
 
 
 @given(st.booleans(), words)
-def test_the_response_of_a_trigger_is_a_boolean_and_a_text(success: bool, text: str) -> None:
+def test_response_of_trigger_is_boolean_and_text(success: bool, text: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg("bool success\nstring message\n", "std_srvs/msg/Told"))
     told = store.types["std_srvs/msg/Told"](success=success, message=text)

@@ -30,7 +30,7 @@ LOGS = {"paper": paper, "busy": lambda: logs.busy().log, "four": lambda: logs.si
 
 
 @pytest.mark.parametrize("which", LOGS)
-def test_names_are_unique_end_in_their_unit_and_every_column_says_what_it_is(which: str) -> None:
+def test_column_names_are_unique_end_in_units_and_are_explained(which: str) -> None:
     log = LOGS[which]()
     for table in log.tables():
         names = [column.name for column in table.columns]
@@ -150,7 +150,7 @@ def test_what_there_is_not_is_answered_with_what_there_is() -> None:
         log.table("m1")["q1"]
 
 
-def test_an_arrival_of_a_peer_that_there_is_not_is_refused() -> None:
+def test_arrival_of_peer_that_there_is_not_is_refused() -> None:
     log = opened(edited(recorded("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]}))
     with pytest.raises(LogError, match="record of m1 lists an arrival of a peer"):
         log.table("m1", "arrivals")
@@ -194,7 +194,7 @@ ENDINGS = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}
 
 
 @pytest.mark.parametrize("kind", [State, LinkStats, Event, RecorderStats])
-def test_every_field_has_a_meaning_and_the_unit_in_which_its_name_ends(kind: type[msgspec.Struct]) -> None:
+def test_every_field_has_a_meaning_and_the_unit_it_names(kind: type[msgspec.Struct]) -> None:
     said = read_field_docs(kind)
     assert list(said) == list(kind.__struct_fields__)
     for field, (unit, text, json_type) in said.items():

@@ -132,7 +132,7 @@ def test_a_tick_that_the_scenario_does_not_have_is_refused() -> None:
         _ = log["m1"]
 
 
-def test_a_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
+def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
     log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
     endless = [msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events]
     log.events = endless

@@ -75,7 +75,7 @@ def test_every_sample_has_the_delay_that_its_receiver_recorded(path: Path, peer:
 
 
 @pytest.mark.parametrize("rate_hz", [1000, 333])
-def test_a_link_that_replays_a_log_gives_each_sample_its_measured_delay(path: Path, rate_hz: int) -> None:
+def test_link_that_replays_log_gives_each_sample_its_measured_delay(path: Path, rate_hz: int) -> None:
     """In [link] each link reads its own; to the microsecond, at any rate."""
     link = {"model": "trace", "file": str(path)}
     scenario = load_scenario("paper", {**OVERRIDES, "link": link})
@@ -108,7 +108,7 @@ def test_a_scenario_that_ran_does_not_need_the_log_again(path: Path) -> None:
     assert "run.mcap" not in scenario.text
 
 
-def test_what_may_stand_in_records_that_are_missing_is_left_out(data: bytes, path: Path) -> None:
+def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> None:
     """A gap in the receiver's records hides arrivals: those samples are unknown, not lost."""
     path.write_bytes(
         edited(data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r)
@@ -125,9 +125,7 @@ def test_what_may_stand_in_records_that_are_missing_is_left_out(data: bytes, pat
     ("link", "words"),
     [("m1->ss", "did you mean 'm1->s'"), ("x", "Its links are m2->m1"), ("m1->m1", "no link")],
 )
-def test_a_link_that_the_log_does_not_have_is_named_with_the_nearest(
-    path: Path, link: str, words: str
-) -> None:
+def test_link_that_log_does_not_have_is_named_with_nearest(path: Path, link: str, words: str) -> None:
     with pytest.raises(ValueError, match="no link") as error:
         read_link_delays(path, link)
     assert words in str(error.value)
@@ -143,14 +141,14 @@ def test_a_link_over_which_nothing_came_has_no_delays(data: bytes, path: Path) -
 
 
 @pytest.mark.parametrize("content", [b"", b"t_s,delay_ms\n0,1\n", b"\x89MCAP0\r\n"])
-def test_a_file_that_is_no_log_is_refused_with_the_keys_path(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_no_log_is_refused_with_keys_path(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "run.mcap").write_bytes(content)
     with pytest.raises(ScenarioError) as error:
         load_scenario("paper", {"link": {"model": "trace", "file": str(tmp_path / "run.mcap")}})
     assert error.value.path == "link.file"
 
 
-def test_a_log_that_is_not_there_is_refused_with_the_keys_path(tmp_path: Path) -> None:
+def test_log_that_is_not_there_is_refused_with_keys_path(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="No such file") as error:
         load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}})
     assert error.value.path == "links.m1->s.file"

@@ -44,7 +44,7 @@ def messages(path: Path) -> list[Sent]:
 # Names.
 
 
-def test_a_log_has_its_name_when_it_is_whole_and_not_before(tmp_path: Path) -> None:
+def test_a_log_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogFile(path) as file:
         container = begun(file)
@@ -57,7 +57,7 @@ def test_a_log_has_its_name_when_it_is_whole_and_not_before(tmp_path: Path) -> N
     assert messages(path) == [(1, 0, b"x", 0, 0)]
 
 
-def test_what_is_flushed_is_in_the_file_and_what_is_not_is_not(tmp_path: Path) -> None:
+def test_only_what_is_flushed_is_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     file = LogFile(path)
     container = begun(file)
@@ -100,7 +100,7 @@ def test_a_file_into_which_nothing_was_written_is_not_there(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_exists_is_replaced_only_when_asked_and_only_when_the_new_one_is_whole(tmp_path: Path) -> None:
+def test_an_existing_log_is_replaced_by_a_whole_one(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"precious")
     with (
@@ -129,7 +129,7 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     assert messages(active_path(path)) == []
 
 
-def test_where_there_are_no_links_a_log_gets_its_name_all_the_same(
+def test_without_hard_links_a_log_still_gets_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def link(*_: object) -> None:
@@ -192,7 +192,7 @@ def recorded(file: LogFile, wanted: list[Sent], flushed: list[Sent]) -> None:
 
 
 @pytest.mark.usefixtures("unsynced", "little_margin")
-def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_given(tmp_path: Path) -> None:
+def test_wherever_a_disk_fills_the_log_ends_in_order(tmp_path: Path) -> None:
     """At every byte of a chunk: the file is whole, with the chunk that did not fit any more."""
     path = tmp_path / "run.mcap"
     wanted = sent(60 * CHUNK)
@@ -217,9 +217,7 @@ def test_wherever_a_disk_is_full_the_log_ends_in_order_with_all_that_it_was_give
 
 @pytest.mark.usefixtures("unsynced", "little_margin")
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO])
-def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
-    error: int, tmp_path: Path
-) -> None:
+def test_without_room_for_the_end_whole_chunks_are_kept(error: int, tmp_path: Path) -> None:
     """At every byte of a chunk and of the end: cut where the last flush ended."""
     path = tmp_path / "run.mcap"
     wanted = sent(3 * CHUNK)
@@ -247,7 +245,7 @@ def test_where_not_even_the_end_fits_every_whole_chunk_is_kept_for_recover(
         path.unlink()
 
 
-def test_room_is_kept_for_what_is_pending_and_for_the_end(tmp_path: Path) -> None:
+def test_room_is_kept_for_what_is_pending_and_for_end(tmp_path: Path) -> None:
     disk = SmallDisk(10 << 20)
     file = file_on(disk, tmp_path / "run.mcap")
     container = begun(file)
@@ -262,7 +260,7 @@ def test_room_is_kept_for_what_is_pending_and_for_the_end(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("error", [None, errno.EOPNOTSUPP, errno.EACCES])
-def test_a_real_reserve_takes_room_that_nobody_sees_and_gives_it_back(
+def test_a_reserve_takes_hidden_room_and_gives_it_back(
     error: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without `posix_fallocate` it is written; a folder that takes no reserve does without."""
@@ -308,7 +306,7 @@ except LogRefused as refused:
 """
 
 
-def test_a_file_that_is_as_long_as_it_may_be_is_cut_at_a_chunk_and_recovered(tmp_path: Path) -> None:
+def test_a_file_of_the_largest_size_is_cut_and_recovered(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     done = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60)
     assert done.returncode == 5, done
@@ -322,7 +320,7 @@ def test_a_file_that_is_as_long_as_it_may_be_is_cut_at_a_chunk_and_recovered(tmp
 # Loss of power.
 
 
-def test_what_is_flushed_is_synced_every_second_and_with_durable_every_time(
+def test_flushed_data_is_synced_every_second_or_when_durable_always(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
@@ -339,7 +337,7 @@ def test_what_is_flushed_is_synced_every_second_and_with_durable_every_time(
         file.close()
 
 
-def test_a_disk_that_refuses_what_it_had_taken_ends_the_log(
+def test_disk_that_refuses_what_it_had_taken_ends_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: int) -> None:

@@ -51,7 +51,7 @@ def test_a_leading_slash_is_fine() -> None:
     )
 
 
-def test_what_is_not_chosen_has_no_channel_and_no_account_and_the_file_says_so() -> None:
+def test_an_unchosen_channel_is_absent_and_the_file_says_so() -> None:
     stream = io.BytesIO()
     chosen = ChannelFilter(("trilat/*/m$*/**",), ("**/link",))
     writer = LogWriter(stream, load_scenario("paper"), "lab", "live", 0, choice=chosen)

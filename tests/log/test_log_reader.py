@@ -39,7 +39,7 @@ def test_another_seed_is_another_file() -> None:
     assert recorded("paper", {"duration_s": 0.05}) != recorded("paper", {"duration_s": 0.05, "seed": 2})
 
 
-def test_there_is_no_path_and_no_wall_clock_in_a_virtual_log() -> None:
+def test_a_virtual_log_has_no_path_and_no_wall_clock() -> None:
     data = edited(recorded("paper"))
     assert str(Path(__file__).parents[2]).encode() not in data
     for _, _, message in make_reader(io.BytesIO(recorded("paper"))).iter_messages():
@@ -169,7 +169,7 @@ def test_the_reader_gives_arrays_with_time() -> None:
 # What is torn, damaged, or not ours.
 
 
-def test_a_file_cut_anywhere_opens_as_far_as_it_is_whole() -> None:
+def test_file_cut_anywhere_opens_as_far_as_it_is_whole() -> None:
     """It says that it is not complete, or is refused; nothing else comes out."""
     data = edited(recorded("paper"), chunk_bytes=4096)
     before = 0
@@ -212,7 +212,7 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
         len(opened(stream.getvalue())["m1"])
 
 
-def test_events_that_cannot_be_read_are_left_out_and_the_log_is_read() -> None:
+def test_unreadable_events_are_left_out_and_the_log_is_read() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
     whole = opened(recorded("paper"))
     odd = opened(edited(recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload))

@@ -48,7 +48,7 @@ def test_what_was_signed_holds_and_the_log_is_not_touched(signed: tuple[Path, Pa
     assert problem(path, key) == ""
 
 
-def test_ed25519_is_that_of_rfc_8032_over_the_digests_in_words(signed: tuple[Path, Path]) -> None:
+def test_ed25519_is_that_of_rfc_8032_over_digests_in_words(signed: tuple[Path, Path]) -> None:
     """The file is enough for any other program: the bytes that are signed are made of it alone."""
     path, key = signed
     stated = json.loads(path.with_name("run.mcap.sig").read_text())

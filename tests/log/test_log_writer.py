@@ -111,7 +111,7 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
     assert found == messages
 
 
-def test_a_part_opens_as_a_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
+def test_part_opens_as_log_and_all_parts_open_as_one(tmp_path: Path) -> None:
     messages = [(KEYS[0], b"\x80" * 900, 10**18 + k * 10**8, k) for k in range(40)]
     path = tmp_path / "run.mcap"
     written(LogStorage(path, split_ns=10**9), messages)
@@ -152,7 +152,7 @@ def test_to_continue_is_to_write_the_next_part(
 
 
 @pytest.mark.parametrize("there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"])
-def test_a_name_that_is_taken_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
+def test_a_taken_name_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
     with pytest.raises(UsageError, match=f"{there}.* exists.*force=True"):
@@ -219,7 +219,7 @@ def recorded_on(room: int, path: Path, messages: list[Message]) -> list[Message]
     return taken
 
 
-def test_a_disk_that_is_full_at_a_seam_keeps_the_parts_before(tmp_path: Path) -> None:
+def test_disk_that_is_full_at_seam_keeps_parts_before(tmp_path: Path) -> None:
     """At every step of a log in parts: all parts are whole, and hold all that was given to them."""
     messages = [(KEYS[0], os.urandom(300), 10**18 + k * 10**8, k) for k in range(40)]
     for room in range(80_000, 200_000, 7900):

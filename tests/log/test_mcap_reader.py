@@ -98,9 +98,7 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
 
 @settings(max_examples=30)
 @given(st.sampled_from(FRAMES), st.integers(0, (1 << 64) - 1))
-def test_a_record_that_lies_about_its_length_hides_no_more_than_a_chunk_or_two(
-    frame: RecordFrame, length: int
-) -> None:
+def test_a_record_of_false_length_hides_few_chunks(frame: RecordFrame, length: int) -> None:
     """Reading goes on at the next chunk that makes sense, and what is between is named."""
     changed = bytearray(DATA)
     struct.pack_into("<Q", changed, frame.offset + 1, length)
@@ -142,7 +140,7 @@ def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
         unpack_chunk(head + lz4_)
 
 
-def test_a_file_that_holds_absurdly_much_is_refused_with_the_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_that_holds_absurdly_much_is_refused_with_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
     bombs = b"".join(chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6))
@@ -153,7 +151,7 @@ def test_a_file_that_holds_absurdly_much_is_refused_with_the_place(monkeypatch: 
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 240_000
 
 
-def test_a_channel_that_holds_absurdly_much_ends_there_and_the_others_are_read(
+def test_an_absurdly_large_channel_ends_there_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One odd channel does not make a log unreadable; what is left out of it is said, once."""
@@ -180,7 +178,7 @@ def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.
     assert sum(1 for _ in McapReader(stream, "log").messages()) > 3000
 
 
-def test_a_chunk_in_a_chunk_is_no_message_and_is_not_looked_into() -> None:
+def test_a_chunk_within_a_chunk_is_not_read() -> None:
     inner = chunk(struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0))
     data = DATA[: CHUNKS[1].offset] + chunk(inner) + DATA[CHUNKS[1].offset :]
     assert walked(data)[1] == ITEMS

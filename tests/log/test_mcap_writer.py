@@ -77,7 +77,7 @@ def read(data: bytes) -> dict[str, Any]:
 
 @settings(max_examples=40)
 @given(calls=CALLS, chunk_bytes=st.sampled_from([1, 200, 1 << 20]))
-def test_every_reader_finds_what_it_finds_in_a_file_of_mcaps_own(
+def test_every_reader_finds_what_mcaps_own_writer_wrote(
     calls: list[tuple[Any, ...]], chunk_bytes: int
 ) -> None:
     found, expected = read(ours(calls, chunk_bytes)), read(theirs(calls, chunk_bytes))
@@ -86,7 +86,7 @@ def test_every_reader_finds_what_it_finds_in_a_file_of_mcaps_own(
 
 @settings(max_examples=20)
 @given(calls=CALLS)
-def test_the_same_calls_give_the_same_bytes_and_a_stream_reads_them_in_order(
+def test_the_same_calls_give_the_same_bytes(
     calls: list[tuple[Any, ...]],
 ) -> None:
     data = ours(calls, 200)
@@ -96,7 +96,7 @@ def test_the_same_calls_give_the_same_bytes_and_a_stream_reads_them_in_order(
     assert [record.data for record in records if type(record).__name__ == "Message"] == payloads
 
 
-def test_a_channel_that_comes_later_stands_before_the_messages_that_wait() -> None:
+def test_channel_that_comes_later_stands_before_messages_that_wait() -> None:
     stream = io.BytesIO()
     file = McapWriter(stream, "lib")
     begun(file)

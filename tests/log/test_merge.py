@@ -58,7 +58,7 @@ def hands(draw: st.DrawFn) -> list[set[int]]:
 
 @settings(max_examples=12)
 @given(hands(), st.randoms(use_true_random=False))
-def test_a_log_dealt_out_reads_as_the_whole_in_whatever_order_its_parts_are_named(dealing, chance) -> None:
+def test_parts_in_any_order_read_as_the_whole(dealing, chance) -> None:
     parts = dealt(whole(), dealing)
     chance.shuffle(parts)
     log = joined(*parts)
@@ -85,7 +85,7 @@ def place_of(topic_end: str, number: int = 0) -> int:
         ("s/event", {"text": "no"}, "event 0 of s"),
     ],
 )
-def test_parts_that_tell_the_same_differently_are_refused_by_their_names(
+def test_parts_that_tell_same_differently_are_refused_by_their_names(
     where: str, fields: dict[str, object], named: str, tmp_path: Path
 ) -> None:
     every = messages(whole())
@@ -117,7 +117,7 @@ def test_files_of_different_sessions_are_refused_with_what_differs(
         open_log(one, two)
 
 
-def test_a_torn_part_whose_hole_another_one_fills_leaves_the_whole_complete() -> None:
+def test_torn_part_whose_hole_another_one_fills_leaves_whole_complete() -> None:
     every = messages(whole())
     torn = a_file(whole(), every[:150], finished=False)
     carried_on = a_file(whole(), every[100:], part=2)
@@ -126,7 +126,7 @@ def test_a_torn_part_whose_hole_another_one_fills_leaves_the_whole_complete() ->
     assert joined(torn, carried_on).complete
 
 
-def test_a_record_that_no_part_has_is_missing_and_a_torn_part_shows_it() -> None:
+def test_a_record_that_no_part_has_is_missing() -> None:
     every = messages(whole())
     torn = a_file(whole(), every[:150], finished=False)
     log = joined(torn, a_file(whole(), every[151:], part=2))
@@ -135,7 +135,7 @@ def test_a_record_that_no_part_has_is_missing_and_a_torn_part_shows_it() -> None
     assert sum("missing 1" in log.account(name) for name in log.sites) == 1
 
 
-def test_a_part_that_is_not_named_or_has_no_end_leaves_the_whole_incomplete() -> None:
+def test_an_unnamed_or_unfinished_part_leaves_the_whole_incomplete() -> None:
     parts = dealt(whole(), [range(100), range(100, 200), range(200, count())])
     assert joined(*parts).complete
     assert not joined(parts[0], parts[2]).complete
@@ -158,7 +158,7 @@ def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
     return stream.getvalue()
 
 
-def test_what_recorders_dropped_is_counted_once_each_though_one_counts_on_from_part_to_part() -> None:
+def test_drops_counted_across_parts_are_counted_once() -> None:
     log = joined(
         by(1, at_ns=0, dropped=2, part=1),
         by(1, at_ns=10, dropped=5, part=2),
@@ -170,7 +170,7 @@ def test_what_recorders_dropped_is_counted_once_each_though_one_counts_on_from_p
     assert [event.boot for event in log.events] == [1, 2]
 
 
-def test_events_of_before_they_were_numbered_are_told_apart_by_what_they_say() -> None:
+def test_events_without_numbers_are_told_apart_by_their_content() -> None:
     every = messages(whole())
     place = place_of("m1/event")
     old = [changed(every[place], n=-1, text=text) for text in ("a", "b")]
@@ -191,7 +191,7 @@ def test_progress_is_told_of_all_parts_as_one(tmp_path: Path) -> None:
     assert total - 100 < told[-1][0] <= total
 
 
-def test_a_part_with_a_message_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:
+def test_a_part_with_an_invalid_message_is_refused_by_name(tmp_path: Path) -> None:
     every = messages(whole())
     first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
     first.write_bytes(a_file(whole(), every[:100]))

@@ -49,7 +49,7 @@ def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
                 yield channel.topic, decode(message.data), message
 
 
-def test_the_mcap_package_reads_the_same_with_the_index_and_without(log_file: Path) -> None:
+def test_mcap_package_reads_same_with_index_and_without(log_file: Path) -> None:
     data = log_file.read_bytes()
     by_index = make_reader(io.BytesIO(data), validate_crcs=True).iter_messages()
     plain = NonSeekingReader(io.BytesIO(data), validate_crcs=True).iter_messages(log_time_order=False)
@@ -61,7 +61,7 @@ def test_the_mcap_package_reads_the_same_with_the_index_and_without(log_file: Pa
     assert times == sorted(times)
 
 
-def test_every_channel_has_a_schema_and_every_message_a_name_for_each_field(log_file: Path) -> None:
+def test_every_channel_has_a_schema_that_names_every_field(log_file: Path) -> None:
     """Viewers pass over channels without a schema, and take a list on top for many messages."""
     with log_file.open("rb") as stream:
         reader = make_reader(stream)

@@ -103,7 +103,7 @@ GOOD: dict[str, object] = {
         ("cmd", [3]),
     ],
 )
-def test_a_column_with_a_value_that_is_none_is_refused_by_the_sites_name(field: str, value: object) -> None:
+def test_a_column_with_an_invalid_value_is_refused(field: str, value: object) -> None:
     part = site_log([msgpack.packb(GOOD), msgpack.packb({**GOOD, field: value})])
     ask = {"rx": "arrivals", "cmd": "changes"}.get(field, field)
     with pytest.raises(Exception, match="log: a record of m1 cannot be read") as raised:
@@ -129,7 +129,7 @@ def test_a_payload_that_is_too_long_is_refused() -> None:
         record_columns.decode_ticks([msgpack.packb({**GOOD, "cmd": ["x" * 70_000]})])
 
 
-def test_records_that_came_out_of_order_are_put_in_order_with_their_times() -> None:
+def test_disordered_records_are_put_in_order_with_their_times() -> None:
     payloads = [msgpack.packb({**GOOD, "tick": tick}) for tick in (4, 2, 3)]
     came = np.array([40, 20, 30])
     part = SiteLog("m1", PEERS, 1000, payloads, "log", (came, came + 1))

@@ -130,7 +130,7 @@ def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
 
 @anywhere
 @given(made_by=LOGS, flips=st.lists(st.tuples(positions, st.integers(1, 255)), min_size=1, max_size=3))
-def test_of_a_damaged_file_every_chunk_that_is_intact_is_kept(
+def test_of_damaged_file_every_chunk_that_is_intact_is_kept(
     made_by: Callable[[], bytes], flips: list[tuple[float, int]], tmp_path: Path
 ) -> None:
     whole = made_by()
@@ -195,7 +195,7 @@ def test_what_is_missing_is_counted_afresh_and_named_by_site(tmp_path: Path) -> 
     assert metadata["trilat.recovered"]["missing"] == result.missing[0]
 
 
-def test_a_chunk_that_is_lost_is_told_with_the_ticks_that_were_in_it(tmp_path: Path) -> None:
+def test_a_lost_chunk_is_told_with_its_ticks(tmp_path: Path) -> None:
     data = bytearray(log())
     chunk = chunks(log())[5]
     data[(chunk.begin + chunk.end) // 2] ^= 1
@@ -400,9 +400,7 @@ def test_a_file_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", [["log", "recover"], ["verify"]])
-def test_who_asks_for_a_log_that_was_not_finished_is_told_where_it_is(
-    command: list[str], tmp_path: Path
-) -> None:
+def test_an_unfinished_log_is_named_where_it_is(command: list[str], tmp_path: Path) -> None:
     (tmp_path / "run.mcap.active").write_bytes(log()[:-60])
     done = trilat(*command, "run.mcap", cwd=tmp_path)
     done.refuses("run.mcap: cannot be read", "trilat log recover run.mcap.active")

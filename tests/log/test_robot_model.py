@@ -39,7 +39,7 @@ def end_of(model: RobotModel, q) -> tuple:
 
 
 @pytest.mark.parametrize("arm", POSES)
-def test_the_last_frame_is_where_pinocchio_has_the_end_of_the_arm(arm):
+def test_last_frame_is_where_pinocchio_has_end_of_arm(arm):
     model = build_robot_model(scenario(arm), "m")
     reference = chain_references()[arm]
     assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
@@ -78,7 +78,7 @@ def test_a_message_is_read_by_the_decoder_of_ros():
     assert {channel.kind for channel in ROBOT_CHANNELS.values()} == {cdr.STRING, cdr.TRANSFORMS}
 
 
-def test_the_description_has_the_links_of_the_file_named_after_the_site_and_shapes_that_end_at_joints():
+def test_the_robot_description_has_the_links_and_shapes():
     root = ElementTree.fromstring(build_robot_model(scenario(), "s").description)
     given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
     names = [link.get("name") for link in root.findall("link")]
@@ -88,7 +88,7 @@ def test_the_description_has_the_links_of_the_file_named_after_the_site_and_shap
     assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
 
 
-def test_the_end_of_every_unlike_arm_is_where_its_site_says():
+def test_end_of_every_unlike_arm_is_where_its_site_says():
     """A planar arm among chains has a model too, and bases stand where the scenario places them."""
     from trilat_net.scenario import load_scenario
 

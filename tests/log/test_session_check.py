@@ -222,7 +222,7 @@ def test_files_of_different_sessions_are_not_judged_as_one(tmp_path: Path) -> No
         judged(tmp_path, DATA, edited(DATA, session={"session": "other"}))
 
 
-def test_a_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
+def test_file_of_others_is_judged_by_how_it_is_built(tmp_path: Path) -> None:
     found = judged(tmp_path, foreign())
     assert found.passed
     assert not found.ours
@@ -268,7 +268,7 @@ def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
     assert theirs == ours
 
 
-def test_the_checksum_of_the_data_is_compared_where_there_is_one(tmp_path: Path) -> None:
+def test_checksum_of_data_is_compared_where_there_is_one(tmp_path: Path) -> None:
     """Our writer makes none; of a file that has one it is told when a byte of the data changed."""
     data = foreign([b"{}"] * 100, enable_data_crcs=True)
     assert judged(tmp_path, data).passed

@@ -124,7 +124,7 @@ def joint_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
 
 
 @given(st.lists(st.lists(finite, min_size=3, max_size=3), min_size=1, max_size=30))
-def test_the_envelope_of_a_column_is_its_extremes_in_the_order_in_which_they_came(
+def test_an_envelope_is_the_extremes_in_their_order(
     rows: list[list[float]],
 ) -> None:
     columns = list(zip(*rows, strict=True))
@@ -156,7 +156,7 @@ def buckets(records: Iterable[TickRecord], length: int) -> dict[int, list[TickRe
 
 
 @given(runs())
-def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: list[TickRecord]) -> None:
+def test_exactly_every_extreme_of_every_bucket_is_there(records: list[TickRecord]) -> None:
     """In whatever order the records come."""
     desk = Desk(100.0)
     desk.take(records)
@@ -180,7 +180,7 @@ def test_every_extreme_of_every_bucket_is_there_and_nothing_else_is(records: lis
 
 
 @given(runs())
-def test_messages_bear_times_of_records_and_are_put_in_order_of_log_time(records: list[TickRecord]) -> None:
+def test_messages_bear_times_of_records_in_order_of_log_time(records: list[TickRecord]) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.take(records)
     desk.finish()
@@ -206,7 +206,7 @@ def test_disorder_within_a_bucket_does_not_show(records: list[TickRecord], chanc
     assert Counter(first) == Counter(second)
 
 
-def test_a_live_recorder_sees_one_message_every_ten_ms_on_either_clock() -> None:
+def test_a_live_view_has_one_message_every_ten_ms() -> None:
     """The second message of a bucket waits half a bucket, so that curves are even over the log time, too."""
     desk = Desk(100.0)
     desk.take(record(k, [float(k)] * 17) for k in range(1000))
@@ -227,12 +227,12 @@ def test_full_is_every_record_as_it_was(views_hz: float) -> None:
 
 
 @given(runs())
-def test_a_record_of_the_wire_and_one_of_the_simulation_look_the_same(records: list[TickRecord]) -> None:
+def test_record_of_wire_and_one_of_simulation_look_same(records: list[TickRecord]) -> None:
     states = [decode(encode_state("m", 1, ["s"], one, [], 0, 0), State) for one in records]
     assert stack_signals(states) == stack_signals(records)
 
 
-def test_what_waits_is_bounded_by_the_bucket_and_not_by_the_silence() -> None:
+def test_what_waits_is_bounded_by_bucket_and_not_by_silence() -> None:
     """A sender that counts its ticks in leaps, back and forth, leaves nothing behind."""
     desk = Desk(100.0)
     desk.take(record((k * 7919) % 100_000, [0.0] * 17) for k in range(3000))
@@ -252,7 +252,7 @@ def stats(**facts: Any) -> LinkStats:
     )  # fmt: skip
 
 
-def test_statistics_are_arrays_with_a_unit_and_what_was_not_measured_is_no_number() -> None:
+def test_statistics_are_arrays_with_units_and_unmeasured_ones_are_nan() -> None:
     desk = Desk(100.0)
     clocks = {"offset_us": {"s": -2000}, "bound_us": {"s": 40}}
     delays = {"delay_us": {"s": 800}, "delay_max_us": {"s": 2500}}
@@ -278,7 +278,7 @@ def test_virtual_time_has_no_clocks_and_no_network_to_show() -> None:
 
 
 @pytest.mark.parametrize(("kind", "level"), [("end", 20), ("lost", 30), ("diverged", 40)])
-def test_an_event_is_a_text_and_a_line_with_a_level(kind: str, level: int) -> None:
+def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
     desk.views.takers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
@@ -290,7 +290,7 @@ def test_an_event_is_a_text_and_a_line_with_a_level(kind: str, level: int) -> No
     assert text.publish_ns == text.log_ns == line.publish_ns == line.log_ns == EPOCH_NS + 9
 
 
-def test_an_event_before_the_epoch_has_the_time_of_its_arrival() -> None:
+def test_event_before_epoch_has_time_of_its_arrival() -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
     desk.views.takers["trilat/lab/m/event"](Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9)
     kind, data = desk.seen[1].message
@@ -298,7 +298,7 @@ def test_an_event_before_the_epoch_has_the_time_of_its_arrival() -> None:
     assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
 
 
-def test_the_logs_own_messages_are_the_same_with_views_and_without() -> None:
+def test_logs_own_messages_are_same_with_views_and_without() -> None:
     own, shown = [], []
     for views_hz in (0.0, 100.0):
         stream = io.BytesIO()
@@ -333,7 +333,7 @@ def test_a_part_ends_with_all_that_it_has_seen() -> None:
     assert np.array_equal(np.min(shown, axis=0), whole.min(axis=0))
 
 
-def test_a_site_with_an_odd_rate_is_shown_no_less_often_than_asked() -> None:
+def test_an_odd_rate_is_shown_as_often_as_asked() -> None:
     scenario = load_scenario("two_sites", {"sites.m.rate_hz": 333})
     desk = Desk(100.0, scenario)
     desk.take(record(k, [0.0] * 17) for k in range(333))

@@ -89,7 +89,7 @@ def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> N
     assert heard == [("t/a", number) for number in NUMBERS]
 
 
-def test_a_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tuple[Bus, Bus]) -> None:
+def test_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tuple[Bus, Bus]) -> None:
     """Several times what a connection holds; who takes it is slower."""
     sender, receiver = pair
     heard: list[bytes] = []
@@ -105,7 +105,7 @@ def test_a_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tupl
     assert heard == said
 
 
-def test_a_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
+def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     small, large, publish = receiver.inbox("t/a", 16), receiver.inbox("t/a"), sender.publisher("t/a")
     opened(publish, small, large)
@@ -159,7 +159,7 @@ def test_a_responder_answers_at_once_while_nobody_polls(pair: tuple[Bus, Bus]) -
     assert until(lambda: answered(asker, "t/*/ping", b"123")) == ("t/a/ping", b"321")
 
 
-def test_a_responder_may_keep_silent_and_then_only_the_others_are_heard(network: Network) -> None:
+def test_responder_may_keep_silent_and_then_only_others_are_heard(network: Network) -> None:
     asker, silent, other = (network.join() for _ in range(3))
     asked: list[bytes] = []
     silent.respond("t/a/ping", asked.append)
@@ -220,7 +220,7 @@ def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> Non
     assert inbox.overflowed == 0
 
 
-def test_a_stamped_ring_that_is_full_counts_the_oldest_that_it_loses(pair: tuple[Bus, Bus]) -> None:
+def test_stamped_ring_that_is_full_counts_oldest_that_it_loses(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     inbox, publish = receiver.stamped("t/a", Ticking(), bytes, 16), sender.publisher("t/a")
     opened(publish, inbox)

@@ -51,7 +51,7 @@ def test_who_names_nothing_is_on_this_machine() -> None:
     assert member(own=file(namespace="n")) == Connection(HERE, THERE, "peer", {"namespace": "n"})
 
 
-def test_a_place_that_is_named_replaces_the_one_on_this_machine() -> None:
+def test_place_that_is_named_replaces_one_on_this_machine() -> None:
     assert member(listen=[A]) == Connection([A], THERE)
     assert member(connect=[A, B]) == Connection(HERE, [A, B])
     assert member(listen=[], connect=[]) == Connection([], [])
@@ -63,7 +63,7 @@ def test_a_place_that_is_named_replaces_the_one_on_this_machine() -> None:
     ]  # --connect first
 
 
-def test_a_client_of_a_router_listens_nowhere_and_connects_to_nothing_else() -> None:
+def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None:
     assert member(routers=[A, B]) == Connection((), [A, B], "client", {})
     stated = file(mode="client", connect={"endpoints": [C]})
     assert member(routers=[A], own=stated) == Connection((), [A, C], "client", {"connect": {}})
@@ -108,7 +108,7 @@ def router(listen: list[str] | None, connect: list[str] | None, own: ZenohFile |
     return resolve_member_connection(listen, connect, None, own, HERE, routes=True)
 
 
-def test_a_router_listens_where_it_is_told_and_may_connect_to_others() -> None:
+def test_a_router_listens_and_connects_as_told() -> None:
     assert router(None, None, None) == Connection(HERE, (), "router", {})
     told = router([A], [B], file(mode="router"))
     assert told == Connection([A], [B], "router", {})
@@ -150,7 +150,7 @@ def test_a_router_that_comes_later_is_waited_for() -> None:
     assert said == [f"no router answers at {endpoints[0]} yet; trying again"]
 
 
-def test_a_router_that_never_comes_is_said_and_a_signal_ends_the_waiting() -> None:
+def test_router_that_never_comes_is_said_and_signal_ends_waiting() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     connection = Connection((), endpoints, "client")
@@ -205,7 +205,7 @@ def test_free_endpoints_can_be_listened_at_all_at_once() -> None:
             stack.enter_context(socket.socket()).bind(("127.0.0.1", port(endpoint)))
 
 
-def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
+def test_a_session_keeps_its_ports_unless_one_is_taken() -> None:
     """So that `trilat set` and `trilat ping` find it without being told."""
     sites = ("a", "b", "c")
     places = list(default_endpoints("endpoints-test", sites).values())
@@ -219,7 +219,7 @@ def test_a_session_stays_at_its_ports_unless_one_of_them_is_taken() -> None:
             assert not set(others) & set(places)
 
 
-def test_two_sessions_of_one_name_that_begin_at_once_get_ports_of_their_own() -> None:
+def test_two_sessions_of_one_name_get_their_own_ports() -> None:
     """Each keeps what it chose, and its sites can listen there all the same."""
     sites = ("a", "b", "c")
     with ExitStack() as stack:
@@ -273,7 +273,7 @@ def test_it_says_who_comes_and_goes_in_every_session() -> None:
     ]
 
 
-def test_two_starts_of_one_member_are_two_and_one_start_is_one() -> None:
+def test_two_starts_of_one_member_count_as_two() -> None:
     """A token may be heard twice, as after a link that healed; it is said once."""
     network = LocalNetwork()
     first = announced(network, "trilat/t/m1/alive/1")
@@ -289,7 +289,7 @@ def test_two_starts_of_one_member_are_two_and_one_start_is_one() -> None:
     ]
 
 
-def test_it_stays_until_members_have_come_and_all_have_left_for_so_long() -> None:
+def test_a_router_stays_until_all_members_have_left() -> None:
     network = LocalNetwork()
     members: list[Bus] = []
 

@@ -71,7 +71,7 @@ def running() -> Iterator[Answering]:
         yield site
 
 
-def test_a_change_is_answered_by_the_site_that_carries_it_out(running: Answering) -> None:
+def test_change_is_answered_by_site_that_carries_it_out(running: Answering) -> None:
     reply = running.asked("s", link="m1->s", to={"delay_ms": 350.0})
     assert (reply.member, reply.accepted, reply.tick) == ("s", True, 200)
     refused = running.asked("s", link="m1->s", to={"delay_ms": -1.0})
@@ -79,12 +79,12 @@ def test_a_change_is_answered_by_the_site_that_carries_it_out(running: Answering
     assert "delay_ms" in refused.text
 
 
-def test_a_site_that_does_not_exist_is_told_with_those_that_do(running: Answering) -> None:
+def test_a_site_that_does_not_exist_is_told_the_others(running: Answering) -> None:
     with pytest.raises(SessionError, match="m1, m2, s"):
         running.asked("x", dominance="x", to={"m1": 1.0})
 
 
-def test_a_site_of_the_scenario_that_is_not_there_does_not_answer(running: Answering) -> None:
+def test_site_of_scenario_that_is_not_there_does_not_answer(running: Answering) -> None:
     with pytest.raises(SessionError, match="'m1' of session 'o' does not answer"):
         running.asked("m1", dominance="m1", to={"s": 1.0})
 
@@ -115,12 +115,12 @@ def test_members_are_found_again_and_again_beside_unreadable_answers() -> None:
     assert find() == []
 
 
-def test_answers_of_another_version_alone_are_an_error_that_names_the_member() -> None:
+def test_answers_of_another_version_alone_are_error_that_names_member() -> None:
     with pytest.raises(SessionError, match=f"the answer of m0 cannot be read: .* version {VERSION + 1}"):
         find(encode(told("m0", 1, v=VERSION + 1)))
 
 
-def test_a_recorder_announces_itself_while_it_asks_the_first_site_for_the_others() -> None:
+def test_recorder_announces_itself_while_it_asks_first_site_for_others() -> None:
     session = f"discovery-{CLOCK.monotonic_ns()}"
     first = ZenohBus([default_endpoint(session, 0)])
     presence = first.presence(topics.presence_key(session, "*"))

@@ -31,7 +31,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "trilat-net" / "running"
 
 
-def test_a_site_is_known_while_it_runs_and_to_its_user_alone(state: Path) -> None:
+def test_a_running_site_is_known_to_its_user_alone(state: Path) -> None:
     assert find_known_sites("t") == []
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
         (one,) = find_known_sites("t")
@@ -74,7 +74,7 @@ def test_a_site_runs_where_no_file_can_be_written(state: Path) -> None:
         assert find_known_sites("t") == []
 
 
-def test_places_are_known_where_all_sites_are_and_as_the_member_reaches_them() -> None:
+def test_endpoints_are_known_as_the_member_reaches_them() -> None:
     with make_site_known("t", "m", SITES, 6, HERE, b"order"):
         assert find_known_places("t", Connection(connect=None)) is None
         with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
@@ -83,13 +83,13 @@ def test_places_are_known_where_all_sites_are_and_as_the_member_reaches_them() -
             assert find_known_places("t", Connection(connect=None, mode="client")) is None
 
 
-def test_a_site_with_settings_of_its_user_is_for_nobody_else() -> None:
+def test_site_with_settings_of_its_user_is_for_nobody_else() -> None:
     with make_site_known("t", "s", SITES, 7, replace(HERE, own={"x": 1}), b"order"):
         assert find_known_sites("t") == []
 
 
 @pytest.mark.parametrize("words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]])
-def test_what_is_no_stop_of_arms_goes_the_long_way_silently(
+def test_what_is_no_stop_of_arms_goes_long_way_silently(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert stop_at_once(words) == words

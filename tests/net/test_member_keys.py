@@ -156,7 +156,7 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
         assert {payload for _, payload in heard(say, inbox)} == {b"true"}
 
 
-def test_every_member_may_ask_a_site_to_stop_and_nothing_else(meeting: Meeting, folder: Path) -> None:
+def test_every_member_may_ask_site_to_stop_and_nothing_else(meeting: Meeting, folder: Path) -> None:
     for channel in (topics.STOP, topics.SET):
         meeting.m1.respond(key("m1", channel), lambda payload: payload)
     members = [meeting.join(read_member_keys(folder / name).settings) for name in ("s", RECORDER, OPERATOR)]
@@ -192,7 +192,7 @@ def test_a_member_whose_name_was_taken_out_is_denied_everything(folder: Path, tm
             bus.close()
 
 
-def test_what_is_too_long_is_dropped_and_what_is_not_goes_on(meeting: Meeting) -> None:
+def test_an_oversized_message_is_dropped_and_others_go_on(meeting: Meeting) -> None:
     inbox, publish = meeting.m1.inbox(key("m2", topics.STATE)), meeting.m2.publisher(key("m2", topics.STATE))
     recorder = meeting.join(read_member_keys(meeting.folder / RECORDER).settings)
     records = recorder.inbox(key("m2", topics.STATE))
@@ -262,7 +262,7 @@ class Flipping:
             end.close()
 
 
-def test_a_bit_that_flips_on_its_way_ends_the_connection_which_is_made_again(folder: Path) -> None:
+def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> None:
     """TLS finds it: no payload comes otherwise than it was sent."""
     (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
     receiver = ZenohBus([place], own=read_member_keys(folder / "m1").settings)
@@ -382,7 +382,7 @@ def test_with_keys_links_are_encrypted(folder: Path) -> None:
         secure_connection(Connection(own={"access_control": {"enabled": True}}), keys, insecure=False)
 
 
-def test_every_rule_names_its_member_or_everybody_and_denies_the_rest() -> None:
+def test_every_rule_names_its_member_or_everybody_and_denies_rest() -> None:
     rules = make_access_rules(ALL)["access_control"]
     assert rules["enabled"] is True
     assert rules["default_permission"] == "deny"

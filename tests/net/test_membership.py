@@ -45,7 +45,7 @@ def test_it_learns_epoch_and_boots_from_those_who_run() -> None:
 
 @given(ahead_ns=st.integers(-(10**9) + 1, 10**15), unix_ns=st.integers(0, 2**60))
 @settings(max_examples=30, deadline=None)
-def test_on_a_clock_of_its_own_it_finds_the_same_instant(ahead_ns: int, unix_ns: int) -> None:
+def test_on_clock_of_its_own_it_finds_same_instant(ahead_ns: int, unix_ns: int) -> None:
     session, epoch = running()
     session.start(RECORDER, on_clock=session.elsewhere(ahead_ns, unix_ns))
     late = joined(session, 4 * LATE_GATHER_NS)
@@ -54,7 +54,7 @@ def test_on_a_clock_of_its_own_it_finds_the_same_instant(ahead_ns: int, unix_ns:
     assert late.unix_ns == epoch.unix_ns
 
 
-def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
+def test_site_that_is_gone_is_waited_for_while_only() -> None:
     session, epoch = running()
     session.kill("s")
     session.start(RECORDER)
@@ -63,7 +63,7 @@ def test_a_site_that_is_gone_is_waited_for_a_while_only() -> None:
     assert set(session.members[RECORDER].joining.membership.met) == {"m1", "m2"}
 
 
-def test_of_two_recorders_at_the_start_one_is_a_member_and_one_comes_late() -> None:
+def test_of_two_recorders_at_the_start_one_is_late() -> None:
     session = Party(SITES)
     session.start(*SITES, RECORDER)
     first = session.members["first"] = session.members.pop(RECORDER)

@@ -31,7 +31,7 @@ messages = st.lists(
 
 @given(others, messages, st.integers(0, 100 * S))
 @settings(max_examples=100)
-def test_the_true_offset_and_drift_are_inside_whatever_the_delays_were(
+def test_true_offset_and_drift_are_inside_whatever_delays_were(
     other: Other, crossings: list[tuple[int, bool, int]], silence_ns: int
 ) -> None:
     """Delays as unequal as one likes, pauses, ways that say nothing, and a silence afterwards."""
@@ -59,7 +59,7 @@ def test_the_true_offset_and_drift_are_inside_whatever_the_delays_were(
 
 
 @given(others, delays, delays)
-def test_one_exchange_gives_the_classical_offset_and_half_its_round_trip(
+def test_one_exchange_gives_classical_offset_and_half_its_round_trip(
     other: Other, there_ns: int, back_ns: int
 ) -> None:
     """Four stamps of one instant: (t1 + t2 - t3 - t4)/2 within (t4 - t1 - (t3 - t2))/2, and drift besides."""
@@ -95,7 +95,7 @@ def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: in
     assert estimate.drift_high - estimate.drift_low <= 20_000
 
 
-def test_ways_that_are_unlike_bias_the_estimate_and_the_bound_says_so() -> None:
+def test_ways_that_are_unlike_bias_estimate_and_bound_says_so() -> None:
     other, rnd, estimator = Other(S, 20_000), random.Random(1), OffsetEstimator()
     for n in range(20):
         estimator.add(*second(other, n * S, queueing(500, 50), queueing(100, 50), rnd))
@@ -106,7 +106,7 @@ def test_ways_that_are_unlike_bias_the_estimate_and_the_bound_says_so() -> None:
     assert abs(error_ns) <= estimate.bound_at(20 * S, estimate.offset_ns) <= 350_000
 
 
-def test_the_bound_is_of_the_quickest_messages_each_way_not_of_one_round_trip() -> None:
+def test_the_bound_is_of_the_quickest_messages_each_way() -> None:
     other, estimator = Other(7, 0), OffsetEstimator()
     estimator.add(ceiling(other, 0, 10_000), floor(other, 1_000_000, 900_000))
     estimator.add(ceiling(other, 2_000_000, 900_000), floor(other, 3_000_000, 20_000))
@@ -115,7 +115,7 @@ def test_the_bound_is_of_the_quickest_messages_each_way_not_of_one_round_trip() 
     assert estimate.bound_at(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
 
 
-def test_a_bad_minute_among_good_ones_does_not_move_the_drift() -> None:
+def test_bad_minute_among_good_ones_does_not_move_drift() -> None:
     other, rnd, estimator = Other(S, 50_000), random.Random(2), OffsetEstimator()
     for n in range(40):
         bad = 15 <= n < 25
@@ -129,7 +129,7 @@ def test_a_bad_minute_among_good_ones_does_not_move_the_drift() -> None:
 
 @given(st.floats(1.0, 100.0), st.floats(0.0, 2 * math.pi), st.integers(0, 2**32))
 @settings(max_examples=12, deadline=None)
-def test_a_drift_that_wanders_as_far_as_it_may_stays_inside(period_s: float, phase: float, seed: int) -> None:
+def test_drift_that_wanders_as_far_as_it_may_stays_inside(period_s: float, phase: float, seed: int) -> None:
     """The offset's rate swings by a quarter of a part per million, so over any stretch within WANDER."""
     size = 250.0 * period_s / (2 * math.pi)
 

@@ -132,7 +132,7 @@ def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
     session.agreed()
 
 
-def test_a_leader_lost_before_the_start_is_followed_by_its_next_start() -> None:
+def test_leader_lost_before_start_is_followed_by_its_next_start() -> None:
     session = party(*SITES)
     while session.kinds().count("ready") < 2:
         session.round("m1")
@@ -213,7 +213,7 @@ def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
 
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("boots", [(7, 9), (9, 7)])
-def test_of_two_starts_of_one_site_one_goes_and_the_session_begins(name: str, boots: tuple[int, int]) -> None:
+def test_of_two_starts_of_one_site_one_goes(name: str, boots: tuple[int, int]) -> None:
     session = Party(SITES)
     twins = [session.member(name, boot=boot) for boot in boots]
     others = [session.member(other) for other in SITES if other != name]
@@ -244,7 +244,7 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
 
 
 @pytest.mark.parametrize("name", SITES)
-def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(name: str) -> None:
+def test_whoever_joins_a_running_session_is_refused(name: str) -> None:
     session = party(*SITES)
     epoch = session.agreed()
     late = session.member(name)
@@ -261,9 +261,7 @@ def test_who_comes_into_a_running_session_is_refused_and_the_session_goes_on(nam
     unix_ns=st.integers(0, 2**60),
 )
 @settings(max_examples=15)
-def test_members_on_other_clocks_get_the_same_instant_whatever_their_wall_clocks_say(
-    ahead_ns: dict[str, int], unix_ns: int
-) -> None:
+def test_members_on_other_clocks_begin_at_the_same_instant(ahead_ns: dict[str, int], unix_ns: int) -> None:
     session = Party(SITES)
     clocks = {
         name: session.elsewhere(ns, unix_ns + ns, f"machine of {name}") for name, ns in ahead_ns.items()
@@ -337,7 +335,7 @@ GARBAGE.append(bytes(70_000))
 
 
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
-def test_garbage_in_events_and_answers_does_not_keep_a_session_from_beginning(name: str) -> None:
+def test_garbage_keeps_no_session_from_beginning(name: str) -> None:
     session = party(*SITES)
     asked = session.stranger.questions(topics.key(SESSION, name, topics.INFO))
     for _ in range(30):

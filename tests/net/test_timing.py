@@ -121,7 +121,7 @@ LAN = queueing(80, 60)
 
 
 @pytest.mark.parametrize("skew", [(-2 * S, -100_000), (86_400 * S, 30_000)])
-def test_delays_are_inside_their_bound_and_the_grid_follows_the_leader(skew: tuple[int, int]) -> None:
+def test_delays_are_inside_their_bound_and_grid_follows_leader(skew: tuple[int, int]) -> None:
     session = Session(((0, 0), skew), (LAN, queueing(140, 90)))
     session.run(20.0)
     for site in session.sites:
@@ -179,7 +179,7 @@ def test_bounds_hold_whatever_the_clocks_the_ways_and_the_outage(
 
 
 @pytest.mark.parametrize("step_ns", [S, -3_000_000])
-def test_a_clock_that_steps_is_a_fault_once_a_second_and_found_again(step_ns: int) -> None:
+def test_clock_that_steps_is_fault_once_second_and_found_again(step_ns: int) -> None:
     session = Session(((0, 0), (3 * S, 0)), (LAN, LAN))
     session.step_at = {1: (4 * RATE_HZ, step_ns)}
     session.run(10.0)
@@ -211,7 +211,7 @@ def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
     assert link.offset.bound_ns == 0
 
 
-def test_an_echo_of_what_is_not_known_any_more_says_nothing() -> None:
+def test_echo_of_what_is_not_known_any_more_says_nothing() -> None:
     link, sent = meter()
     for tick in range(20):
         sent.put(tick, tick)
@@ -221,7 +221,7 @@ def test_an_echo_of_what_is_not_known_any_more_says_nothing() -> None:
     assert sent.at(11) is None
 
 
-def test_figures_are_of_what_came_since_the_last_and_faults_since_the_start() -> None:
+def test_figures_are_of_the_last_window_and_faults_of_all() -> None:
     link, _ = meter()
     for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
         link.take(sample(n, 0), 1000 + delay_ns)

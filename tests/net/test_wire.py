@@ -134,7 +134,7 @@ def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
     assert (virtual.sent_ns, virtual.echo) == (output.t_ns, [])
 
 
-def test_a_record_of_the_first_version_is_read_in_files_and_refused_live() -> None:
+def test_a_version_1_record_is_read_in_files_only() -> None:
     record = msgpack.unpackb(payload(v=1))
     first = msgpack.packb({name: record[name] for name in record if name not in ("sent_ns", "echo")})
     assert decode(first, State, READABLE) == msgspec.structs.replace(decode(payload(sent_ns=0), State), v=1)
@@ -153,7 +153,7 @@ pose = st.one_of(st.just(()), row(3))
     task=st.tuples(pose, row(3), row(3)),
     echo=st.lists(st.tuples(ticks, ticks, instants), max_size=MOST_PEERS),
 )
-def test_each_field_of_a_sample_is_bit_for_bit_one_of_the_record_of_its_tick(
+def test_each_field_of_a_sample_is_one_of_its_record(
     output: TickRecord, task: tuple[list[float], list[float], list[float]], echo: list[tuple[int, int, int]]
 ) -> None:
     if task[0]:
@@ -179,7 +179,7 @@ def test_blocks_hold_records_in_order_and_as_they_were(sizes: list[int]) -> None
 
 
 @given(st.integers(1, 3), st.integers(1, 200))
-def test_of_a_block_that_is_cut_the_records_before_are_there(whole: int, cut: int) -> None:
+def test_of_block_that_is_cut_records_before_are_there(whole: int, cut: int) -> None:
     records = [payload(tick=n) for n in range(whole)]
     came = split_states(b"".join([*records, payload()[:cut]]))
     assert [next(came) for _ in records] == records
@@ -228,7 +228,7 @@ def test_what_is_not_finite_is_refused_at_both_ends(
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_a_law_sends_as_many_numbers_as_it_declares_each_finite(count: int) -> None:
+def test_law_sends_as_many_numbers_as_it_declares_each_finite(count: int) -> None:
     numbers = [0.5] * count
     for kind, data in {State: payload(ch=numbers), PeerSample: sample(ch=numbers)}.items():
         assert decode(data, kind, layout=Layout(sent=count)).ch == numbers

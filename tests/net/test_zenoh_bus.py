@@ -25,7 +25,7 @@ def test_a_busy_port_is_the_callers_error_and_named() -> None:
         first.close()
 
 
-def test_a_message_that_no_member_sends_is_not_taken_in_at_all() -> None:
+def test_a_message_of_no_member_is_not_taken_in() -> None:
     """Rings hold hundreds of messages; of hundreds of megabytes they would fill a memory."""
     (endpoint,) = find_free_endpoints(1)
     with closing(ZenohBus([endpoint])) as here, closing(ZenohBus([], [endpoint])) as there:
@@ -52,7 +52,7 @@ def test_a_client_whose_router_does_not_answer_says_so(endpoint: str) -> None:
         ZenohBus([], [endpoint], "client")
 
 
-def test_a_stranger_without_a_certificate_of_the_authority_does_not_get_in(tmp_path: Path) -> None:
+def test_stranger_without_certificate_of_authority_does_not_get_in(tmp_path: Path) -> None:
     """Each side of TLS asks the other: a stranger is refused by the router, and refuses a strange router."""
     for folder in ("ours", "theirs"):
         (tmp_path / folder).mkdir()
@@ -87,7 +87,7 @@ ACCESS = """{
 }"""
 
 
-def test_a_router_lets_in_who_has_the_password_and_through_what_is_allowed(tmp_path: Path) -> None:
+def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) -> None:
     users, file = tmp_path / "users.txt", tmp_path / "router.json5"
     users.write_text("lab:secret\n")
     file.write_text(ACCESS.replace("USERS", str(users)))

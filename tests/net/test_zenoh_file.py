@@ -62,7 +62,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("path", REQUIREMENTS)
-def test_what_contradicts_a_need_is_refused_with_key_value_and_what_it_must_be(path: str) -> None:
+def test_a_setting_against_a_need_is_refused_with_reason(path: str) -> None:
     with pytest.raises(UsageError) as refused:
         checked(nested(path, WRONG[path]))
     assert str(refused.value).startswith(f"{SOURCE}: {path}: ")
@@ -92,7 +92,7 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
         assert need.holds(value) or value == found(plain, path), path
 
 
-def test_what_a_session_does_not_need_is_taken_as_it_is() -> None:
+def test_what_session_does_not_need_is_taken_as_it_is() -> None:
     own = checked(
         {
             "transport": {
@@ -122,7 +122,7 @@ def test_null_says_nothing() -> None:
     }
 
 
-def test_endpoints_and_mode_are_apart_and_may_depend_on_the_mode() -> None:
+def test_endpoints_and_mode_are_apart_and_may_depend_on_mode() -> None:
     file = checked(
         {
             "mode": "client",
@@ -139,7 +139,7 @@ def test_endpoints_and_mode_are_apart_and_may_depend_on_the_mode() -> None:
     assert ZenohFile("").endpoints("listen", "peer") is None
 
 
-def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path: Path) -> None:
+def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path: Path) -> None:
     key = "transport/link/tls/root_ca_certificate"
     with pytest.raises(UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"):
         checked(nested(key, f"{tmp_path}/none.pem"))
@@ -177,9 +177,7 @@ def test_a_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_pa
         ("{transport: {link: {tx: {lease: 500}}}}", "transport/link/tx/lease: 500 must be 5000 or more"),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line_that_names_file_and_place(
-    text: str, problem: str, tmp_path: Path
-) -> None:
+def test_a_bad_file_is_refused_with_file_and_place(text: str, problem: str, tmp_path: Path) -> None:
     path = tmp_path / SOURCE
     path.write_text(text)
     with pytest.raises(UsageError, match=problem) as refused:

@@ -107,7 +107,7 @@ def test_a_name_of_somebody_elses_that_leads_here_is_refused(server: PageServer)
     assert server.refused["foreign host"] == 1
 
 
-def test_a_port_in_use_is_found_before_a_folder_is_made(tmp_path: Path) -> None:
+def test_port_in_use_is_found_before_folder_is_made(tmp_path: Path) -> None:
     with create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         done = trilat("live", "two_sites", "--port", str(port), "--no-browser", cwd=tmp_path)
@@ -171,7 +171,7 @@ def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(server
         assert "hello" in hears(page)
 
 
-def test_orders_count_of_a_page_that_takes_part_and_a_second_one_asks_first(
+def test_only_a_participating_page_gives_orders_a_second_asks_first(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
@@ -197,7 +197,7 @@ def test_orders_count_of_a_page_that_takes_part_and_a_second_one_asks_first(
     assert server.refused["does not take part"] == 1
 
 
-def test_what_a_page_wants_of_a_hand_is_in_range_or_refused(server: PageServer) -> None:
+def test_what_page_wants_of_hand_is_in_range_or_refused(server: PageServer) -> None:
     """An arm that is not there, or that nobody can hold, is refused; so is what is no number."""
     with socket(server) as page:
         page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
@@ -208,7 +208,7 @@ def test_what_a_page_wants_of_a_hand_is_in_range_or_refused(server: PageServer) 
         assert "hello" in hears(page)
 
 
-def test_the_hands_of_a_page_are_its_own_and_let_go_with_it(network: LocalNetwork) -> None:
+def test_a_pages_hands_are_its_own_and_end_with_it(network: LocalNetwork) -> None:
     site = network.join()
     messages = site.inbox("trilat/s1/m1/hand")
     hands = [PageHands(network.join(), SystemClock(), "s1", f"page {n}") for n in (1, 2)]
@@ -261,7 +261,7 @@ def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> Non
     assert server.refused["malformed request"] == 1
 
 
-def test_marks_hands_and_control_have_rates_of_their_own_and_letting_go_has_none(server: PageServer) -> None:
+def test_marks_hands_and_control_have_rates_letting_go_has_none(server: PageServer) -> None:
     with socket(server) as page:
         for _ in range(50):
             page.send('{"do":"mark","text":"a"}')
@@ -278,7 +278,7 @@ def test_marks_hands_and_control_have_rates_of_their_own_and_letting_go_has_none
         until(lambda: server.refused["nobody can hold it"] == refused + 1)
 
 
-def test_any_page_stops_every_arm_past_what_waits_for_an_answer(
+def test_any_page_stops_every_arm_past_what_waits_for_answer(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
@@ -316,7 +316,7 @@ def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_loop_that_ends_is_begun_again_at_the_same_address(network: LocalNetwork) -> None:
+def test_loop_that_ends_is_begun_again_at_same_address(network: LocalNetwork) -> None:
     said: list[str] = []
     with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server:
         address, loop = server.address, server._loop

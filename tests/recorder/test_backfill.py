@@ -155,7 +155,7 @@ class Run:
 
 @given(ways())
 @settings(max_examples=40, deadline=None)
-def test_the_log_has_all_that_came_or_could_be_had_and_the_accounts_are_the_truth(way: Way) -> None:
+def test_the_log_has_all_that_arrived_or_could_be_requested(way: Way) -> None:
     run = Run(way)
     run.live(2600 * MS)
     stored = run.until_stored()
@@ -201,7 +201,7 @@ def test_who_hears_everything_in_the_end_asks_nothing(late_ms: dict[int, int]) -
     assert run.desk.recording.dropped == Counter()
 
 
-def test_no_more_than_one_question_is_under_way_and_none_asks_for_more_than_a_chunk() -> None:
+def test_one_request_at_a_time_asks_for_one_chunk() -> None:
     run = Run(Way(lost=set(range(20, 180))))
     most = 0
     answer = run.site.answer
@@ -219,7 +219,7 @@ def test_no_more_than_one_question_is_under_way_and_none_asks_for_more_than_a_ch
     assert all(wanted.last - wanted.first < BACKFILL_MESSAGES for wanted in run.site.asked)
 
 
-def test_a_site_that_is_silent_is_asked_and_its_lost_end_is_noticed() -> None:
+def test_a_silent_site_is_asked_and_its_lost_end_noticed() -> None:
     """The last second is lost on the way, statistics, end and all."""
     run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
     run.live(3100 * MS)
@@ -227,7 +227,7 @@ def test_a_site_that_is_silent_is_asked_and_its_lost_end_is_noticed() -> None:
     assert run.desk.recording.problem() == "s disappeared after 0 records"
 
 
-def test_a_site_that_is_hushed_is_asked_no_more_than_three_times_a_second() -> None:
+def test_a_hushed_site_is_asked_three_times_a_second() -> None:
     """It hangs, say: it has said nothing since its start, and there is nothing to be had."""
     run = Run(Way(lost=set(range(len(SENT)))))
     run.site.answer()
@@ -239,7 +239,7 @@ def test_a_site_that_is_hushed_is_asked_no_more_than_three_times_a_second() -> N
 
 
 @pytest.mark.parametrize("how", ["lost", "garbage", "wrong boot"])
-def test_a_site_that_does_not_answer_is_asked_ever_more_rarely_and_then_no_more(how: str) -> None:
+def test_an_unanswering_site_is_asked_ever_more_rarely(how: str) -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.site.replies = lambda payload: lie(how, payload)
     run.live(2100 * MS)
@@ -285,7 +285,7 @@ def vanish(run: Run) -> None:
         run.desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False)
 
 
-def test_a_site_that_is_gone_is_not_asked_and_what_it_owes_ends_nothing() -> None:
+def test_a_departed_site_is_not_asked_and_delays_no_end() -> None:
     run = Run(Way(lost=set(range(30, 60))))
     run.live(25 * MS)
     vanish(run)
@@ -295,7 +295,7 @@ def test_a_site_that_is_gone_is_not_asked_and_what_it_owes_ends_nothing() -> Non
     assert run.desk.over()
 
 
-def test_a_site_that_goes_on_is_there_whatever_its_token_says() -> None:
+def test_site_that_goes_on_is_there_whatever_its_token_says() -> None:
     """A connection that is made anew may tell that a token went and came in the wrong order."""
     run = Run(Way(lost=set(range(30, 60))))
     vanish(run)
@@ -305,7 +305,7 @@ def test_a_site_that_goes_on_is_there_whatever_its_token_says() -> None:
     assert "missing 0" in run.desk.log().account("m")
 
 
-def test_a_site_that_goes_on_and_then_dies_ends_the_recording() -> None:
+def test_site_that_goes_on_and_then_dies_ends_recording() -> None:
     """Its token had disappeared before, and nothing will tell of it once more."""
     run = Run(Way(lost=set(range(30, 60))))
     vanish(run)
@@ -318,7 +318,7 @@ def test_a_site_that_goes_on_and_then_dies_ends_the_recording() -> None:
     assert run.desk.over()
 
 
-def test_answers_that_are_too_large_for_the_way_are_made_smaller() -> None:
+def test_answers_that_are_too_large_for_way_are_made_smaller() -> None:
     run = Run(Way(lost=set(range(20, 180))))
     run.site.replies = lambda payload: [payload] if len(payload) < 5_000 else []
     run.live(2100 * MS)
@@ -337,7 +337,7 @@ def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
     assert run.desk.said() == []
 
 
-def test_times_come_from_the_monotonic_clock_however_the_wall_clock_steps() -> None:
+def test_times_come_from_monotonic_clock_however_wall_clock_steps() -> None:
     class Stepping(ManualClock):
         def unix_ns(self) -> int:
             return super().unix_ns() + (-3600 * S if self.monotonic_ns() > MONO_NS + S else 0)

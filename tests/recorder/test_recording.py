@@ -69,7 +69,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("reason", "name", "channel", "payload"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_does_not_belong_is_counted_and_dropped_and_the_rest_is_written_byte_for_byte(
+def test_foreign_messages_are_dropped_the_rest_written_byte_for_byte(
     reason: str, name: str, channel: str, payload: bytes
 ) -> None:
     desk = Desk()
@@ -111,7 +111,7 @@ def ahead(tick: int) -> bytes:
     ],
     ids=["a record", "just too early", "statistics", "an end", "a beginning", "the number of an event"],
 )
-def test_a_member_that_says_more_than_the_clock_allows_is_not_believed(
+def test_member_that_says_more_than_clock_allows_is_not_believed(
     reason: str, channel: str, payload: bytes
 ) -> None:
     """It has valid keys and says that it made 50 s of records after some milliseconds."""
@@ -130,7 +130,7 @@ def test_a_member_that_says_more_than_the_clock_allows_is_not_believed(
     assert any(f"1 messages dropped: {reason}" in line for line in desk.recording.summary())
 
 
-def test_an_answer_for_more_than_the_clock_allows_is_not_believed() -> None:
+def test_answer_for_more_than_clock_allows_is_not_believed() -> None:
     desk = Desk(LONG)
     memory = Memory(desk.network, "m")
     memory.made["state"] = [b""] * 50_000
@@ -186,7 +186,7 @@ def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.
     assert any(str(TICKS - 20) in line and "the queue was full" in line for line in desk.recording.summary())
 
 
-def test_a_flood_of_events_leaves_a_log_that_can_be_used() -> None:
+def test_flood_of_events_leaves_log_that_can_be_used() -> None:
     """What packs to nothing in the file must not take the reader's memory, nor the place of an end."""
     desk = Desk()
     desk.take("m", topics.STATE, *states("m"))
@@ -225,7 +225,7 @@ def alive(name: str, boot: int | str) -> str:
     return topics.key(SESSION, name, topics.ALIVE) + f"/{boot}"
 
 
-def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> None:
+def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     desk = Desk()
     desk.whole("m")
     desk.take("s", topics.STATE, *states("s")[:20])
@@ -242,7 +242,7 @@ def test_a_site_that_dies_without_a_word_ends_the_recording_and_is_named() -> No
 
 
 @pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, SETTLE_NS), (False, AWAY_NS)])
-def test_a_site_that_is_cut_off_in_a_long_session_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
+def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
     """Even if it is the recorder that is cut off: then all sites are gone at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
     if said_its_end:
@@ -327,6 +327,6 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
     assert verify(log).agreed
 
 
-def test_the_scenario_is_that_of_a_member_and_not_of_a_stranger(tmp_path: Path) -> None:
+def test_scenario_is_that_of_member_and_not_of_stranger(tmp_path: Path) -> None:
     recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256

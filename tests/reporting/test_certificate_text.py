@@ -25,7 +25,7 @@ LOGS = {
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_facts_are_json_without_nan_and_say_what_the_verdict_says(name: str) -> None:
+def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None:
     found = certify(LOGS[name]())
     read = json.loads(json.dumps(certificate_to_json(found), allow_nan=False))
     assert read["text"] == found.verdict.text
@@ -86,7 +86,7 @@ def test_many_links_are_one_entry() -> None:
     assert [name for name in names if "->" in name or "links" in name] == ["given: 19 links"]
 
 
-def test_the_papers_weights_are_told_of_where_they_are_wrong_and_v_rises_with_them() -> None:
+def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
     told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
     assert told.mark == "note"
     assert told.text.startswith("with the paper's weights, ones, V would have risen by 12.3 J of 32.8")

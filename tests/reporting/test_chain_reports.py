@@ -29,7 +29,7 @@ def six() -> Log:
     return simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200}))
 
 
-def test_the_end_of_a_chain_is_where_pinocchio_has_it_and_links_keep_their_lengths():
+def test_the_end_of_a_chain_is_where_pinocchio_has_it():
     arm = six().scenario.arms["m1"]
     states = chain_references()["arm6"].states
     points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
@@ -39,7 +39,7 @@ def test_the_end_of_a_chain_is_where_pinocchio_has_it_and_links_keep_their_lengt
     assert not points[:, 0].any()
 
 
-def test_pictures_of_a_chain_have_up_on_top_and_shadows_below():
+def test_pictures_of_chain_have_up_on_top_and_shadows_below():
     arm = six().scenario.arms["m1"]
     origin, above, aside = arm_poses.project_arm_m(arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]]))
     assert not origin.any()
@@ -97,7 +97,7 @@ def test_paths_are_those_of_the_end_effectors_in_three_planes():
             assert path[[0, -1]] == pytest.approx(points[:, plane], abs=1e-12)
 
 
-def test_the_force_of_a_wall_in_space_is_what_the_record_says_of_the_arm():
+def test_the_force_of_a_wall_is_the_recorded_torque():
     """Its torque is the force times what the end effector moves along the normal, by differences of poses."""
     arm = six().scenario.arms["s"]
     start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[0, -1]

@@ -59,6 +59,7 @@ def test_histograms_count_every_tick():
         assert age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
 
 
+@pytest.mark.long
 def test_a_log_without_events_has_no_markers():
     log = logs.simulated("paper")
     for name in registry.list_drawable_figures(log):
@@ -68,7 +69,7 @@ def test_a_log_without_events_has_no_markers():
         assert drawn.get_supxlabel() == ""
 
 
-def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow(monkeypatch):
+def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
     log = logs.busy().log
     figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
@@ -88,7 +89,7 @@ def test_every_panel_of_a_site_shows_its_changes_and_when_it_did_not_follow(monk
     assert "and 2 more" in joint_motion.draw_operation(log).get_supxlabel()
 
 
-def test_the_stated_mean_is_drawn_while_it_holds_and_not_where_there_is_none():
+def test_the_stated_mean_is_drawn_only_while_it_holds():
     log = logs.busy().log
     figure = age_and_lateness.draw_sample_age(log)
     panel = next(axes for axes in figure.axes if axes.get_title(loc="left") == "a → c")
@@ -108,7 +109,7 @@ def test_estimates_show_the_sites_that_are_asked_for():
     assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
 
 
-def test_distributions_reach_the_longest_age_and_a_rare_one_by_logarithm():
+def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
         x_ms = age_and_lateness.delay_axis_ms(
@@ -118,7 +119,7 @@ def test_distributions_reach_the_longest_age_and_a_rare_one_by_logarithm():
         assert (x_ms[0] == 0.0) == even
 
 
-def test_ages_that_go_up_and_down_all_the_time_are_a_band():
+def test_ages_that_go_up_and_down_all_time_are_band():
     seconds, swings = np.arange(4000) / 1000.0, np.arange(4000) % 5
     assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
     assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
@@ -129,7 +130,7 @@ def test_ages_that_go_up_and_down_all_the_time_are_a_band():
     assert set(median.get_ydata()) == {220.0}
 
 
-def test_a_slave_has_the_same_colour_however_many_masters_there_are():
+def test_slave_has_same_colour_however_many_masters_there_are():
     for name, slaves in (("two_sites", 1), ("paper", 2), ("training", 2)):
         colours = list_site_colours(load_scenario(name))
         assert len(set(colours)) == len(SITE_COLOURS)
@@ -149,7 +150,7 @@ def test_shares_are_of_all_that_there_is():
     assert np.isnan(age_and_lateness.cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
 
-def test_arms_stand_where_their_angles_put_them_in_panels_with_equal_axes():
+def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
     log = logs.simulated("four")
     arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
@@ -168,7 +169,7 @@ def test_arms_stand_where_their_angles_put_them_in_panels_with_equal_axes():
     assert 3 <= len(instants) <= arm_poses.INSTANTS
 
 
-def test_a_path_is_thinned_by_its_length_and_keeps_its_ends():
+def test_path_is_thinned_by_its_length_and_keeps_its_ends():
     turns = np.linspace(0.0, 6.0, 20_001) ** 3  # ever faster
     circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     kept = joint_motion.thin_path(circle)
@@ -197,7 +198,7 @@ def test_a_phase_portrait_is_of_e_and_its_rate():
     assert {tuple(row) for row in np.transpose(line.get_data()).tolist()} <= {tuple(r) for r in both.tolist()}
 
 
-def test_the_limit_of_a_torque_is_drawn_where_it_was_reached():
+def test_limit_of_torque_is_drawn_where_it_was_reached():
     free = joint_motion.draw_control_torques(logs.simulated("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
     held = trilat_net.simulate("paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20})
@@ -225,7 +226,7 @@ def test_shares_are_drawn_as_they_change():
     assert joint_motion.sites_with_changing_dominance(logs.simulated("paper")) == []
 
 
-def test_an_overview_has_the_extremes_of_every_site_and_the_verdict():
+def test_overview_has_extremes_of_every_site_and_verdict():
     log = logs.simulated("paper")
     made = run_overview.draw_overview(log)
     errors, _, torques, _ = made.axes
@@ -235,7 +236,7 @@ def test_an_overview_has_the_extremes_of_every_site_and_the_verdict():
     assert str(trilat_net.certify(log).stability) in made.legends[0].get_title().get_text()
 
 
-def test_runs_over_one_another_are_the_largest_of_their_sites_and_of_one_kind():
+def test_overlaid_runs_share_sites_and_kind():
     paper, task = logs.simulated("paper"), trilat_net.simulate(parse_scenario(planar_task(0.02)))
     made = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
     one, _ = lines(made.axes[2])

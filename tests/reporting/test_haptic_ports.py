@@ -17,7 +17,7 @@ def test_figures_are_drawn_at_the_width_that_is_asked_for(name: str, form: Figur
         assert figure.get_size_inches()[0] == form.width_in
 
 
-def test_the_impedance_has_a_free_and_a_clamped_line_for_each_hand() -> None:
+def test_impedance_has_free_and_clamped_line_for_each_hand() -> None:
     section = section_of("p_d_margin")
     size = draw_port_impedance(section).axes[0]
     assert len(size.lines) == 4

@@ -67,6 +67,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.long
 def test_files_beside_the_others_are_figures_and_formats_everywhere(tmp_path: Path) -> None:
     for name, text in {"figures/haste.py": FIGURE, "exports/counts.py": FORMAT}.items():
         (tmp_path / name).parent.mkdir()

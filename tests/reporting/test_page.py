@@ -49,7 +49,7 @@ def column(table, n):
     return np.frombuffer(base64.b64decode(table["columns"][n]), "<f4")
 
 
-def test_a_report_is_a_page_and_numbers_and_pictures_that_are_asked_for(tmp_path):
+def test_a_report_is_a_page_with_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
     paths = write_report(log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS)
@@ -105,7 +105,7 @@ def test_texts_of_a_scenario_stay_texts():
     assert "trilat sim ./four.toml" in html  # not shipped: its text is on the page
 
 
-def test_the_page_holds_the_log_with_a_spike_of_one_tick():
+def test_page_holds_log_with_spike_of_one_tick():
     def spike(state):
         return (
             msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
@@ -158,7 +158,7 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sites", [(), pytest.param(("m2", "s"), marks=pytest.mark.long)])
+@pytest.mark.parametrize("sites", [(), ("m2", "s")])
 def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
     some = logs.timed(logs.simulated("paper"))

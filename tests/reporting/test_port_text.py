@@ -26,7 +26,7 @@ def test_what_is_not_passive_says_where_and_by_how_much() -> None:
     assert "some make it unstable at" in text
 
 
-def test_an_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
+def test_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
     lines = describe_ports(section_of("p_d_margin_two", (("control.d", 1.8),)))
     assert len(lines) == 2
     assert "the loop without operators is unstable" in lines[1]

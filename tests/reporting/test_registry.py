@@ -57,7 +57,7 @@ def drawn(name, width_in):
         ("certificate", PAGE_IN),
     ],
 )
-def test_no_word_is_cut_off_or_lies_on_another_all_type_is_8_pt_and_axes_have_units(name, width_in):
+def test_words_do_not_overlap_type_is_8_pt(name, width_in):
     made = drawn(name, width_in)
     assert made.get_figwidth() == width_in
     assert misplaced(made) == []
@@ -72,7 +72,7 @@ def test_no_word_is_cut_off_or_lies_on_another_all_type_is_8_pt_and_axes_have_un
 
 
 @pytest.mark.parametrize("name", ["parameter_estimates", "contact"])
-def test_a_pdf_is_one_page_of_the_width_with_its_fonts_and_no_date(name, tmp_path):
+def test_a_pdf_is_one_page_with_fonts_and_no_date(name, tmp_path):
     """252 pt are 3.5 in; Type 42 is TrueType, which journals take where they refuse Type 3."""
     before = dict(mpl.rcParams)
     path = tmp_path / f"{name}.pdf"
@@ -114,7 +114,7 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
 
 
-def test_the_force_of_a_wall_is_what_the_record_says_of_the_arm():
+def test_force_of_wall_is_what_record_says_of_arm():
     """J'F of the drawn force along the normal is the recorded torque ON the arm: the wall is all there is."""
     log = walled()
     part, wall = log["s"], log.scenario.sites["s"].environment[0]

@@ -15,7 +15,7 @@ def boards(files: dict[str, Path]) -> dict[str, tuple[dict[str, Ros2Channel], Pl
     }
 
 
-def test_every_curve_is_of_a_channel_in_the_file_and_every_number_has_a_name(files: dict[str, Path]) -> None:
+def test_every_curve_is_of_a_channel_in_the_file(files: dict[str, Path]) -> None:
     for channels, shown in boards(files).values():
         for page in shown.pages.values():
             for plot in (plot for row in page for plot in row):
@@ -39,7 +39,7 @@ def test_every_site_has_its_column_and_every_quantity_its_row(files: dict[str, P
     assert {"/viz/log", "/viz/events"} <= set(channels)
 
 
-def test_a_bag_shows_the_reference_beside_the_joints_and_the_views_do_not_show_its_effort(
+def test_a_bag_shows_the_reference_beside_the_joints(
     files: dict[str, Path],
 ) -> None:
     of = boards(files)

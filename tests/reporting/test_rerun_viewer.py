@@ -47,6 +47,7 @@ def never() -> Log:
     raise AssertionError("it was read")
 
 
+@pytest.mark.long
 def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> None:
     rerun = Rerun()
     open_rerun([files["live"]], never, ViewerOptions(web=True), lambda _: None, rerun)
@@ -56,7 +57,7 @@ def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> N
     assert rerun.environment["RERUN_ANALYTICS_ENABLED"] == "false"
 
 
-def test_what_was_made_for_it_is_gone_when_the_viewer_is(files: dict[str, Path]) -> None:
+def test_what_was_made_for_it_is_gone_when_viewer_is(files: dict[str, Path]) -> None:
     rerun, said = shown([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
     assert "/m/joint_states" in rerun.topics
     assert said == ["making standard channels of every record ..."]
@@ -65,9 +66,7 @@ def test_what_was_made_for_it_is_gone_when_the_viewer_is(files: dict[str, Path])
     assert files["live"].exists()
 
 
-def test_parts_are_shown_as_one_and_a_torn_log_as_far_as_it_is_whole(
-    files: dict[str, Path], tmp_path: Path
-) -> None:
+def test_parts_are_shown_as_one_and_a_torn_log_too(files: dict[str, Path], tmp_path: Path) -> None:
     parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(files["live"].read_bytes()[:150_000])

@@ -10,7 +10,7 @@ from trilat_net.errors import LogError
 from trilat_net.reporting.exports.ros2 import export_ros2
 
 
-def test_all_messages_stand_in_the_order_in_which_they_came_and_virtual_time_has_no_clocks(
+def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
     path, told = tmp_path / "bag.mcap", list[int]()

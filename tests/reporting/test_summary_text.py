@@ -22,7 +22,7 @@ from trilat_net.reporting.summary_text import (
 )
 
 
-def test_a_run_of_constant_links_without_loss_is_not_worth_a_line():
+def test_run_of_constant_links_without_loss_is_not_worth_line():
     for name in ("paper", "free", "two_sites", "four"):
         assert format_run_lines(logs.simulated(name)) == []
 
@@ -45,7 +45,7 @@ def test_what_happened_is_told_once():
     assert "in a row" in link
 
 
-def test_an_arm_that_was_stopped_is_told_first_and_in_large():
+def test_arm_that_was_stopped_is_told_first_and_in_large():
     log = stopped_log()
     assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to"
     assert "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to" in render_alarms(log)
@@ -125,7 +125,7 @@ def test_a_clock_is_told_as_it_stood_at_the_end():
     )
 
 
-def test_a_shared_clock_and_a_log_without_one_are_not_worth_a_line():
+def test_shared_clock_and_log_without_one_are_not_worth_line():
     shared = summarise_clock(clocked(), "s", "m2")
     assert shared is not None
     assert shared.shared
@@ -133,7 +133,7 @@ def test_a_shared_clock_and_a_log_without_one_are_not_worth_a_line():
     assert format_clock_lines(logs.simulated("paper")) == []
 
 
-def test_what_came_from_outside_and_ended_the_run_is_a_line_that_a_terminal_can_have() -> None:
+def test_what_ended_the_run_is_a_line_without_controls() -> None:
     long = "the law a:B of s failed at tick 3: \x1b[31m" + "x" * 1000
     said = [
         SimpleNamespace(kind=kind, text=text)

@@ -162,7 +162,7 @@ def test_damping_that_a_light_joint_cannot_take_names_the_joint(scheme: str, mos
 # What is accepted
 
 
-def test_one_number_stands_for_every_joint_and_each_is_drawn_by_itself() -> None:
+def test_one_number_stands_for_every_joint_each_drawn_by_itself() -> None:
     same = six(**{"arm.armature_kg_m2": 0.1, "limits.tau_limit_nm": 50.0})
     assert same.sites["s"].arm.armature_kg_m2 == (0.1,) * 6
     drawn = six(**{"arm.armature_kg_m2": UNIFORM, "arm.payload_kg": UNIFORM})
@@ -176,7 +176,7 @@ def test_one_number_stands_for_every_joint_and_each_is_drawn_by_itself() -> None
     assert reseed_scenario(again, 1) == drawn
 
 
-def test_a_drawn_start_pose_takes_the_operator_at_the_end_effector_along() -> None:
+def test_drawn_start_pose_takes_operator_at_end_effector_along() -> None:
     start = [0.3, {"uniform": [-1.2, -0.8]}, 1.2, -0.6, 0.5, 0.2]
     drawn = six(**{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]})
     again = reseed_scenario(drawn, 2)
@@ -186,7 +186,7 @@ def test_a_drawn_start_pose_takes_the_operator_at_the_end_effector_along() -> No
     assert drawn.sites["m1"].hands[0].from_m != again.sites["m1"].hands[0].from_m
 
 
-def test_limits_are_those_of_the_file_unless_the_author_says_others() -> None:
+def test_limits_are_those_of_file_unless_author_says_others() -> None:
     limits = six().sites["s"].limits
     assert limits.tau_limit_nm == (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
     assert limits.qd_limit_rad_s == (math.pi,) * 6
@@ -194,11 +194,11 @@ def test_limits_are_those_of_the_file_unless_the_author_says_others() -> None:
     assert (changed.tau_limit_nm, changed.qd_limit_rad_s) == (limits.tau_limit_nm, 5.0)
 
 
-def test_a_start_beyond_the_limits_is_free_where_there_are_no_stops() -> None:
+def test_start_beyond_limits_is_free_where_there_are_no_stops() -> None:
     six(**{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]})
 
 
-def test_gravity_along_an_axis_or_across_it_is_only_its_direction() -> None:
+def test_gravity_along_axis_or_across_it_is_only_its_direction() -> None:
     """down = -z at 9.81 is the default; its length does not matter, its bits do not depend on a library."""
     assert six(**{"arm.down": [0, 0, -3.0]}).arms["s"].chain.gravity_m_s2 == (0.0, 0.0, -9.81)
     x, y, z = six(**{"arm.down": [1.0, 2.0, -2.0]}).arms["s"].chain.gravity_m_s2
@@ -293,7 +293,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: Overrides, comme
         assert (one.chain, one.gains, one.q0) == (other.chain, other.gains, other.q0)
 
 
-def test_the_end_effector_and_the_inertia_are_those_of_the_references() -> None:
+def test_end_effector_and_inertia_are_those_of_references() -> None:
     """Pinocchio's, stored; the drives' inertia comes on top."""
     model = six().arms["m1"]
     _, states = chain_references()["arm6"]

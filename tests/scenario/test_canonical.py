@@ -103,7 +103,7 @@ def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
     assert ("timeline" in load_scenario(name).text) == bool(load_scenario(name).timeline)
 
 
-def test_350_and_350_point_0_are_one_experiment_in_a_timeline_too() -> None:
+def test_350_and_350_point_0_are_one_experiment() -> None:
     def sha256(delay_ms: float, at_s: float) -> str:
         change = {"at_s": at_s, "link": "m1->s", "to": {"delay_ms": delay_ms}}
         return load_scenario("paper", {"timeline": [change]}).sha256

@@ -68,7 +68,7 @@ def test_it_says_in_a_few_words_what_a_link_does() -> None:
     assert link({"model": "measured", "loss": 1}).describe() == "measured, loss 100 %"
 
 
-def test_a_table_without_a_model_changes_single_keys_and_one_with_a_model_begins_anew() -> None:
+def test_a_table_with_a_model_begins_anew() -> None:
     base = {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 50.0, "loss": 0.1}
     own = {
         "m1->s": {"half_width_ms": 5.0},

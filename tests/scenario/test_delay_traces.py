@@ -145,7 +145,7 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
     assert setup.traces[0].tolist() == POINTS
 
 
-def test_a_trace_written_out_replaces_a_file_and_a_file_a_trace(tmp_path: Path) -> None:
+def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
     made = scenario(tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"')

@@ -20,7 +20,7 @@ def test_one_experiment_differs_in_nothing_whatever_it_is_called() -> None:
     assert told(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
 
 
-def test_one_gain_of_all_sites_is_one_line_and_of_one_site_says_which() -> None:
+def test_a_gain_of_all_sites_is_one_line() -> None:
     assert told(("free", []), ("free", ["control.Kd=5"])) == {"control.Kd of m1, m2, s": ("3", "5")}
     found = told(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
     assert found == {"control.Kd of s": ("3", "[5, 6]")}
@@ -52,7 +52,7 @@ def test_other_scenarios_other_sites_other_hands() -> None:
     assert found["duration_s"] == ("15", "30")
 
 
-def test_a_chain_is_told_joint_by_joint_with_the_notes_of_its_file() -> None:
+def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
     unlimited = (SHIPPED_FOLDER / "arm6.urdf").read_text().replace('effort="28" velocity', "velocity", 1)
     text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
     first = (
@@ -64,7 +64,7 @@ def test_a_chain_is_told_joint_by_joint_with_the_notes_of_its_file() -> None:
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
 
 
-def test_it_says_how_often_a_site_will_hold_and_it_holds_so_often() -> None:
+def test_it_says_how_often_a_site_will_hold() -> None:
     keys = {"on_stale.action": "glide", "link.model": "normal", "duration_s": 6.0, "seed": 3}
     link = {"link.delay_ms": 60.0, "link.deviation_ms": 25.0, "link.loss": 0.6}
     scenario = load_scenario("two_sites", {**keys, **link})
@@ -129,7 +129,7 @@ def test_a_check_says_which_shares_have_no_effect(
     assert found == [f"dominance without effect at {line}" for line in expected]
 
 
-def test_lines_have_the_shares_of_their_sites_and_b_on_the_average() -> None:
+def test_lines_have_shares_of_their_sites_and_b_on_average() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
     scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)

@@ -31,7 +31,7 @@ def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
     ],
     ids=str,
 )
-def test_every_other_key_asks_something_also_where_its_value_is_nothing(keys: dict[str, Any]) -> None:
+def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any]) -> None:
     assert Expect(**keys).asks
 
 
@@ -88,7 +88,7 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
     ],
     ids=str,
 )
-def test_a_window_that_cannot_be_right_is_refused_with_its_key(
+def test_window_that_cannot_be_right_is_refused_with_its_key(
     changes: dict[str, Any], facts: list[str]
 ) -> None:
     with pytest.raises(ScenarioError) as error:
@@ -97,12 +97,12 @@ def test_a_window_that_cannot_be_right_is_refused_with_its_key(
         assert fact in str(error.value)
 
 
-def test_a_window_that_asks_nothing_is_refused_and_told_what_it_may_ask() -> None:
+def test_a_window_that_asks_nothing_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"expect.windows\[0\]: asks nothing; it may ask error_peak_rad"):
         with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 
 
-def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
+def test_template_names_every_key_with_value_that_is_valid() -> None:
     commented = read_template().partition("# [expect]")[2].splitlines()[1:]
     text = read_template() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
     written = parse_scenario(text).expect
@@ -113,7 +113,7 @@ def test_the_template_names_every_key_with_a_value_that_is_valid() -> None:
     assert [key for key, _ in written.windows[0].asked] == window[3:]
 
 
-def test_a_window_has_the_quantities_of_as_many_joints_as_the_arm() -> None:
+def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
     window = {"from_s": 1.0, "to_s": 2.0, "site": "s", "q6_rad": [0.0, 1.0], "push5_mean_nm": [0.0, 1.0]}
     asked = six(**{"expect.windows": [window]}).expect.windows[0].asked
     assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}

@@ -41,7 +41,7 @@ def test_naming_a_law_hashes_its_file_and_runs_nothing(module: str, folder: Path
     assert not {"trap_package", "trap_package.trap", "trap_alone"} & set(sys.modules)
 
 
-def test_what_a_log_names_is_imported_only_where_it_defines_a_class_of_that_name(folder: Path) -> None:
+def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
     """The hash is that of the file: a class from elsewhere would not be in it."""
     (folder / "borrowed.py").write_text("raise RuntimeError('it ran')\nfrom tests.laws import Adaptive\n")
     scenario = load_scenario("two_sites", {"control.law": "borrowed:Adaptive"})
@@ -59,7 +59,7 @@ def test_what_a_log_names_is_imported_only_where_it_defines_a_class_of_that_name
         (".laws:Law", "must be as in package.module:Law"),
     ],
 )
-def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: str) -> None:
+def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario("two_sites", {"sites.s.control.law": law})
     assert caught.value.path == "sites.s.control.law"
@@ -76,9 +76,7 @@ def test_a_name_that_is_none_is_refused_as_the_scenario_is_read(law: str, fact: 
         ({"control.law": "tests.laws:Odd"}, "sites must be as in 2 or (2, 4), is 'many'"),
     ],
 )
-def test_what_is_no_law_for_its_site_is_refused_as_the_site_is_built(
-    overrides: dict[str, object], fact: str
-) -> None:
+def test_a_wrong_law_is_refused_as_the_site_is_built(overrides: dict[str, object], fact: str) -> None:
     scenario = load_scenario("paper", overrides)
     with pytest.raises(ScenarioError) as caught:
         Site(scenario.setup("s"))
@@ -87,7 +85,7 @@ def test_what_is_no_law_for_its_site_is_refused_as_the_site_is_built(
 
 
 @pytest.mark.parametrize(("name", "law"), [("two_sites", "Pair"), ("two_sites", "Few"), ("paper", "Few")])
-def test_a_law_that_says_for_how_many_sites_it_is_is_made_for_them(name: str, law: str) -> None:
+def test_a_law_made_for_a_number_of_sites_gets_it(name: str, law: str) -> None:
     Site(load_scenario(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
 
 
@@ -108,7 +106,7 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
         Site(scenario.setup("s"))
 
 
-def test_a_file_that_was_edited_while_the_program_runs_is_taken_as_it_is_now(folder: Path) -> None:
+def test_an_edited_law_file_is_taken_as_it_is_now(folder: Path) -> None:
     file = folder / "edited_law.py"
     text = "from tests.laws import Adaptive\nclass Law(Adaptive):\n    theta_hat0 = {}\n"
     made = []
@@ -135,7 +133,7 @@ RESOLVED = load_scenario("paper", {"control.law": LAW, "control.Kd": 2.0, "sites
     ],
     ids=str,
 )
-def test_overrides_of_a_resolved_scenario_reach_what_a_law_is_made_with(
+def test_overrides_of_resolved_scenario_reach_what_law_is_made_with(
     overrides: list[str], settings: tuple[dict[str, object], ...]
 ) -> None:
     changed = load_scenario(RESOLVED, overrides)
@@ -148,7 +146,7 @@ def test_settings_stand_beside_the_name_of_the_law() -> None:
         load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 
-def test_a_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
+def test_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
     other = load_scenario(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
     Site(RESOLVED.setup("s"))
     with pytest.raises(ScenarioError, match=r"is not the one that the scenario names") as caught:
@@ -171,7 +169,7 @@ def load_sending(folder: Path, sends: str) -> Scenario:
     return load_scenario("paper", {"control.law": "sending:Law"})
 
 
-def test_what_a_law_sends_is_read_from_its_file_and_stands_in_the_scenario(folder: Path) -> None:
+def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
     sends = "{'u': {'unit': 'sqrt(W)', 'per_peer': True}, 'E': {'unit': 'J', 'length': 1}, 'w': {}}"
     scenario = load_sending(folder, sends)
     assert parse_scenario(scenario.text) == scenario
@@ -188,7 +186,7 @@ def test_what_a_law_sends_is_read_from_its_file_and_stands_in_the_scenario(folde
             assert link.channel.part(record, link.place) == [0, 1, 2, first, first + 1]
 
 
-def test_a_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> None:
+def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> None:
     scenario = load_sending(folder, "{}")
     assert "sends" not in scenario.text
     assert "ch" not in scenario.layout("s").lengths()
@@ -210,7 +208,7 @@ def test_a_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) ->
         ("{'u': {'length': 20}, 'v': {'length': 13, 'per_peer': True}}", "sends", "33 numbers to each peer"),
     ],
 )
-def test_what_cannot_be_sent_is_refused_as_the_scenario_is_read(
+def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
     sends: str, key: str, fact: str, folder: Path
 ) -> None:
     with pytest.raises(ScenarioError) as caught:
@@ -227,7 +225,7 @@ def test_what_cannot_be_sent_is_refused_as_the_scenario_is_read(
         ("{'u': {}}; schemes = ('digital',)", {"scheme": "digital"}, ""),
     ],
 )
-def test_a_site_is_built_of_the_law_that_the_scenario_names_in_the_scheme_it_is_for(
+def test_a_site_is_built_with_its_named_law_and_scheme(
     sends: str, overrides: dict[str, object], fact: str, folder: Path
 ) -> None:
     scenario = load_sending(folder, "{'u': {}}")

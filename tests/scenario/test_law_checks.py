@@ -41,13 +41,13 @@ def test_a_law_that_cannot_do_its_work_is_refused(
     ],
     ids=str,
 )
-def test_a_law_that_needs_no_masses_drives_an_arm_that_nobody_knows(overrides: dict[str, Any]) -> None:
+def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(overrides: dict[str, Any]) -> None:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     assert not scenario.setup("s").theta_known
     assert parse_scenario(scenario.text) == scenario
 
 
-def test_a_known_arm_is_not_mentioned_so_that_older_scenarios_keep_their_hashes() -> None:
+def test_a_known_arm_is_not_mentioned_for_the_hashes_sake() -> None:
     assert "known" not in load_scenario("two_sites").text
     assert load_scenario("two_sites", {"arm.known": True}).sha256 == load_scenario("two_sites").sha256
     assert load_scenario("two_sites", OUTSIDE).text.count("known = false") == 1

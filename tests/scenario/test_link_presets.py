@@ -48,7 +48,7 @@ def test_wifi_has_half_of_the_percentiles_that_were_measured() -> None:
         assert (1 - link.slow_share) * below[0] + link.slow_share * below[1] == pytest.approx(share, abs=2e-3)
 
 
-def test_lan_has_half_of_the_median_and_of_the_quartiles_distance() -> None:
+def test_lan_has_half_of_median_and_of_quartiles_distance() -> None:
     mean, deviation = PRESETS["lan"]["delay_ms"], PRESETS["lan"]["deviation_ms"]
     law = stats.gamma((mean / deviation) ** 2, scale=deviation**2 / mean)
     assert 2 * law.median() == pytest.approx(0.542, rel=0.01)
@@ -72,7 +72,7 @@ def test_the_grid_is_half_a_round_trip_and_single_losses() -> None:
     assert (link.moments(), link.loss, link.loss_burst) == ((68.0, 0.0), 0.25, 0.0)
 
 
-def test_every_preset_of_the_file_has_a_comment_with_its_source() -> None:
+def test_every_preset_of_file_has_comment_with_its_source() -> None:
     text = _PRESETS_FILE.read_text(encoding="utf-8")
     for name in tomllib.loads(text):
         head = f'["{name}"]' if name[0].isdigit() else f"[{name}]"

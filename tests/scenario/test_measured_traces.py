@@ -29,7 +29,7 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 
 
 @pytest.mark.parametrize("zipped", [False, True])
-def test_irtt_says_of_round_trips_what_the_trace_says_of_halves(tmp_path: Path, zipped: bool) -> None:
+def test_irtt_says_of_round_trips_what_trace_says_of_halves(tmp_path: Path, zipped: bool) -> None:
     found = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
     facts = found.to_dict()
     assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
@@ -43,7 +43,7 @@ def test_irtt_says_of_round_trips_what_the_trace_says_of_halves(tmp_path: Path, 
     )
 
 
-def test_what_irtt_lost_is_lost_and_clocks_that_differ_are_told(tmp_path: Path) -> None:
+def test_samples_lost_in_irtt_are_lost_and_differing_clocks_told(tmp_path: Path) -> None:
     found = import_trace(irtt(tmp_path, 1, 2), "irtt")
     assert [math.isinf(ms) for _, ms in found.points] == [False, True, True, False, False]
     assert (found.to_dict()["lost_percent"], found.to_dict()["lost_in_a_row"]) == (40.0, 2.0)
@@ -87,7 +87,7 @@ def test_a_table_of_the_form_of_cicv5g_makes_a_link(tmp_path: Path) -> None:
     assert link.points.tolist() == [[0, 22000], [54000, 33000], [109000, -1]]
 
 
-def test_a_column_says_its_unit_and_whether_it_is_a_round_trip(tmp_path: Path) -> None:
+def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("timestamp_s,rtt_ms,uplink_ms\n0,20,12\n1,40,-1\n")
     assert [ms for _, ms in import_trace(path, "csv").points] == [10.0, 20.0]

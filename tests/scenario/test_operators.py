@@ -66,7 +66,7 @@ def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key
     ],
     ids=str,
 )
-def test_a_value_of_the_wrong_kind_is_told_what_its_key_wants(group: str, entry: Any, key: str) -> None:
+def test_value_of_wrong_kind_is_told_what_its_key_wants(group: str, entry: Any, key: str) -> None:
     said = refused(group, entry)
     assert said.startswith(f".{key}: must be ")
     assert key == "points" or said.endswith("is 'x'")
@@ -105,6 +105,6 @@ def test_what_authors_get_wrong(group: str, entry: Any, said: str) -> None:
     assert re.match(said, refused(group, entry))
 
 
-def test_a_start_pose_that_is_none_is_refused_at_its_own_key() -> None:
+def test_an_invalid_start_pose_is_refused_at_its_own_key() -> None:
     with pytest.raises(ScenarioError, match=r"sites.m1.q0_rad"):
         load_scenario("free", {"sites.m1.q0_rad": ["x", 0.0], "sites.m1.hands": [SPRING, TIP]})

@@ -23,7 +23,7 @@ PAPER = load_scenario("paper")
     ],
     ids=str,
 )
-def test_it_is_what_the_same_override_gives_as_the_scenario_is_loaded(
+def test_it_is_what_same_override_gives_as_scenario_is_loaded(
     name: str, overrides: dict[str, object]
 ) -> None:
     """Of scenarios whose sites and links have nothing of their own."""
@@ -31,7 +31,7 @@ def test_it_is_what_the_same_override_gives_as_the_scenario_is_loaded(
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
+def test_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
     texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][::order]
     scenario = load_scenario(PAPER, texts)
     assert [site.control.Kd[0] for site in scenario.sites.values()] == [5.0, 5.0, 7.0]
@@ -48,7 +48,7 @@ def test_a_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> No
         ("sites.m1.q0_rad.2=1", "sites.m1.q0_rad=[0.3, -1.0, 1.0, -0.6, 0.5, 0.2]"),
     ],
 )
-def test_a_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> None:
+def test_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> None:
     """Also where the author wrote one number for all joints, or the vector of a group."""
     scenario = load_scenario("six_joints", [whole])
     assert load_scenario("six_joints", [one]) == scenario == load_scenario(load_scenario("six_joints"), [one])
@@ -59,7 +59,7 @@ def test_another_law_has_its_own_gains_from_the_start() -> None:
     assert (control.K, control.d) == ((20.0, 20.0), (3.0, 3.0))
 
 
-def test_a_key_counts_for_those_whose_law_or_model_has_it() -> None:
+def test_key_counts_for_those_whose_law_or_model_has_it() -> None:
     mixed = load_scenario(PAPER, ["sites.m1.control.law=p_d", "links.m1->s.model=measured"])
     again = load_scenario(mixed, ["control.Kd=5", "control.K=30", "link.delay_ms=50"])
     assert again.sites["m1"].control.K == (30.0, 30.0)

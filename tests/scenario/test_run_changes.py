@@ -40,7 +40,7 @@ def refused(*changes: Any, **overrides: Any) -> ScenarioError:
     return error.value
 
 
-def test_a_change_of_a_link_is_its_model_from_then_on() -> None:
+def test_change_of_link_is_its_model_from_then_on() -> None:
     setup = scripted(LINK, {"at_s": 9, "link": "m1->s", "to": {"loss": 0.5}}).setup("s")
     assert setup.links[0].models == (
         LinkModel(location=200_000.0),
@@ -59,7 +59,7 @@ def test_a_change_of_shares_is_a_ramp() -> None:
     assert scenario.setup("m1").ramps == ()
 
 
-def test_a_change_keeps_what_it_does_not_name_unless_it_names_a_kind() -> None:
+def test_a_change_keeps_unnamed_keys_unless_it_names_a_kind() -> None:
     base = {"model": "gamma", "delay_ms": 50.0, "deviation_ms": 10.0, "loss": 0.1, "outages_s": [[1, 2]]}
     first = {"at_s": 1, "link": "m1->s", "to": {"deviation_ms": 5}}
     then = {"at_s": 2, "link": "m1->s", "to": {"preset": "4g"}}
@@ -73,7 +73,7 @@ def test_a_change_keeps_what_it_does_not_name_unless_it_names_a_kind() -> None:
     assert scenario.setup("s").links[0].outages == ((S, 2 * S),)
 
 
-def test_a_trace_may_be_left_and_its_loss_changed_but_no_other_begun() -> None:
+def test_a_trace_may_be_left_but_no_other_begun() -> None:
     base = {"model": "trace", "trace": "0 7000, 1000 9000"}
     left = [
         {"at_s": 1, "link": "m1->s", "to": {"loss": 0.5}},
@@ -145,7 +145,7 @@ def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> An
     return resolve_change(scenario, initial_link_tables(scenario), written, from_ns)
 
 
-def test_a_command_holds_from_its_tick_and_belongs_to_the_receiver() -> None:
+def test_command_holds_from_its_tick_and_belongs_to_receiver() -> None:
     scenario = load_scenario("paper")
     change = ordered(scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789)
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
@@ -202,7 +202,7 @@ def test_an_order_that_cannot_be_is_refused(written: dict[str, Any], words: str)
         ordered(load_scenario("paper"), written)
 
 
-def test_a_link_with_a_trace_takes_no_orders_that_a_record_could_not_hold() -> None:
+def test_a_link_with_a_trace_takes_no_unrecordable_orders() -> None:
     scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
     with pytest.raises(ScenarioError, match="can only be given another model"):
         ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
@@ -232,7 +232,7 @@ row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
         json.dumps({**row, "to": {"m1": 0.5}}),
     ],
 )
-def test_a_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
+def test_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
     scenario = load_scenario("paper")
     for valid in (good, row):
         assert parse_core_change(scenario, "s", json.dumps(valid)).text == msgspec.json.encode(valid).decode()

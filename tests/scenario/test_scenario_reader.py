@@ -54,7 +54,7 @@ def test_paper_is_section_iv() -> None:
     assert m1.links[0].models == (LinkModel(location=200_000.0),)
 
 
-def test_the_template_is_valid_and_its_defaults_are_what_it_says() -> None:
+def test_template_is_valid_and_its_defaults_are_what_it_says() -> None:
     scenario = parse_scenario(read_template(), "template")
     assert scenario.name == "mine"
     spelt_out = "\n".join(line.removeprefix("# ") for line in read_template().splitlines() if "=" in line)
@@ -95,7 +95,7 @@ def test_an_override_without_key_or_value_is_refused(text: str) -> None:
     assert "KEY=VALUE" in str(refused([text]))
 
 
-def test_an_override_that_names_a_kind_replaces_what_the_file_says_of_another() -> None:
+def test_override_that_names_kind_replaces_what_file_says_of_another() -> None:
     """Whatever comes first; other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
         links = load_scenario("paper", texts).links.values()
@@ -174,7 +174,7 @@ def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
     assert scenario.sites["m2"].control.Kp == (1.0, 1.0)
 
 
-def test_a_site_overrides_single_keys_of_its_arm_and_a_link_its_delay() -> None:
+def test_a_site_overrides_its_arm_and_a_link_its_delay() -> None:
     scenario = load_scenario(
         "paper", {"sites.s.arm.m1_kg": 2, "links": {"m1->s": {"delay_ms": 350.0}}, "sites.m2.rate_hz": 500}
     )
@@ -193,7 +193,7 @@ def test_a_delay_is_rounded_to_whole_microseconds() -> None:
         )
 
 
-def test_without_hands_is_the_same_experiment_with_nobody_at_the_arms() -> None:
+def test_without_hands_is_same_experiment_with_nobody_at_arms() -> None:
     scenario = load_scenario("paper").without_hands()
     assert all(spec.hands == () for spec in scenario.sites.values())
     assert scenario.setup("m1").actors == ()
@@ -228,7 +228,7 @@ def test_a_reducible_matrix_loads_and_has_no_beta() -> None:
         ("links.m1->ss", "m1->s"),
     ],
 )
-def test_an_unknown_key_is_refused_with_its_path_and_the_nearest_name(key: str, nearest: str) -> None:
+def test_unknown_key_is_refused_with_its_path_and_nearest_name(key: str, nearest: str) -> None:
     table = {"links.m1->ss": {"delay_ms": 1.0}}.get(key, 1.0)
     error = refused({key: table})
     assert error.path == key
@@ -236,7 +236,7 @@ def test_an_unknown_key_is_refused_with_its_path_and_the_nearest_name(key: str, 
     assert f"did you mean '{nearest}'" in error.problem
 
 
-def test_a_key_unlike_any_other_is_refused_with_all_that_are_valid() -> None:
+def test_a_key_unlike_any_other_is_refused_with_all_valid() -> None:
     assert "valid are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
 
 
@@ -324,7 +324,7 @@ def test_the_smallest_scenario_is_two_sites_and_a_delay() -> None:
     assert (scenario.duration_s, scenario.sites["a"].rate_hz) == (20.0, 1000)
 
 
-def test_an_arm_whose_inertia_is_singular_in_some_pose_is_refused() -> None:
+def test_arm_whose_inertia_is_singular_in_some_pose_is_refused() -> None:
     """Property 1 does not hold for a massless first link with a point mass at the tip of the second."""
     assert refused({"arm.lc1_m": 0.0, "arm.I1_kg_m2": 0.0}).path.endswith("arm")
 
@@ -355,13 +355,13 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
         assert str(path) in str(error.value)
 
 
-def test_a_name_that_is_not_shipped_is_refused_with_the_nearest() -> None:
+def test_name_that_is_not_shipped_is_refused_with_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'paper'") as error:
         load_scenario("papre")
     assert "./mine.toml" in str(error.value)
 
 
-def test_a_stale_rule_below_the_links_delay_would_hold_for_ever_and_is_refused() -> None:
+def test_a_stale_rule_below_the_delay_is_refused() -> None:
     rule = {"on_stale.action": "hold", "on_stale.age_ms": 350.0}
     assert load_scenario("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action == "hold"
     for link in ({"link.delay_ms": 350.0}, {"link.playout_ms": 400.0}):

@@ -159,7 +159,7 @@ def words(vector: Array) -> str:
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
-def test_fixed_links_and_the_payload_are_lumped_and_fixed_frames_composed(seed: int) -> None:
+def test_fixed_links_and_payload_are_lumped_and_fixed_frames_composed(seed: int) -> None:
     """Every body is a cloud of masses: what is read must be the cloud's own sums in the joint's frame."""
     random = np.random.default_rng(seed)
     angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
@@ -230,7 +230,7 @@ def test_limits_friction_and_kinds() -> None:
     )
 
 
-def test_a_gripper_is_held_at_zero_and_a_note_says_so() -> None:
+def test_gripper_is_held_at_zero_and_note_says_so() -> None:
     chain = read_urdf(GRIPPER, tip="tcp")
     assert [j.inertia[0] for j in chain.joints] == [4.0, 6.0]
     assert [re.findall("'(.*?)'", note) for note in chain.notes] == [

@@ -46,7 +46,7 @@ class Asked:
 
 
 @given(st.integers(0, 10_000))
-def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k: int) -> None:
+def test_an_accepted_change_names_its_first_tick_and_is_recorded(k: int) -> None:
     """What the next record says makes the same command again; it holds from the tick of the answer on."""
     asked = Asked()
     (taken,), reply = asked.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
@@ -58,7 +58,7 @@ def test_an_accepted_change_names_its_first_tick_and_its_record_says_all_of_it(k
     assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)
 
 
-def test_what_a_change_does_not_name_stays_as_it_was_even_by_the_timeline() -> None:
+def test_a_change_leaves_unnamed_keys_as_the_timeline_has_them() -> None:
     later = {"at_s": 1.0, "link": "m1->s", "to": {"loss": 0.25}}
     asked = Asked(load_scenario("paper", {"timeline": [later]}))
     (before,), _ = asked.ask(10, link="m1->s", to={"duplicate": 0.5})
@@ -78,7 +78,7 @@ def test_shares_are_ramped_from_the_first_tick_on() -> None:
     assert taken.ramp == (first_ns, first_ns + 2_000_000_000, (0.9, 0.1))
 
 
-def test_dominance_is_ramped_whatever_the_sender_asks_and_the_record_says_so() -> None:
+def test_dominance_is_ramped_whatever_sender_asks_and_record_says_so() -> None:
     (taken,), _ = Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=0.0)
     assert taken.ramp is not None
     assert taken.ramp.end_ns - taken.ramp.start_ns == round(MIN_RAMP_S * 1e9)
@@ -86,7 +86,7 @@ def test_dominance_is_ramped_whatever_the_sender_asks_and_the_record_says_so() -
     assert not Asked().ask(7, dominance="s", to={"m1": 0.9, "m2": 0.1}, ramp_s=-1.0)[1].accepted
 
 
-def test_a_triangle_dragged_for_a_minute_is_obeyed_to_its_end() -> None:
+def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
     """Thirty orders a second, as a page sends them; a flood within the time before they hold is refused."""
     asked = Asked()
     site = Site(asked.scenario.setup("s"))
@@ -134,7 +134,7 @@ def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
 
 
 @given(st.lists(st.sampled_from(["stop", "enable", "reset"]), min_size=1, max_size=6))
-def test_orders_that_come_in_one_tick_are_taken_as_if_each_had_a_tick(orders: list[str]) -> None:
+def test_orders_of_one_tick_act_as_in_several(orders: list[str]) -> None:
     """`enable` behind a `stop` of the same tick was refused: the site was not stopped yet."""
     assert obey([orders]) == obey([[order] for order in orders])
 
@@ -152,7 +152,7 @@ def test_what_is_no_order_is_answered_and_harmless() -> None:
     assert all((answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies)
 
 
-def test_a_change_that_the_run_does_not_live_to_see_is_refused() -> None:
+def test_change_that_run_does_not_live_to_see_is_refused() -> None:
     taken, reply = Asked().ask(19_950, link="m1->s", to={"delay_ms": 1.0})
     assert taken == []
     assert "20000" in reply.text
@@ -188,7 +188,7 @@ def test_a_mark_changes_nothing_and_waits_for_the_next_event() -> None:
         {"order": "stop", "mark": "x"},
     ],
 )
-def test_under_the_key_of_every_member_a_site_can_be_asked_to_stop_alone(more: dict[str, Any]) -> None:
+def test_the_key_of_every_member_allows_stop_alone(more: dict[str, Any]) -> None:
     asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
     garbage = asked.send(b"garbage", STOP)
     taken, reply = asked.ask(10, STOP, **more)

@@ -42,7 +42,7 @@ def test_keys_that_are_well_are_well(folder: Path) -> None:
     assert states(examine_keys(None)) == ["ok"]
 
 
-def test_keys_that_end_soon_lie_open_or_beside_the_authority_are_told(tmp_path: Path) -> None:
+def test_keys_that_end_soon_or_lie_open_are_told(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys", MEMBERS, [], 3)
     (tmp_path / "keys" / "m1").chmod(0o755)
     found = list(examine_keys(tmp_path / "keys" / "m1"))
@@ -68,7 +68,7 @@ def member(folder: Path, place: str) -> Iterator[None]:
         bus.close()
 
 
-def test_a_member_with_keys_answers_one_with_keys_of_the_same_authority(folder: Path, tmp_path: Path) -> None:
+def test_member_with_keys_answers_one_with_keys_of_same_authority(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
     (place, nobody) = (one.replace("tcp", "tls") for one in find_free_endpoints(2))
     with member(folder / "m1", place):

@@ -108,7 +108,7 @@ def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Sess
     return session, session.ends
 
 
-def test_what_the_arm_measures_is_the_record_and_the_record_is_what_drives_it(tmp_path: Path) -> None:
+def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
     session, ends = session_of(tmp_path, driving(sent, torques))
@@ -138,7 +138,7 @@ def whole(log: Log) -> None:
 
 
 @pytest.mark.long
-def test_an_arm_of_six_joints_sends_the_torque_that_it_measures(tmp_path: Path) -> None:
+def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None:
     """Its tau_x is the record's to the bit, goes to the peers, and is what the log executes again."""
     changes = {**ARM, "duration_s": 0.3}
     Site(six(**changes).setup("s")).step(TickInput(0))  # compiles, before anybody waits
@@ -171,7 +171,7 @@ def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None
     )
 
 
-def test_an_arm_that_falls_silent_is_held_then_in_fault_and_the_session_goes_on(tmp_path: Path) -> None:
+def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_300_000_000))
     log = session.run()
     assert ends == {"m": 0, "s": 0}
@@ -207,9 +207,7 @@ def braked(
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
-def test_a_site_that_was_frozen_makes_up_for_nothing_and_its_arm_stays_where_it_was(
-    frozen_s: float, tmp_path: Path
-) -> None:
+def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_path: Path) -> None:
     poses: list[tuple[int, list[float]]] = []
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
@@ -288,7 +286,7 @@ class Switch:
         return self.switch.held
 
 
-def test_a_switch_is_held_until_who_holds_it_lets_go_or_is_silent() -> None:
+def test_a_switch_is_held_until_let_go_or_silent() -> None:
     one = Switch()
     switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
     assert switch.take_order(Mode.RUN, LifeReason.START) == "released"
@@ -311,7 +309,7 @@ def test_a_switch_is_held_until_who_holds_it_lets_go_or_is_silent() -> None:
 
 
 @pytest.mark.parametrize("first", [1, 2])
-def test_of_two_that_hold_a_switch_whoever_lets_go_stops_the_arm(first: int) -> None:
+def test_of_two_that_hold_switch_whoever_lets_go_stops_arm(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
     one, other = Switch(), 3 - first
     assert one.hear(1, 0)
@@ -326,7 +324,7 @@ def test_of_two_that_hold_a_switch_whoever_lets_go_stops_the_arm(first: int) -> 
     assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_of_two_that_hold_a_switch_the_silence_of_one_stops_the_arm() -> None:
+def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
     """As its program crashed; nor does one go on that lets go and presses within a tick."""
     one = Switch()
     assert one.hear(1, 0)
@@ -343,7 +341,7 @@ def test_of_two_that_hold_a_switch_the_silence_of_one_stops_the_arm() -> None:
     assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_many_that_do_not_hold_a_switch_make_nobody_forgotten_who_does() -> None:
+def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
     one = Switch()
     assert one.hear(0, 0)
     for boot in range(1, 2 * STARTS_KEPT):
@@ -386,7 +384,7 @@ def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     assert result.absences == [("s", *gone)]
 
 
-def test_without_an_arm_nothing_begins_and_it_is_said_where_it_was_waited_for(tmp_path: Path) -> None:
+def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
     def alone(clock: RelayClock) -> None:
@@ -478,7 +476,7 @@ def test_the_newest_counts_in_whatever_order_they_come(order: list[int], bound: 
     assert heard.dropped["old measurement"] == 8 - records
 
 
-def test_a_flood_is_bounded_and_what_is_lost_of_it_is_counted() -> None:
+def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     heard = Heard()
     heard.hear(measurement(n=0))
     heard.arm.bind((0.5, 0.25))
@@ -488,7 +486,7 @@ def test_a_flood_is_bounded_and_what_is_lost_of_it_is_counted() -> None:
     assert heard.dropped["missing measurement"] == 8
 
 
-def test_a_program_that_is_started_anew_counts_until_the_session_begins() -> None:
+def test_program_that_is_started_anew_counts_until_session_begins() -> None:
     heard = Heard()
     heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
     assert heard.arm.newest.q == [2.0, 2.0]
@@ -535,7 +533,7 @@ def test_a_short_silence_is_over_with_the_next_measurement() -> None:
     assert heard.arm.take_order(Mode.RETURN) == ""
 
 
-def test_a_glitch_of_an_encoder_is_no_measurement_and_repeated_it_is_silence() -> None:
+def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:
     """The arm of two_sites may move at 100 rad/s, 0.1 rad in a period."""
     heard = Heard()
     heard.hear(measurement(n=0))
@@ -552,7 +550,7 @@ def test_a_glitch_of_an_encoder_is_no_measurement_and_repeated_it_is_silence() -
     assert heard.dropped["implausible measurement"] == 75
 
 
-def test_a_torque_counts_while_it_is_fresh_and_the_run_goes_on() -> None:
+def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     network, clock = LocalNetwork(), ManualClock()
     site = network.join()
     port = ArmClient(network.join(), clock, "t", "s")

@@ -72,7 +72,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
     return made.run(), felt
 
 
-def test_a_session_with_people_is_verified_and_fed_virtual_time_repeats_it(
+def test_a_session_with_people_is_verified_and_repeated(
     session: tuple[Log, Felt],
 ) -> None:
     log, _ = session
@@ -82,7 +82,7 @@ def test_a_session_with_people_is_verified_and_fed_virtual_time_repeats_it(
     assert compare_with_virtual(log).fed.identical == found.records
 
 
-def test_its_events_say_who_held_which_arm_and_its_counts_who_was_refused(session: tuple[Log, Felt]) -> None:
+def test_its_events_say_who_held_and_counts_who_was_refused(session: tuple[Log, Felt]) -> None:
     log, _ = session
     said = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
     assert sorted(said) == sorted(
@@ -107,7 +107,7 @@ def test_what_a_hand_feels_is_what_acts_on_the_arm(session: tuple[Log, Felt]) ->
     assert seen > 30
 
 
-def test_a_hand_does_what_its_mode_says_and_only_where_there_is_one() -> None:
+def test_a_hand_does_what_its_mode_says() -> None:
     bus, clock = LocalNetwork().join(), ManualClock()
     with open_hand(bus, clock, "t", "m1", SCENARIO) as hand:
         with pytest.raises(UsageError, match="can move, not push"):
@@ -167,7 +167,7 @@ def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -
     assert served.dropped == {reason: 1}
 
 
-def test_a_flood_is_read_a_little_at_a_time_and_moves_nobody() -> None:
+def test_flood_is_read_little_at_time_and_moves_nobody() -> None:
     """A hundred messages a tick of others: the holder's arm stays as it was, and few are looked at."""
     served = Served()
     served.take(message())

@@ -50,7 +50,7 @@ def ended(steps: Steps, overtime: LawWatchdog | None = None) -> int | None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.74, 0.8, 1.0, 2.0, 20.0, 100.0])
-def test_what_a_law_takes_above_its_share_adds_up_to_half_a_second(share: float) -> None:
+def test_a_laws_overtime_adds_up_to_half_a_second(share: float) -> None:
     took_ns = int(share * PERIOD_NS)
     over_ns = min(took_ns, HICCUP_NS) - int(SHARE * PERIOD_NS)
     k = ended(Steps(lambda _: took_ns))
@@ -60,7 +60,7 @@ def test_what_a_law_takes_above_its_share_adds_up_to_half_a_second(share: float)
         assert k == MOST_NS // over_ns
 
 
-def test_a_law_that_is_slow_at_every_other_tick_is_found_too() -> None:
+def test_a_law_slow_at_every_other_tick_is_found() -> None:
     """2.5 periods and nothing, by turns: 1.25 on average, and never twice in a row."""
     k = ended(Steps(lambda k: 2_500_000 * (k % 2)))
     assert k == pytest.approx(MOST_NS / (0.5 * PERIOD_NS), abs=3)
@@ -75,7 +75,7 @@ def test_a_single_hiccup_is_counted_and_no_more(hiccup_ns: int) -> None:
     assert "at 1 ticks" in overtime.describe_hiccups()
 
 
-def test_a_machine_that_takes_the_processor_away_is_no_fault_of_the_law() -> None:
+def test_machine_that_takes_processor_away_is_no_fault_of_law() -> None:
     assert ended(Steps(lambda _: 5_000_000, computes=0.05, evicts=1)) is None
 
 

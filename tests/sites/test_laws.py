@@ -21,7 +21,7 @@ def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, 
     return session.run(), session.ends or {}
 
 
-def test_a_law_that_repeats_the_papers_is_virtual_time_and_the_papers_bit_for_bit(tmp_path: Path) -> None:
+def test_a_copy_of_the_papers_law_has_its_bits_live(tmp_path: Path) -> None:
     law = {"law": "tests.laws:Adaptive"}
     log, ends = lived(tmp_path, "two_sites", control=law)
     assert ends == {"m": 0, "s": 0}
@@ -60,7 +60,7 @@ def test_a_law_that_fails_ends_the_session_in_order(how: str, tmp_path: Path) ->
     assert twins.fed.identical == sum(made.values())
 
 
-def test_a_law_that_fails_at_rest_is_told_before_the_session() -> None:
+def test_law_that_fails_at_rest_is_told_before_session() -> None:
     control = {"law": "tests.laws:Failing", "how": "nan", "at": 3}
     scenario = load_scenario("two_sites", {"sites.s.control": control})
     with pytest.raises(LawFailed, match=r"of s failed at tick 3: .* this was the rehearsal"):

@@ -28,7 +28,7 @@ def engaged_after_s(log: Log, site: str, tick: int) -> float:
     return float(part.tick[np.argmax(after)] - tick) / part.rate_hz
 
 
-def test_a_site_that_is_killed_comes_back_and_the_log_is_whole(tmp_path: Path) -> None:
+def test_site_that_is_killed_comes_back_and_log_is_whole(tmp_path: Path) -> None:
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 4 * S
     session.site("m", at_ns=5 * S)
@@ -55,7 +55,7 @@ def kinds_about(log: Log, member: str, about: str) -> list[str]:
     return [event.kind for event in log.events if event.member == member and event.about == about]
 
 
-def test_whose_end_it_was_is_said_to_the_others_who_go_on(tmp_path: Path) -> None:
+def test_whose_end_it_was_is_told_to_the_others(tmp_path: Path) -> None:
     session = Session.whole(gliding(4.0), tmp_path, ends={})
     session.interrupt("s", 3 * S)
     log = session.run()
@@ -76,7 +76,7 @@ def test_whose_end_it_was_is_said_to_the_others_who_go_on(tmp_path: Path) -> Non
     assert log.expected_ticks("s") == end.ticks
 
 
-def test_a_site_waits_for_one_that_left_no_longer_than_it_is_told(tmp_path: Path) -> None:
+def test_a_site_waits_for_a_departed_one_only_as_told(tmp_path: Path) -> None:
     session = Session.whole(gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}})
     session.clocks["s"].dies_ns = 3 * S
     log = session.run()
@@ -88,7 +88,8 @@ def test_a_site_waits_for_one_that_left_no_longer_than_it_is_told(tmp_path: Path
     assert 1.0 < end.ticks / 200 - lost.t_ns / S < 1.3
 
 
-def test_a_site_that_left_in_order_may_come_back_and_leave_again(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
     session = Session.whole(gliding(9.0), tmp_path, ends={})
     session.interrupt("s", 3 * S, 15)
     session.site("s", at_ns=4 * S)
@@ -106,7 +107,7 @@ def test_a_site_that_left_in_order_may_come_back_and_leave_again(tmp_path: Path)
     assert check.passed, check.findings
 
 
-def test_a_site_may_come_late_where_the_first_one_begins_without_it(tmp_path: Path) -> None:
+def test_site_may_come_late_where_first_one_begins_without_it(tmp_path: Path) -> None:
     scenario = gliding(5.0, "asymmetric")
     session = Session(
         scenario, tmp_path / "run.mcap", ends={}, options={"m1": {"without": (scenario.names[2],)}}
@@ -164,7 +165,7 @@ def test_another_start_waits_while_the_one_before_is_there(tmp_path: Path) -> No
     assert len(log["m"]) == 800
 
 
-def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: Path) -> None:
+def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path) -> None:
     session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
     for name in ("m", "s"):
         session.site(name, needs_recorder=False)
@@ -181,7 +182,7 @@ def test_a_recorder_that_comes_after_a_return_knows_what_was_not_made(tmp_path: 
     assert "agree with what is there" in [finding.text for finding in check_log([session.path]).findings]
 
 
-def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_path: Path) -> None:
+def test_a_sample_whose_record_died_leaves_few_ticks_open(tmp_path: Path) -> None:
     """Its peer used it until it held: those ticks cannot be executed. What it held is in its records."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/state", 4 * S - 14_000_000, 5 * S)
@@ -195,7 +196,7 @@ def test_a_sample_whose_record_died_with_its_site_leaves_a_few_ticks_open(tmp_pa
     assert 0 < result.unjudged <= 3 + 4
 
 
-def test_a_cut_in_one_direction_is_in_the_last_words_of_who_is_not_heard(tmp_path: Path) -> None:
+def test_a_one_way_cut_is_in_the_last_words(tmp_path: Path) -> None:
     session = Session.whole(gliding(3.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 60 * S)
     log = session.run()
@@ -222,7 +223,7 @@ def test_a_site_that_some_do_not_admit_names_them(tmp_path: Path) -> None:
     assert "m2 did not admit it to the running session" in failed[0]
 
 
-def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) -> None:
+def test_a_site_says_that_a_peer_does_not_hear_it(tmp_path: Path) -> None:
     session = Session.whole(gliding(4.0), tmp_path, ends={})
     session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
     log = session.run()
@@ -238,7 +239,7 @@ def test_a_site_says_that_a_peer_that_it_hears_does_not_hear_it(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_path: Path) -> None:
+def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) -> None:
     session = Session.whole(gliding(7.0, "paper"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
@@ -257,10 +258,10 @@ def test_the_certificate_says_what_the_theorem_covers_and_judges_the_rest(tmp_pa
     assert link.loss == 0.0
 
 
-@pytest.mark.parametrize(("dies_ms", "again_ms"), [(4300, 5000), (4050, 4060)])
-def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(
-    dies_ms: int, again_ms: int, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("dies_ms", "again_ms"), [pytest.param(4300, 5000, marks=pytest.mark.long), (4050, 4060)]
+)
+def test_a_start_dead_before_tick_0_leaves_its_place(dies_ms: int, again_ms: int, tmp_path: Path) -> None:
     """Also if the other site admits it only when the next one is there already."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
@@ -276,7 +277,7 @@ def test_a_start_that_dies_before_its_first_tick_leaves_its_place_to_the_next(
     assert check_log([session.path]).passed
 
 
-def test_a_site_that_comes_back_does_not_wait_for_one_that_leaves_meanwhile(tmp_path: Path) -> None:
+def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> None:
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 3 * S
     session.site("m1", at_ns=4 * S)
@@ -290,8 +291,8 @@ def test_a_site_that_comes_back_does_not_wait_for_one_that_leaves_meanwhile(tmp_
     assert log.starts.keys() == {"m1"}
 
 
-@pytest.mark.parametrize("later_ms", [60, 140])
-def test_of_two_sites_that_come_back_together_each_takes_in_the_other(later_ms: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("later_ms", [60, pytest.param(140, marks=pytest.mark.long)])
+def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: Path) -> None:
     """Who comes second learns of the first start from those that admit both, who know it only since."""
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
     for name, wait_ms in (("m2", 0), ("m1", later_ms)):
@@ -302,7 +303,7 @@ def test_of_two_sites_that_come_back_together_each_takes_in_the_other(later_ms: 
     assert verify(log).passed
 
 
-def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: Path) -> None:
+def test_a_frozen_start_ends_when_another_has_its_place(tmp_path: Path) -> None:
     """Its token went, as that of a process that is stopped for longer than its lease does."""
     session = Session.whole(gliding(8.0), tmp_path, ends={})
     session.clocks["m"].stall(3 * S, 3 * S)
@@ -317,7 +318,8 @@ def test_a_start_that_was_frozen_ends_when_another_one_has_its_place(tmp_path: P
     assert verify(log).differing == 0
 
 
-def test_recorders_that_follow_each_other_agree_on_what_was_not_made(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
     """The first one is gone before a site comes back, the second begins while it is away."""
     stops_ns = 3 * S + 500_000_000
     session = Session(gliding(8.0), tmp_path / "run.mcap", ends={})
@@ -350,7 +352,7 @@ def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None
     assert session.ends == {"m": 0, "s": 0}
 
 
-def test_a_site_at_its_end_waits_for_a_recorder_whose_connection_broke(tmp_path: Path) -> None:
+def test_site_at_its_end_waits_for_recorder_whose_connection_broke(tmp_path: Path) -> None:
     """Its token is gone, and it heard neither the last records nor the end; then it asks for them."""
     session = Session.whole(gliding(2.0), tmp_path, ends={})
     session.clocks["s"].at(3 * S + 600_000_000, lambda: session.lose_token("recorder"))

@@ -113,7 +113,7 @@ def test_lateness_enters_no_formula() -> None:
     assert max(state.late_us for state in late.states) == 400_000
 
 
-def test_statistics_and_slack_come_ten_times_a_second_after_the_tick() -> None:
+def test_statistics_and_slack_come_ten_times_second_after_tick() -> None:
     alone = Alone(LateClock())
     alone.run()
     assert [link.tick for link in alone.links] == list(range(0, 2000, 100))
@@ -132,7 +132,7 @@ def test_a_loop_that_is_stopped_makes_no_further_tick() -> None:
     assert none.states == []
 
 
-def test_a_run_that_leaves_its_limits_ends_with_a_record_that_says_so() -> None:
+def test_a_run_beyond_its_limits_ends_with_a_diverged_record() -> None:
     alone = Alone(LateClock(), {"limits.qd_limit_rad_s": 0.05, "sites.m.q0_rad": [0.4, -0.2]})
     output = alone.run()
     assert output.mode is Mode.DIVERGED
@@ -149,7 +149,7 @@ SCENARIOS = {
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
     scenario = load_scenario(name, SCENARIOS[name])
     log = Session.whole(scenario, tmp_path).run()
     assert log.complete
@@ -167,7 +167,7 @@ def test_a_stall_within_the_delay_changes_no_bit(tmp_path: Path) -> None:
     assert in_log(log) == in_virtual_time(scenario)
 
 
-def test_a_stall_beyond_the_delay_changes_nothing_before_the_first_late_sample(tmp_path: Path) -> None:
+def test_stall_beyond_delay_changes_nothing_before_first_late_sample(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
     session.clocks["m2"].stall(2_000_000_000, 300_000_000)
@@ -219,7 +219,7 @@ def test_strangers_and_their_garbage_change_no_bit_and_are_counted(tmp_path: Pat
     assert int(log.accounts["dropped: oversized"]) > 0
 
 
-def test_a_site_that_is_asked_to_end_ends_in_order_and_its_exit_code_says_so(tmp_path: Path) -> None:
+def test_a_site_asked_to_end_ends_in_order(tmp_path: Path) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 1.0})
     session = Session.whole(scenario, tmp_path)
 
@@ -256,7 +256,7 @@ def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("late_ms", [0.9, 1.0, 7.5, 300.0, 1000.0, 3000.0])
-def test_a_loop_that_cannot_catch_up_leaves_out_the_ticks_that_it_missed(late_ms: float) -> None:
+def test_a_loop_that_cannot_catch_up_skips_missed_ticks(late_ms: float) -> None:
     """Late by n periods at tick 500, the next tick is 500 + n, or the last one of the run."""
     clock = LateClock({500: int(late_ms * 1e6)})
     alone = Alone(clock)

@@ -49,7 +49,7 @@ class Desk:
         (22, "diverged", [], ""),  # another start is nobody
     ],
 )
-def test_a_peer_that_goes_is_lost_unless_it_said_its_end(
+def test_peer_that_goes_is_lost_unless_it_said_its_end(
     boot: int, event: str, news: list[tuple[str, str]], ended_by: str
 ) -> None:
     desk = Desk()
@@ -61,7 +61,7 @@ def test_a_peer_that_goes_is_lost_unless_it_said_its_end(
     assert (desk.told(), desk.company.ended_by) == (news, ended_by)
 
 
-def test_the_recorder_of_the_beginning_is_no_news_and_a_later_one_is_told_of_and_counted_in() -> None:
+def test_a_later_recorder_is_told_of_and_counted() -> None:
     desk = Desk()
     first = desk.comes(topics.RECORDER, 9)
     assert desk.told() == []
@@ -74,7 +74,7 @@ def test_the_recorder_of_the_beginning_is_no_news_and_a_later_one_is_told_of_and
     assert desk.company.recorders == {"10"}
 
 
-def test_a_recorder_has_all_of_a_site_when_it_says_so_of_all_its_ticks() -> None:
+def test_a_recorder_has_all_when_it_says_so() -> None:
     desk = Desk()
     desk.says(topics.RECORDER, 9, "stored", about="m1", ticks=4)
     desk.says(topics.RECORDER, 9, "stored", about="m2", ticks=5)

@@ -28,7 +28,7 @@ def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool
     return tuple(json.loads(done.stdout))
 
 
-def test_every_step_says_what_it_obtained_and_a_process_stays_on_its_processor() -> None:
+def test_every_step_says_what_it_obtained_and_pins_its_process() -> None:
     cpu = min(os.sched_getaffinity(0))
     obtained, collecting, cpus = prepared(cpu)
     assert list(obtained) == ["affinity", "timer_slack", "memory", "scheduling", "collector"]

@@ -60,7 +60,7 @@ def test_who_answers_no_ping_is_shown_without_any() -> None:
     assert not {"rtt_us", "jitter_us", "offset_ns", "bound_us"} & facts.keys()
 
 
-def test_nobody_there_is_over_after_the_time_that_it_was_given() -> None:
+def test_nobody_there_is_over_after_time_that_it_was_given() -> None:
     party = Party(("m", "s"))
     probe = Visit(party).look(2 * S)
     assert probe.report().members == []
@@ -99,7 +99,7 @@ def test_its_json_is_as_documented() -> None:
     assert is_documented("ping", ping_sites().to_dict())
 
 
-def test_the_delays_of_a_topic_of_ros_is_that_of_every_publisher() -> None:
+def test_delays_of_topic_of_ros_is_that_of_every_publisher() -> None:
     found = ping_publishers()
     first, second = found.publishers
     assert first["messages"] == 201

@@ -25,7 +25,7 @@ from .sessions import SESSION, Session
 LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 
 
-def test_stop_ends_all_sites_at_one_time_and_a_watcher_sees_them_until_then(tmp_path: Path) -> None:
+def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={})
     said: list[str] = []
     shown: list[list[SiteRow]] = []
@@ -113,7 +113,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     assert verify(log).identical == 8000
 
 
-def test_a_site_whose_peers_are_too_far_says_so_once_a_second(tmp_path: Path) -> None:
+def test_site_whose_peers_are_too_far_says_so_once_second(tmp_path: Path) -> None:
     """Their start poses are 0.4 rad apart."""
     rule = {**GLIDES, "on_stale.align_limit_rad": 0.05, "duration_s": 3.2}
     log = Session.whole(load_scenario("two_sites", rule), tmp_path).run()
@@ -123,7 +123,7 @@ def test_a_site_whose_peers_are_too_far_says_so_once_a_second(tmp_path: Path) ->
     assert set(log["s"].mode) == {"waiting"}
 
 
-def test_an_arm_whose_rule_is_not_glide_is_told_how_its_session_ends(tmp_path: Path) -> None:
+def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
     session = Session.whole(load_scenario("two_sites", {"duration_s": 2.0}), tmp_path, ends={})
     said: list[str] = []
 
@@ -141,7 +141,8 @@ def test_a_session_that_is_not_there_is_not_stopped() -> None:
         stop_session(LocalNetwork().join(), ManualClock(), "t")
 
 
-def test_who_watches_sees_a_site_come_back_and_stop_reaches_those_that_are_there(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> None:
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "rate_hz": 200}
     session = Session.whole(load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 4_000_000_000
@@ -174,7 +175,7 @@ def test_who_watches_sees_a_site_come_back_and_stop_reaches_those_that_are_there
 
 
 @pytest.mark.long
-def test_a_master_that_is_killed_is_done_without_and_taken_back(tmp_path: Path) -> None:
+def test_master_that_is_killed_is_done_without_and_taken_back(tmp_path: Path) -> None:
     """It dies 3 s after the beginning and is started again 4 s later; the others never hold."""
     rule = {**GLIDES, "on_stale.on_lost": "degrade", "rate_hz": 200, "duration_s": 12.0}
     session = Session.whole(load_scenario("paper", rule), tmp_path, ends={})

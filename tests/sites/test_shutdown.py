@@ -40,7 +40,7 @@ def test_how_long_a_site_stays(stay_s: float, after: str, least_s: int, most_s: 
         assert least_s * S < session.left_ns[name] - session.left_ns[after] < most_s * S
 
 
-def test_a_signal_ends_the_wait_and_spoils_no_run_that_was_complete(tmp_path: Path) -> None:
+def test_signal_ends_wait_and_spoils_no_run_that_was_complete(tmp_path: Path) -> None:
     session = ending(tmp_path, 120.0)
 
     def ask(clock: RelayClock) -> None:

@@ -49,9 +49,7 @@ def heard(session: Session, sites: Sequence[str]) -> tuple[dict[str, list[bytes]
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )
-def test_samples_are_the_records_of_their_ticks_and_blocks_hold_ten_milliseconds(
-    scenario: Scenario, tmp_path: Path
-) -> None:
+def test_samples_are_records_and_blocks_hold_ten_milliseconds(scenario: Scenario, tmp_path: Path) -> None:
     session = Session.whole(scenario, tmp_path)
     samples, blocks = heard(session, scenario.names)
     log = session.run()

@@ -34,7 +34,7 @@ def records(path: Path) -> dict[str, int]:
         return Counter(item.topic for item in McapReader(stream, str(path)).messages())
 
 
-def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(tmp_path: Path) -> None:
+def test_records_sent_100_ms_before_a_crash_are_filed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     session = session_of(tmp_path, 0.4)
     looks: list[tuple[int, int]] = []
@@ -59,7 +59,7 @@ def test_whenever_the_recorder_dies_what_was_sent_100_ms_before_is_in_the_file(t
 
 
 @pytest.mark.parametrize("room", range(160_000, 300_000, 45_000))
-def test_on_a_full_disk_the_accounts_are_those_of_what_is_in_the_file(
+def test_on_a_full_disk_accounts_match_the_file(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
@@ -107,7 +107,7 @@ def test_a_session_in_parts_is_the_session(tmp_path: Path) -> None:
         assert any(f"received {known}, missing 0" in said for known in (made, made + 1))
 
 
-def test_what_is_left_out_is_neither_in_the_file_nor_missing(tmp_path: Path) -> None:
+def test_what_is_left_out_is_neither_in_file_nor_missing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     choice = ChannelFilter(("**/m/**", "**/s/event"), ("**/link",))
     log = session_of(tmp_path, 0.3, LogStorage(path, choice=choice)).run()

@@ -98,9 +98,7 @@ def workers_of(cluster: Cluster) -> int:
 
 @pytest.mark.long
 @pytest.mark.timeout(120)
-def test_a_sweep_on_two_workers_of_which_one_is_killed_gives_the_same_bytes(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(cluster: Cluster, tmp_path: Path) -> None:
     run_on_cluster(cluster, tmp_path, 300)
 
 
@@ -132,9 +130,7 @@ def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_worker_with_another_program_is_refused_also_one_that_joins_later(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_a_worker_with_another_program_is_refused_even_later(cluster: Cluster, tmp_path: Path) -> None:
     shutil.copytree(
         ROOT / "trilat_net", tmp_path / "trilat_net", ignore=shutil.ignore_patterns("__pycache__")
     )

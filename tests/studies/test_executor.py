@@ -23,7 +23,7 @@ def test_any_executor_gives_the_results_of_this_process() -> None:
         assert list(pool.each(abs, [-3, 2])) == [(0, 3), (1, 2)]
 
 
-def test_few_items_are_taken_at_a_time_however_many_there_are() -> None:
+def test_few_items_are_taken_at_time_however_many_there_are() -> None:
     taken: list[int] = []
 
     def items() -> Iterator[int]:
@@ -39,7 +39,7 @@ def test_few_items_are_taken_at_a_time_however_many_there_are() -> None:
     assert len(taken) < 2000
 
 
-def test_batches_take_as_long_as_measured_items_allow_and_shrink_at_the_end() -> None:
+def test_batches_fit_the_measured_time_and_shrink_at_the_end() -> None:
     feed = _Feed(range(2000), 2000, 2)
     assert len(feed.take(idle=True)) == 1
     feed.measure(10, 0.2)
@@ -100,7 +100,7 @@ def test_items_of_a_lost_worker_run_again(tmp_path: Path) -> None:
         assert pool.map(abs, [-1, -2]) == [1, 2]
 
 
-def test_an_item_that_ends_every_worker_is_named_or_gets_its_own_result() -> None:
+def test_an_item_that_ends_every_worker_is_named() -> None:
     pool = WorkerPool(FragileExecutor(), 2, FragileExecutor, hint="; what to do")
     with pytest.raises(RunFailed, match=f"^7 ended {MAX_LOSSES} worker processes; what to do$"):
         pool.map(abs, range(30))

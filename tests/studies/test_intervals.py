@@ -76,7 +76,7 @@ def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
     assert report.results[-1].trial.scenario == again
 
 
-def test_a_trial_of_a_distribution_names_the_command_that_repeats_it(file: Path) -> None:
+def test_trial_of_distribution_names_command_that_repeats_it(file: Path) -> None:
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
     words = shlex.split(trial.look)
     settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]

@@ -65,7 +65,7 @@ def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.long
-def test_a_law_of_ones_own_is_tuned_and_swept_as_the_built_in_one(tmp_path: Path) -> None:
+def test_a_users_law_is_tuned_and_swept_as_built_in(tmp_path: Path) -> None:
     """The same numbers: it computes what p_d does, and both get the same candidates."""
     found = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
     ours, theirs = (one.scores for one in found.found)

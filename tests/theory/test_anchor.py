@@ -66,7 +66,7 @@ def test_what_the_derivation_integrates_is_conserved(name: str) -> None:
         assert np.abs(kept - kept[0]).max() < 1e-4
 
 
-def test_a_hand_sees_a_spring_of_115_nm_per_rad_and_arm() -> None:
+def test_hand_sees_spring_of_115_nm_per_rad_and_arm() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T), 115.5 N m/rad level; a push at one site moves all three by a third."""
     push_nm = 15.0
     hands = [{"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}]
@@ -82,7 +82,7 @@ def test_a_hand_sees_a_spring_of_115_nm_per_rad_and_arm() -> None:
     assert stiffness == pytest.approx(level * np.cos(middle) ** 2, rel=0.01)
 
 
-def test_a_small_gain_has_no_such_pose_and_the_arms_hang() -> None:
+def test_small_gain_has_no_such_pose_and_arms_hang() -> None:
     """Gamma = 0.1: |sin q1(inf)| would have to be 1.7."""
     hanging = load_scenario("paper", {"control.Gamma": 0.1}).without_hands()
     assert predicted("paper", 0.2)[0] / 0.1 < -1.0

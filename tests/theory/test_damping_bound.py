@@ -68,7 +68,7 @@ def test_the_common_motion_asks_for_its_share_at_one_mass() -> None:
     [(LAB, (1.0, 0.5, 0.667), 20.0, 0.25, 0.127), (RING, (1.0, 1.0, 1.0), 200.0, 4.0, 0.134)],
     ids=["lab sheet", "one way"],
 )
-def test_shares_that_are_not_reversible_have_no_bound_and_none_is_given(
+def test_irreversible_shares_have_no_bound(
     alpha: Any, masses: Any, delay_ms: float, d: float, growth_per_s: float
 ) -> None:
     """d is above abs(lambda_min) K T for the first; the second has lambda = exp(2 pi j / 3)."""
@@ -81,7 +81,7 @@ def test_shares_that_are_not_reversible_have_no_bound_and_none_is_given(
     assert count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
 
 
-def test_of_seven_equal_shares_the_common_motion_asks_for_more_than_their_least_eigenvalue() -> None:
+def test_seven_equal_shares_ask_more_than_their_least_eigenvalue() -> None:
     """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
     lacking, enough = (evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44))
     assert lacking is not None
@@ -120,7 +120,7 @@ def test_it_is_the_edge_itself_at_the_worst_mass(count: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 3])
-def test_of_few_ticks_it_is_the_edge_of_the_loop_as_computed(ticks: int) -> None:
+def test_of_few_ticks_it_is_edge_of_loop_as_computed(ticks: int) -> None:
     """Errata 13: 0.667 K h for one tick, and any masses above d h."""
     criterion = evaluate_criterion(position_network(equal(3), d=0.0, delay_ms=float(ticks)))
     assert criterion is not None
@@ -141,7 +141,7 @@ def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0))
     return spectrum.rightmost
 
 
-def test_pd_d_keeps_the_bound_while_error_damping_and_stiffness_have_one_ratio() -> None:
+def test_pd_d_of_one_ratio_keeps_the_bound() -> None:
     rng = np.random.default_rng(5)
     for _ in range(60):
         K = 10.0 ** rng.uniform(0.0, 2.0, 2)
@@ -153,7 +153,7 @@ def test_pd_d_keeps_the_bound_while_error_damping_and_stiffness_have_one_ratio()
         assert root is None or root.s.real < 1e-9
 
 
-def test_pd_d_with_another_ratio_at_either_site_grows_above_the_bound() -> None:
+def test_pd_d_of_another_ratio_grows_above_the_bound() -> None:
     assert 4.0 * 11.8 * 0.356 > (2.0 * 0.2 * 10.0) ** 2
     root = pair_with_error_damping((11.8, 0.356), (307.0, 0.0), (0.58, 0.17))
     assert root.s.real == pytest.approx(0.55, abs=0.01)
@@ -224,7 +224,7 @@ def growth(count: int, ticks: int, d: float, mass: float) -> float:
     return float(max(rates))
 
 
-def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
+def test_held_torques_ask_for_more_than_bound_of_continuous_time() -> None:
     """K 50, d 2 at 30 Hz over a tick: 1.667 would do in continuous time."""
     assert judged(2, 1, 3.33).holds is False
     assert judged(2, 1, 3.34).holds
@@ -234,7 +234,7 @@ def test_held_torques_ask_for_more_than_the_bound_of_continuous_time() -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 5, 7])
 @pytest.mark.parametrize("ticks", [1, 2, 3, 20])
-def test_the_bound_of_held_torques_is_that_of_the_worst_mass(count: int, ticks: int) -> None:
+def test_bound_of_held_torques_is_that_of_worst_mass(count: int, ticks: int) -> None:
     """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
     text = judged(count, ticks, 1e3).text
     sides = K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])

@@ -11,7 +11,8 @@ from tests.virtual_runs import sampled
 from trilat_net.scenario import load_scenario
 
 
-def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
+@pytest.mark.long
+def test_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
     """The hands-free start of Section IV: with theta_hat(0) = 0 both joints fall with (-g, +g)."""
     paper = exact("paper")
     first = paper.rate(0.0, paper.past(-1.0).ravel()).reshape(3, 9)
@@ -24,13 +25,16 @@ def test_the_reference_solution_holds_more_digits_than_it_is_asked_for() -> None
 
 @pytest.mark.parametrize(
     ("name", "bound"),
-    [("paper", 1e-5), pytest.param("paper_rods", 1e-5, marks=pytest.mark.long), ("free", 1.1e-5)],
+    [
+        ("paper", 1e-5),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in (("paper_rods", 1e-5), ("free", 1.1e-5))),
+    ],
 )
-def test_second_order_is_within_1e_5_rad_of_the_exact_solution(name: str, bound: float) -> None:
+def test_second_order_is_within_1e_5_rad_of_exact_solution(name: str, bound: float) -> None:
     assert distance(name, "second_order", 1000) <= bound
 
 
-def test_a_delay_one_tick_off_is_not_what_this_comparison_can_show() -> None:
+def test_this_comparison_shows_a_delay_one_tick_off() -> None:
     """It moves q by some 5e-4 rad, below what `digital` is off: the bookkeeping has tests of its own."""
     early, right, late = (
         sampled(load_scenario("paper", {"link.delay_ms": delay_ms}), TIMES_S)[..., :2]

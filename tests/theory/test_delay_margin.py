@@ -72,7 +72,7 @@ def test_roots_at_zero_cross_nothing() -> None:
     assert found.words == "stable for every common delay up to 10 s"
 
 
-def test_force_reflection_in_contact_has_a_margin_between_calm_and_hammering() -> None:
+def test_force_reflection_in_contact_has_margin_between_calm_and_hammering() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
     found = find_delay_margin(

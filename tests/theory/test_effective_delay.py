@@ -18,7 +18,7 @@ def scenario(**link: object) -> Scenario:
 
 
 @given(delay_ms=st.floats(0, 500), rate_hz=st.sampled_from([100, 300, 1000]))
-def test_a_constant_delay_is_in_use_from_the_next_tick_on(delay_ms: float, rate_hz: int) -> None:
+def test_constant_delay_is_in_use_from_next_tick_on(delay_ms: float, rate_hz: int) -> None:
     chosen = load_scenario("two_sites", {"link.delay_ms": delay_ms, "rate_hz": rate_hz})
     age = compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])
     ticks = age.mean_s * rate_hz

@@ -6,7 +6,7 @@ import trilat_net as tn
 from trilat_net.theory.end_pose import find_end_pose_roots
 
 
-def test_of_several_rates_the_roots_are_exact_and_those_of_the_scenario() -> None:
+def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
     """Both sites end where they start, a millionth apart: folded, as they begin."""
     pair = {
         "sites.m.rate_hz": 40,
@@ -24,7 +24,7 @@ def test_of_several_rates_the_roots_are_exact_and_those_of_the_scenario() -> Non
     assert found.text.endswith("rad/s, over the period of 0.1 s")
 
 
-def test_of_drawn_delays_the_roots_are_those_of_the_samples_that_the_log_has_in_use() -> None:
+def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
     """Its last quarter begins 15 s later than the draws of the linear analysis: they are others."""
     run = {"rate_hz": 200, "duration_s": 40.0}
     found, whole = find_end_pose_roots(tn.simulate("jitter", run)), tn.linear("jitter", run, ports=False)

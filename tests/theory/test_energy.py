@@ -33,7 +33,7 @@ def test_the_hands_do_work_that_the_balance_needs() -> None:
 
 
 @pytest.mark.long
-def test_beta_of_ones_does_not_close_it_where_the_columns_do_not_sum_to_one() -> None:
+def test_beta_of_ones_fails_unless_columns_sum_to_one() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): that is the right null vector, not the left one."""
     made = run("asymmetric", {"duration_s": DURATION_S})
     assert balance(made, np.full(3, 1 / 3)).residual > 1e-2
@@ -56,7 +56,7 @@ def test_v_rises_while_a_hand_pushes() -> None:
 
 
 @pytest.mark.long
-def test_sites_may_scale_kd_if_beta_is_divided_by_the_scale() -> None:
+def test_sites_may_scale_kd_if_beta_is_divided_by_scale() -> None:
     """Kd_i = c_i Kbar needs beta_i = pi_i / c_i; the paper's ones let V rise by a third of itself."""
     scale = {"m1": 10.0, "m2": 3.0, "s": 0.3}
     rows = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}

@@ -35,7 +35,8 @@ def test_a_run_that_settles_rests_where_it_ends() -> None:
     assert "the run is at rest" in found.how
 
 
-def test_a_run_that_diverges_rests_where_its_linear_loop_would_take_it() -> None:
+@pytest.mark.long
+def test_a_diverging_run_rests_where_its_linear_loop_goes() -> None:
     """Equal gains: what is kept is the mean of the start poses."""
     scenario = load_scenario("p_d_margin", {**TRIO, "control.d": 0.1, "link.delay_ms": 400.0})
     found = find_equilibrium(scenario)
@@ -45,7 +46,7 @@ def test_a_run_that_diverges_rests_where_its_linear_loop_would_take_it() -> None
     assert found.q == pytest.approx(predict_equilibrium(scenario).q)
 
 
-def test_what_is_kept_weighs_the_sites_by_their_damping_and_delay() -> None:
+def test_what_is_kept_weighs_sites_by_their_damping_and_delay() -> None:
     """The pose that the linear loop foretells is that in which a run ends."""
     scenario = load_scenario(
         "p_d_margin_two", {**TRIO, "sites.m.control.d": 9.0, "sites.s.control.d": 4.0, "duration_s": 60.0}
@@ -74,7 +75,7 @@ def test_a_pose_of_ones_own_is_taken_as_it_is() -> None:
     assert found.notes == ()
 
 
-def test_a_pose_that_is_no_rest_is_said_to_be_none() -> None:
+def test_pose_that_is_no_rest_is_said_to_be_none() -> None:
     (note,) = find_equilibrium(load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)).notes
     assert "the pose is no equilibrium" in note
 
@@ -85,7 +86,7 @@ def test_a_torque_beyond_the_clamp_is_said() -> None:
     assert all("its clamp is 5" in note for note in notes)
 
 
-def test_a_rest_moves_along_with_a_key_and_stays_where_the_key_does_not_move_it() -> None:
+def test_a_rest_moves_along_with_a_key_that_moves_it() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, (0.3, 0.0))
     assert follow_equilibrium(load_scenario(scenario, {"control.d": 1.0}), rest).q.tolist() == rest.q.tolist()

@@ -84,7 +84,7 @@ def chain(constant: bool) -> Any:
     return sp.expand(sp.expand_trig(x.chain.subs(still)))
 
 
-def test_eq_17_has_the_other_sign_and_half_of_the_last_term() -> None:
+def test_eq_17_has_other_sign_and_half_of_last_term() -> None:
     """Errata 5, Eq. (17), and 9: the hands' power is r'tau_h, not qd'tau_h."""
     x = rates()
     right = -norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed / 2
@@ -97,7 +97,7 @@ def test_eq_17_has_the_other_sign_and_half_of_the_last_term() -> None:
     assert not zero(chain(True) - right - dot(QD, x.hand))
 
 
-def test_eq_19_does_not_follow_from_eq_17_and_what_does() -> None:
+def test_eq_19_does_not_follow_from_eq_17() -> None:
     """Errata 5, Eq. (19): halves, and the other sign of the last two norms."""
     x = rates()
     stored = norm(QD, x.Kd) - sum(a * norm(u, x.Kd) for a, u in zip(x.alpha, x.qd_j, strict=True))

@@ -39,7 +39,7 @@ def theta_24(n: dict[str, Any], last: Any) -> list[Any]:
     return [first, n["m2"] * n["l1"] * n["lc2"], outer, gravity4, last]
 
 
-def test_theta_5_is_m2_lc2_and_eq_24_prints_the_length_of_the_link() -> None:
+def test_theta_5_is_m2_lc2_unlike_eq_24() -> None:
     """Errata 1, Eq. (24)."""
     torque, n = lagrange()
     ours = forces(QD, pair("a"))

@@ -40,7 +40,7 @@ def perron(alpha: Any) -> Any:
 # --- 6: beta --------------------------------------------------------------------------------------------
 
 
-def test_beta_is_the_left_null_vector_and_ones_the_right_one() -> None:
+def test_beta_is_left_null_vector_and_ones_right_one() -> None:
     """Errata 6, after Eq. (20)."""
     assert (PI * UPSILON).expand() == sp.zeros(1, 3)
     assert (UPSILON * ONES.T).expand() == sp.zeros(3, 1)
@@ -53,7 +53,7 @@ def test_ones_work_on_one_parameter_of_the_three() -> None:
     assert found == {A12: 1 - A21, A31: 1 - A21}
 
 
-def test_eq_22_has_the_other_sign_of_what_eq_21_ends_with() -> None:
+def test_eq_22_has_the_other_sign_of_eq_21() -> None:
     """Errata 6, Eq. (21)-(23): it goes unnoticed as the term is zero, if beta is right."""
     beta = sp.Matrix([sp.symbols("b1:4", positive=True)])
     ends = sum(beta[i] * (SQUARES[i] - (ALPHA * SQUARES)[i]) for i in range(3))
@@ -78,7 +78,7 @@ def test_with_ones_v_can_rise() -> None:
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 6])
-def test_the_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: int) -> None:
+def test_programs_weights_are_left_eigenvectors_for_any_number_of_sites(size: int) -> None:
     """Errata 6, N sites."""
     alpha = shares(np.random.default_rng(size), size)
     assert left_perron_vector(alpha) == pytest.approx(perron(alpha), rel=1e-9)
@@ -104,7 +104,7 @@ def feasible(alpha: Any, Kd: Any) -> bool:
     return bool(found.status == 0)
 
 
-def test_kd_may_differ_by_a_scalar_per_site_and_by_nothing_else() -> None:
+def test_kd_may_differ_by_a_scalar_per_site_only() -> None:
     """Errata 7: beta_i = pi_i / c_i; of another shape there is no beta, not even for V' <= 0."""
     alpha, c = shares(np.random.default_rng(3), 3), np.array([10.0, 3.0, 0.3])
     common = c[:, np.newaxis] * [2.0, 5.0]
@@ -114,7 +114,7 @@ def test_kd_may_differ_by_a_scalar_per_site_and_by_nothing_else() -> None:
     assert not feasible(alpha, np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]]))
 
 
-def test_there_is_no_slack_not_even_with_other_weights_in_the_integrals() -> None:
+def test_no_weights_of_the_integrals_leave_slack() -> None:
     """Errata 7: with w_ij in the integral what is left sums to alpha_ij (k_i - w_ij)^2 / (2 w_ij) >= 0."""
     k, w = sp.symbols("k w", positive=True)
     own, seen = sp.symbols("own seen", real=True)
@@ -127,7 +127,7 @@ def test_there_is_no_slack_not_even_with_other_weights_in_the_integrals() -> Non
 # --- 9: hands -------------------------------------------------------------------------------------------
 
 
-def test_a_wall_that_is_passive_at_its_contact_gives_energy_to_v() -> None:
+def test_a_passive_wall_gives_energy_to_v() -> None:
     """Errata 9: at rest in a wall, held there by its peers, qd'tau_h = 0 and r'tau_h = Lambda e'tau_h > 0."""
     wall = TorqueSource(TorqueKind.WALL, a=(1.1, 0.0), b=(-1.0, 0.0), K=(2000.0, 0.0))
     rows, table = torque_source_rows((wall,))

@@ -12,7 +12,7 @@ HELD = ((13.0, 15.0, "m1"), (38.0, 40.0, "m2"), (52.0, 54.0, "m2"))
 
 
 @pytest.mark.long
-def test_a_hand_feels_the_load_times_beta_of_the_slave_over_its_own() -> None:
+def test_hand_feels_load_times_beta_of_slave_over_its_own() -> None:
     """Of 5 N m on the slave: 4.79 at the expert, 16.4 at the trainee, 5.00 with all shares 1/2; 2 %."""
     b1, b2, bs = left_null_vector(load_scenario("force_sharing"))
     made = measured("force_sharing", {}, *HELD)

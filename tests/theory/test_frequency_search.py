@@ -17,7 +17,7 @@ HZ = 2.0 * np.pi
 
 
 @given(low_hz=st.floats(1e-4, 1.0), decades=st.floats(0.1, 5.0), delay_s=st.floats(0.0, 3.0))
-def test_a_grid_spans_its_band_in_order_and_follows_a_round_trip(
+def test_grid_spans_its_band_in_order_and_follows_round_trip(
     low_hz: float, decades: float, delay_s: float
 ) -> None:
     high_hz = low_hz * 10.0**decades
@@ -30,9 +30,7 @@ def test_a_grid_spans_its_band_in_order_and_follows_a_round_trip(
 
 
 @given(at_hz=st.floats(0.01, 10.0), width=st.floats(0.002, 1.0))
-def test_a_dip_is_found_to_a_percent_though_the_grid_steps_over_its_bottom(
-    at_hz: float, width: float
-) -> None:
+def test_a_dip_between_grid_points_is_found_to_a_percent(at_hz: float, width: float) -> None:
     """A Lorentzian whose half width is down to a thirtieth of the grid's steps."""
 
     def curve(w: Array) -> Array:
@@ -46,7 +44,7 @@ def test_a_dip_is_found_to_a_percent_though_the_grid_steps_over_its_bottom(
     assert span.to_hz == pytest.approx(min(100.0, at_hz * np.exp(3.0 * width)), rel=1e-6)
 
 
-def test_ranges_below_a_level_have_the_edges_of_the_curve_and_those_of_the_band() -> None:
+def test_ranges_below_a_level_have_the_edges_of_the_curve() -> None:
     found = find_minima(np.cos, HZ * np.linspace(0.01, 2.0, 200), level=0.5)
     expected = [(1 / 6, 5 / 6), (7 / 6, 11 / 6)]
     np.testing.assert_allclose(found.below, np.array(expected), rtol=1e-6)
@@ -56,7 +54,7 @@ def test_ranges_below_a_level_have_the_edges_of_the_curve_and_those_of_the_band(
     np.testing.assert_allclose(ended.below, [(0.5, 0.9)], rtol=1e-6)
 
 
-def test_what_is_below_by_less_than_the_tolerance_is_not_below() -> None:
+def test_what_is_below_by_less_than_tolerance_is_not_below() -> None:
     def shallow(w: Array) -> Array:
         return np.full(len(w), -1e-9)
 
@@ -65,7 +63,7 @@ def test_what_is_below_by_less_than_the_tolerance_is_not_below() -> None:
     assert find_minima(shallow, w).below
 
 
-def test_a_band_that_is_wide_for_its_delay_is_followed_in_part_and_says_so() -> None:
+def test_a_band_too_wide_for_its_delay_is_followed_partly() -> None:
     assert find_resolved_hz(1e-3, 100.0, 0.2) == 100.0
     assert find_resolved_hz(1e-3, 100.0, 1.6) == 100.0
     assert find_resolved_hz(1e-3, 1000.0, 1.6) == pytest.approx(1.3, rel=0.05)
@@ -94,7 +92,7 @@ def test_an_undamped_resonance_ends_the_refinement() -> None:
     assert len(w) < 6000
 
 
-def test_an_answer_that_is_remembered_is_the_same_and_asked_once() -> None:
+def test_answer_that_is_remembered_is_same_and_asked_once() -> None:
     asked: list[int] = []
     Y = build_admittance(pair().loop)
 

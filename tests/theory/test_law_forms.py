@@ -96,7 +96,7 @@ def test_roots_of_a_wave_line_are_those_of_its_delays(wall: float) -> None:
         assert inside
 
 
-def test_a_wave_line_feels_like_a_mass_and_like_a_spring() -> None:
+def test_wave_line_feels_like_mass_and_like_spring() -> None:
     """LAWS of lines: of a free slave both masses and b T; clamped rigidly at .1 Hz 51.88 N m s/rad."""
     free = loop_of(wave_pair(held=False))
     slow, fast = (2j * np.pi * hz for hz in (0.01, 0.1))
@@ -160,7 +160,7 @@ def solves(f: Callable[[complex], complex], s: complex) -> bool:
     return abs(f(s) / ((f(s + 1e-6) - f(s - 1e-6)) / 2e-6)) < 1e-6 * (1.0 + abs(s))
 
 
-def test_a_predictor_of_the_true_model_has_the_roots_of_no_delay() -> None:
+def test_predictor_of_true_model_has_roots_of_no_delay() -> None:
     """s^2 + d s + 2 K, and of the slave s^2 + d s + K, along the mass that the model has."""
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
@@ -222,7 +222,7 @@ def test_synchronised_outputs_have_the_roots_of_their_consensus() -> None:
     assert all(solves(consensus, root) for root in others)
 
 
-def test_laws_that_switch_by_energy_say_why_they_have_no_roots() -> None:
+def test_laws_that_switch_by_energy_say_why_they_lack_roots() -> None:
     for law, why in (("tanks", "tank"), ("tdpa", "second order")):
         with pytest.raises(ScenarioError, match=why):
             loop_of(unit_scenario({"m": {}, "s": {}}, {"law": law}))
@@ -236,7 +236,7 @@ def test_the_analysis_of_waves_is_whole() -> None:
     assert found.margin.words.startswith("stable for every common delay")
 
 
-def test_arms_that_a_line_holds_against_hands_are_at_rest_there() -> None:
+def test_arms_that_line_holds_against_hands_are_at_rest_there() -> None:
     """A line between passive ends has no root to the right: its torque balances that of the operator."""
     follows = {"sites.s.control.K": 100.0, "sites.s.control.B": 10.0, "duration_s": 6.0}
     scenario = load_scenario("two_sites", {"control.law": "wave", "scheme": "digital", **follows})

@@ -45,7 +45,7 @@ def test_less_damping_than_the_edge_is_unstable() -> None:
     assert describe_linear_verdict(found).startswith("unstable: the slowest motion goes as exp(0.01")
 
 
-def test_the_verdict_is_that_of_the_loop_as_it_is_computed(digital: LinearAnalysis) -> None:
+def test_verdict_is_that_of_loop_as_it_is_computed(digital: LinearAnalysis) -> None:
     assert digital.continuous.verdict == "stable"
     assert digital.verdict == "unstable"
     assert any("the tick rate decides" in note for note in digital.notes)
@@ -96,7 +96,7 @@ def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
     assert told["as_computed"]["deviation_per_s"] is told["continuous"]["span_s"] is None
 
 
-def test_delays_that_are_drawn_tell_how_well_their_roots_are_known() -> None:
+def test_drawn_delays_tell_how_well_their_roots_are_known() -> None:
     found = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
     assert found.sampled is not None
     assert found.sampled.deviation_per_s is not None
@@ -115,6 +115,7 @@ def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
     )
 
 
+@pytest.mark.long
 def test_a_line_without_losses_has_no_margin() -> None:
     """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
     control = {"law": "wave", "b": 60.0, "K": 0.0}

@@ -242,7 +242,7 @@ def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
     assert np.abs(found - Y).max() <= 0.01 * np.abs(Y).max()
 
 
-def test_the_law_is_passive_in_r_for_six_joints_as_its_theorem_says() -> None:
+def test_the_law_is_passive_in_r_for_six_joints() -> None:
     """Also where gravity is learnt, which is not passive in qd at the joints that it loads."""
     case = six("adaptive")
     ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
@@ -261,7 +261,7 @@ def test_a_pose_has_an_angle_for_each_joint() -> None:
 
 
 @pytest.mark.long
-def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
+def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
 
     def damped(d: float, **overrides: Any) -> Linear:
@@ -279,7 +279,8 @@ def test_the_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     assert evaluate_criterion(damped(1.05, **{"arm.armature_kg_m2": 0.001}).scenario) is None
 
 
-def test_a_run_that_diverges_has_the_rest_that_its_start_predicts() -> None:
+@pytest.mark.long
+def test_run_that_diverges_has_rest_that_its_start_predicts() -> None:
     """Of alike arms with alike gains it is near the mean of the start poses."""
     case = six("adaptive", 0.3 * OFF)
     found = predict_equilibrium(case.scenario)

@@ -72,7 +72,7 @@ def heavy_pair(seed: int, ratio: Callable[[float, float, float, float], float]) 
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))])
-def test_two_sites_turn_stable_at_4_d_d_for_the_arms_that_need_most(seed: int) -> None:
+def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2, where M2/M1 is the ratio that needs the most damping."""
 
     def worst(K1: float, K2: float, d1: float, d2: float) -> float:
@@ -86,7 +86,7 @@ def test_two_sites_turn_stable_at_4_d_d_for_the_arms_that_need_most(seed: int) -
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))])
-def test_two_like_arms_turn_stable_where_d1_over_k2_and_d2_over_k1_make_the_round_trip(seed: int) -> None:
+def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_: 1.0)
     exact = K1 * (T - d1 / K2)
@@ -99,7 +99,7 @@ def test_two_like_arms_turn_stable_where_d1_over_k2_and_d2_over_k1_make_the_roun
 
 
 @pytest.mark.long
-def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_none() -> None:
+def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> None:
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
     rest = find_equilibrium(scenario, (-0.1729, 0.0874))
@@ -113,7 +113,7 @@ def test_a_digital_controller_has_a_least_rate_where_the_continuous_loop_has_non
 
 
 @pytest.mark.long
-def test_nothing_is_found_where_nothing_changes_and_all_is_found_where_much_does() -> None:
+def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
     scenario = load_scenario("p_d_margin")
     assert next(iterate_linear_edges(scenario, "control.d", 1.2, 3.0, points=4), None) is None
     found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))

@@ -31,7 +31,7 @@ def rightmost(overrides: dict[str, float]) -> complex:
     return root.s
 
 
-def test_states_inputs_and_outputs_are_in_the_order_of_the_scenario() -> None:
+def test_states_inputs_and_outputs_are_in_order_of_scenario() -> None:
     scenario = load_scenario("contact")
     found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8)))
     assert found.names == ("m.q1", "m.q2", "m.qd1", "m.qd2", "s.q1", "s.q2", "s.qd1", "s.qd2")
@@ -103,7 +103,7 @@ def test_a_run_decays_as_its_rightmost_root_says() -> None:
 
 
 @pytest.mark.long
-def test_a_rest_with_wrong_estimates_can_be_unstable_and_the_run_leaves_it_for_another() -> None:
+def test_an_unstable_rest_with_wrong_estimates_is_left_for_another() -> None:
     """The theorem says that every run settles, not that every rest is stable.
 
     The estimates of a run without delay, at 100 ms: a small swing grows as its root says, the estimates move

@@ -151,7 +151,7 @@ cases = pytest.mark.parametrize(
 
 
 @cases
-def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(name: str) -> None:
+def test_small_deviation_goes_tick_by_tick_as_run_does(name: str) -> None:
     """The companion matrix carries it on; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
     (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
@@ -193,7 +193,7 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
 
 
 @cases
-def test_the_law_is_passive_in_r_at_the_end_effectors_as_its_theorem_says(name: str) -> None:
+def test_the_law_is_passive_in_r_at_the_end_effectors(name: str) -> None:
     """Of places, also with axes left open and with joints to spare; of poses there is no proof."""
     scenario, rest = settled(name)
     ports = analyse_ports(scenario, rest, band_hz=(0.01, 20.0))
@@ -236,7 +236,7 @@ def test_poses_that_have_no_loop_are_refused_by_name() -> None:
         find_equilibrium(scenario, (2.5, 0.0))
 
 
-def test_a_rest_near_a_singular_pose_has_its_damping_in_the_loop() -> None:
+def test_rest_near_singular_pose_has_its_damping_in_loop() -> None:
     scenario = parse_scenario(planar_task(), "planar", {"task.singular_value": 0.9})
     found = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
     assert any("rests near a singular pose" in note for note in found.notes)

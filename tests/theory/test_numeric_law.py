@@ -31,7 +31,7 @@ def roots(found: Spectrum) -> Array:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("law", [PD, PeerPD])
-def test_p_d_of_ones_own_has_the_roots_of_p_d(law: type, scheme: str) -> None:
+def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
     ours, theirs = linear("p_d", scheme=scheme), linear(law, scheme=scheme)
     assert ours.sampled is not None
     assert theirs.sampled is not None

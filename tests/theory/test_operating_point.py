@@ -19,7 +19,7 @@ def test_shares_and_links_are_those_at_the_end() -> None:
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
 
 
-def test_hands_that_have_let_go_are_not_there_and_those_that_hold_are() -> None:
+def test_only_hands_that_hold_are_in_the_operating_point() -> None:
     assert not any(site.actors for site in derive_operating_conditions(load_scenario("paper")).sites)
     pushed = derive_operating_conditions(load_scenario("paper", {"duration_s": 3.5}))
     (pulse,) = pushed.sites[0].actors
@@ -30,7 +30,7 @@ def test_hands_that_have_let_go_are_not_there_and_those_that_hold_are() -> None:
     assert any("still moves at the end" in note for note in moving.notes)
 
 
-def test_two_recorded_torques_stay_as_they_are_and_one_that_swings_is_left_out() -> None:
+def test_two_recorded_torques_stay_and_a_swinging_one_is_omitted() -> None:
     recorded = [{"kind": "recorded", "points": [[0.0, push, 0.0], [60.0, push, 0.0]]} for push in (1.0, 2.0)]
     swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
     scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})

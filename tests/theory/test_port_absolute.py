@@ -39,7 +39,7 @@ def test_springs_and_dampers_between_two_sites_hold_without_a_delay(K: float, B:
 
 
 @pytest.mark.parametrize("d", [0.4, 1.0, 1.6])
-def test_with_a_delay_p_d_fails_up_to_where_its_sine_says(d: float) -> None:
+def test_with_a_delay_p_d_fails_below_its_sine(d: float) -> None:
     """2 d^2 >= abs(z12 z21) + Re(z12 z21) = 2 K^2 sin^2(w T) / w^2."""
     edge_rad_s = brentq(lambda w: 10.0 * np.sin(0.2 * w) / w - d, 1e-6, np.pi / 0.2)
     (span,) = criterion(pair(d=(d, d))).below[:1]
@@ -49,7 +49,7 @@ def test_with_a_delay_p_d_fails_up_to_where_its_sine_says(d: float) -> None:
 
 
 @given(seed=SEEDS)
-def test_the_criterion_is_that_of_its_three_inequalities_in_admittance_and_in_impedance(seed: int) -> None:
+def test_the_criterion_is_its_three_inequalities_in_both_forms(seed: int) -> None:
     Y = drawn(seed, 2)
     Y[::3, 0, 0] -= 0.4
     for parameters in (Y, np.linalg.inv(Y)):
@@ -64,7 +64,7 @@ def test_the_criterion_is_that_of_its_three_inequalities_in_admittance_and_in_im
         np.testing.assert_array_equal((llewellyn_parameter(Y) >= 1.0)[clear], holds[clear])
 
 
-def test_the_parameter_is_bounded_where_nothing_passes_and_at_most_minus_one_where_a_port_is_active() -> None:
+def test_the_parameter_is_minus_one_at_most_with_active_ports() -> None:
     Y = np.array([[[1.0, 0.0], [5.0, 1.0]], [[-1.0, 0.1], [0.1, -1.0]]], dtype=np.complex128)
     np.testing.assert_array_equal(llewellyn_parameter(Y), [MAX_LLEWELLYN, -1.0])
 
@@ -104,7 +104,7 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
 
 @settings(max_examples=4, deadline=None)
 @given(seed=SEEDS)
-def test_for_three_ports_the_best_weights_fail_exactly_where_passive_hands_make_a_pole(seed: int) -> None:
+def test_for_three_ports_the_weights_fail_at_passive_hands_poles(seed: int) -> None:
     """Necessary and sufficient: a search among passive loads finds one where and only where no weights do."""
     Y = drawn(seed, 3)
     margin = find_best_weights(Y, np.array([0, 1, 2])).margin
@@ -141,7 +141,7 @@ def test_one_site_needs_no_weights() -> None:
 
 
 @given(seed=SEEDS)
-def test_what_is_left_at_some_ports_is_a_part_of_the_admittance_or_of_the_impedance(seed: int) -> None:
+def test_what_remains_of_ports_is_part_of_a_matrix(seed: int) -> None:
     """Hands off: rows and columns of Y fall away. Clamped: those of Z."""
     Y = drawn(seed, 3)
     np.testing.assert_array_equal(clamp_ports(Y, [0, 2], []), Y[:, [0, 2]][:, :, [0, 2]])
@@ -151,7 +151,7 @@ def test_what_is_left_at_some_ports_is_a_part_of_the_admittance_or_of_the_impeda
     )
 
 
-def test_three_p_d_sites_hold_from_the_damping_on_at_which_they_are_stable_alone() -> None:
+def test_three_p_d_sites_hold_once_stable_alone() -> None:
     """d = abs(lambda_min(alpha)) K T = 1/2 * 10 * 0.2: Z + Z^H is 2 d + 2 K alpha sin(w T) / w."""
     wires = tuple(Wire(i, j, 5.0, 0.0, 0.2) for i in range(3) for j in range(3) if i != j)
     for d, holds in ((0.98, False), (1.02, True)):

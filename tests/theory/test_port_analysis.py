@@ -12,7 +12,7 @@ from trilat_net.theory.port_analysis import analyse_ports
 
 @pytest.mark.parametrize("name", ["p_d_margin_two", "p_d_margin"])
 @pytest.mark.parametrize("K", [5.0, 20.0])
-def test_p_d_is_passive_from_the_line_of_its_stability_on(name: str, K: float) -> None:
+def test_p_d_is_passive_from_line_of_its_stability_on(name: str, K: float) -> None:
     """d = abs(lambda_min(alpha)) K T, whatever the masses, and with joints that are coupled."""
     line = {"p_d_margin_two": 1.0, "p_d_margin": 0.5}[name] * K * 0.2
     beyond = section_of(name, (("control.K", K), ("control.d", 1.02 * line)))
@@ -43,7 +43,7 @@ def test_every_criterion_agrees_where_a_port_is_left_alone() -> None:
         assert all(span.to_hz <= worst * 1.001 for span in section.absolute.below)
 
 
-def test_three_sites_have_every_pair_with_the_third_off_and_clamped_and_two_have_one() -> None:
+def test_three_sites_pair_with_the_third_off_and_clamped() -> None:
     three = section_of("p_d_margin")
     assert [(one.sites, one.clamped) for one in three.two_ports[::2]] == [
         (("m1", "m2"), ""),
@@ -86,7 +86,7 @@ def test_only_the_paper_s_law_has_an_r() -> None:
     assert section_of("p_d_margin").proof is None
 
 
-def test_estimates_that_are_not_the_truth_let_the_linear_loop_give_back_what_they_store() -> None:
+def test_wrong_estimates_let_the_linear_loop_return_stored_energy() -> None:
     """V counts the error of the estimates, which of inertia nothing excites to first order."""
     scenario = load_scenario("free")
     rest = find_equilibrium(scenario, POSE)
@@ -107,7 +107,7 @@ def test_force_that_is_reflected_late_is_unstable_against_a_clamp() -> None:
     assert section.transparency[0].ratio_db > 2.0
 
 
-def test_a_network_that_passes_one_way_only_has_no_damping_that_saves_all_weights() -> None:
+def test_one_way_networks_have_no_damping_for_all_weights() -> None:
     section = section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ())))
     assert not section.velocity.passive
     assert 0.0 < section.velocity.lacking_nm_s_rad < math.inf

@@ -37,7 +37,7 @@ def same(a: LinearLoop, b: LinearLoop) -> None:
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_a_load_is_a_spring_and_a_damper_of_the_network(K: float, B: float) -> None:
+def test_load_is_spring_and_damper_of_network(K: float, B: float) -> None:
     network = pair()
     tied = network._replace(k=(0.0, K), d=(network.d[0], network.d[1] + B))
     same(apply_loads(network.loop, {"b": PortLoad(K, B)}), tied.loop)
@@ -48,7 +48,7 @@ def test_a_free_load_changes_nothing() -> None:
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_the_impedance_of_a_load_adds_at_its_port_and_what_it_pushes_is_reflected(K: float, B: float) -> None:
+def test_a_loads_impedance_adds_at_its_port(K: float, B: float) -> None:
     Y = build_admittance(REFLECTING.loop)(W)
     load = np.diag([0.0, 1.0, 0.0]) * (B + K / (1j * W))[:, np.newaxis, np.newaxis]
     expected = np.linalg.inv(np.linalg.inv(Y) + load)

@@ -48,7 +48,7 @@ def test_a_delay_without_damping_is_not_passive(K: float, delay_s: float) -> Non
 @pytest.mark.parametrize("T", [(0.2, 0.2), (0.1, 0.5), (0.0, 0.3)])
 @pytest.mark.parametrize("K", [(10.0, 10.0), (20.0, 3.0)])
 @pytest.mark.parametrize("share", [0.3, 1.0, 4.0])
-def test_p_d_is_passive_from_the_damping_on_that_the_literature_states(
+def test_p_d_is_passive_from_damping_on_that_literature_states(
     K: tuple[float, float], T: tuple[float, float], share: float
 ) -> None:
     """4 d1 d2 >= (T1 + T2)^2 K1 K2, the energies weighted by 1 / K: at 2 % on either side."""
@@ -68,9 +68,7 @@ def test_what_p_d_lacks_is_k_t_less_its_damping(d: float) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(K=POSITIVE, delay_s=st.floats(0.05, 0.5))
-def test_with_the_damping_that_is_lacking_it_is_passive_and_with_less_it_is_not(
-    K: float, delay_s: float
-) -> None:
+def test_the_lacking_damping_is_just_enough_for_passivity(K: float, delay_s: float) -> None:
     lacking = judged(pair((K, K), (0.1, 0.2), (delay_s, delay_s))).lacking_nm_s_rad
     for factor, holds in ((0.98, False), (1.02, True)):
         d = (0.1 + factor * lacking, 0.2 + factor * lacking)
@@ -78,7 +76,7 @@ def test_with_the_damping_that_is_lacking_it_is_passive_and_with_less_it_is_not(
             assert judged(pair((K, K), d, (delay_s, delay_s))).passive is holds
 
 
-def test_where_p_d_is_not_passive_ends_where_its_sine_says() -> None:
+def test_the_range_where_p_d_is_active_follows_its_sine() -> None:
     """d = K abs(sin(w T)) / w."""
     (span,) = judged(pair(d=(1.0, 1.0))).minima.below
     w = 2.0 * np.pi * span.to_hz
@@ -86,7 +84,7 @@ def test_where_p_d_is_not_passive_ends_where_its_sine_says() -> None:
     assert span.from_hz == pytest.approx(1e-3)
 
 
-def test_a_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
+def test_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
     """Z = m s + d + c / s^2: at low frequency a negative damping c / w^2."""
     loop = Network((1.0, 1.0), (2.0, 1.0), (0.0, 0.0)).loop
     A = loop.A.copy()
@@ -105,7 +103,7 @@ def test_a_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
     numbers=st.lists(st.complex_numbers(max_magnitude=10.0), min_size=9, max_size=9),
     weights=st.tuples(POSITIVE, POSITIVE, POSITIVE),
 )
-def test_weights_count_by_their_ratios_and_decide_the_sign_of_the_weighted_power(
+def test_ratios_of_weights_decide_the_sign_of_power(
     scale: float, numbers: list[complex], weights: tuple[float, ...]
 ) -> None:
     Y = np.array(numbers).reshape(1, 3, 3)

@@ -36,7 +36,7 @@ def test_who_holds_the_third_site_counts() -> None:
 
 
 @given(free=POSITIVE, clamped=POSITIVE, band=st.tuples(st.floats(0.02, 1.0), st.floats(2.0, 50.0)))
-def test_the_width_is_the_ratio_in_db_whatever_the_band_where_the_ratio_is_one(
+def test_the_width_is_the_ratio_in_db_whatever_the_band(
     free: float, clamped: float, band: tuple[float, float]
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
@@ -57,7 +57,7 @@ def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
     assert widths[-1] > 5.0
 
 
-def test_two_sites_that_do_not_know_each_other_feel_nothing_of_each_other() -> None:
+def test_two_sites_that_do_not_couple_feel_nothing() -> None:
     (one,) = measure_transparency(Network((1.0, 1.0), (1.0, 1.0), (0.0, 0.0)).loop, "a", "b")
     assert one.ratio_db == pytest.approx(0.0, abs=1e-12)
 

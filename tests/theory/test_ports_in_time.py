@@ -42,7 +42,7 @@ def answered(
     return fitted(run.sites["m"].t_s[late], velocities, 2.0 * np.pi * hz) / AMPLITUDE_NM
 
 
-@pytest.mark.parametrize("joint", [1, 2])
+@pytest.mark.parametrize("joint", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) -> None:
     overrides = {"control.d": 4.0, "sites.m.q0_rad": POSE, "sites.s.q0_rad": POSE}
@@ -56,7 +56,7 @@ def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) ->
 
 
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
-def test_the_paper_s_law_answers_a_sinusoid_as_its_admittance_says(hz: float) -> None:
+def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
     """Rods that know themselves, a hand that holds m: learning, delay and the hand's spring are in it."""
     hand = {"kind": "spring", "from_rad": POSE, "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 3.0}
     overrides: dict[str, Any] = {f"arm.{key}": value for key, value in ROD.items()}

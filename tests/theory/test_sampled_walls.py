@@ -167,7 +167,7 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
 
 
 @pytest.mark.parametrize("n", range(3))
-def test_growth_in_contact_of_arms_of_six_joints_is_that_of_pinocchios_arm(n: int) -> None:
+def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
     """At walls in space, soft and hard; of several states the deepest counts, and without contact nothing."""
     state = chain_references()["arm6"].states[n]
     signs = set()

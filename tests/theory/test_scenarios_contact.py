@@ -35,7 +35,11 @@ def test_free_motion_is_calm_at_200_ms() -> None:
     assert made.end_error_rad < 1e-6
 
 
-@pytest.mark.parametrize("law", [{"law": "pd_d"}, {"law": "p_d", "K": 100.0, "d": 40.0}], ids=str)
+@pytest.mark.parametrize(
+    "law",
+    [{"law": "pd_d"}, pytest.param({"law": "p_d", "K": 100.0, "d": 40.0}, marks=pytest.mark.long)],
+    ids=str,
+)
 def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object]) -> None:
     """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
     made = measured(

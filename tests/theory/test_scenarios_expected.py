@@ -33,7 +33,7 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 
 
 @pytest.mark.parametrize(("name", "key", "window", "figure", "digit"), FIGURES)
-def test_the_limits_of_a_window_are_the_figure_within_its_bar(
+def test_limits_of_window_are_figure_within_its_bar(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
     asked = {(w.from_s, w.to_s): dict(w.asked) for w in load_scenario(name).expect.windows}

@@ -15,7 +15,7 @@ CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
 
 
 @pytest.mark.parametrize(("name", "margin"), [("p_d_margin", 1.0), ("p_d_margin_two", 2.0)])
-def test_the_margin_is_the_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
+def test_margin_is_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
     """d = abs(lambda_min(alpha)) K T."""
     scenario = load_scenario(name)
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
@@ -33,7 +33,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
 
 
 @pytest.mark.long
-def test_the_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
+def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
     """-0.8, so 1.6: as `docs/lab.md` asks."""
     row = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
     alpha = np.array([[row[i].get(j, 0.0) for j in row] for i in row])
@@ -68,7 +68,7 @@ def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
 
 
 @pytest.mark.long
-def test_a_play_out_buffer_makes_jitter_a_constant_delay_and_the_run_leaves_the_physics() -> None:
+def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
     free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
     assert peak(free) == printed(339.0, 1.0)
@@ -82,7 +82,7 @@ def test_a_play_out_buffer_makes_jitter_a_constant_delay_and_the_run_leaves_the_
     [({"link.order": "in_order"}, True), ({"rate_hz": 100}, False)],
     ids=["order", "rate"],
 )
-def test_order_makes_jitter_leave_its_limits_and_a_slower_rate_does_not(
+def test_order_makes_jitter_leave_its_limits_unlike_slower_rates(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
     made = FusedRun(load_scenario("jitter", changes))

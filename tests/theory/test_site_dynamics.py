@@ -107,7 +107,7 @@ def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     assert not evaluate_site_rates(one, x).external.any()  # faster outward than the spring would push
 
 
-def test_an_estimate_at_an_end_of_its_box_stays_where_it_would_leave_and_goes_where_it_would_return() -> None:
+def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
     rng = np.random.default_rng(2)
     one = site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)

@@ -40,7 +40,7 @@ def least_margin(network: Network) -> float:
     return float(find_best_weights(Y(grid), np.arange(len(network.m))).margin.min())
 
 
-def test_shares_by_one_factor_are_reversible_at_its_ends_and_in_the_middle() -> None:
+def test_shares_by_one_factor_are_reversible_at_three_places() -> None:
     """Errata 14: a (1 - a)^2 along the circle and a^2 (1 - a) back."""
     a = sp.Symbol("a")
     alpha = sp.Matrix([[0, 1 - a, a], [a, 0, 1 - a], [a, 1 - a, 0]])
@@ -63,7 +63,7 @@ def test_no_damping_makes_a_port_of_irreversible_shares_absolutely_stable(d: flo
 
 
 @pytest.mark.parametrize("count", [3, 5, 7])
-def test_reversible_shares_are_passive_from_the_damping_on_that_makes_them_stable(count: int) -> None:
+def test_reversible_shares_are_passive_once_damped_to_stability(count: int) -> None:
     """Errata 14: D Z + Z^H D of masses that are free has the sign of d + K S sin(w T) / w; any masses."""
     rng = np.random.default_rng(count)
     weights = rng.uniform(0.0, 1.0, (count, count)) * (1.0 - np.eye(count))
@@ -114,16 +114,14 @@ def reflecting(d_m: float, delay_s: float, slave_kg: float = 1.5) -> Network:
 
 
 @pytest.mark.parametrize(("delay_s", "least"), [(0.02, 12.1), (0.2, 40.0), (1.0, 360.0)])
-def test_force_reflection_needs_damping_of_its_master_that_grows_with_delay(
-    delay_s: float, least: float
-) -> None:
+def test_force_reflection_needs_master_damping_that_grows_with_delay(delay_s: float, least: float) -> None:
     """Errata 15: d_m >= k_f (2 K T + d_s)^2 / (4 d_s), K = 100 and d_s = 40; its edge within 1 %."""
     assert (2.0 * 100.0 * delay_s + 40.0) ** 2 / 160.0 == pytest.approx(least)
     assert criterion(reflecting(0.99 * least, delay_s)).below
     assert not criterion(reflecting(1.01 * least, delay_s)).below
 
 
-def test_the_slave_s_damping_that_lets_the_master_have_least_is_twice_stiffness_times_delay() -> None:
+def test_the_slaves_best_damping_is_twice_stiffness_times_delay() -> None:
     """Errata 15: 2 k_f K T, at d_s = 2 K T; and a slave of much mass asks for k_f K M / d_s."""
     K, T, d_s = sp.symbols("K T d_s", positive=True)
     bound = (2 * K * T + d_s) ** 2 / (4 * d_s)
@@ -133,7 +131,7 @@ def test_the_slave_s_damping_that_lets_the_master_have_least_is_twice_stiffness_
     assert criterion(reflecting(1.02 * 40.0, 0.2, slave_kg=40.0)).below
 
 
-def test_hands_that_are_coupled_to_one_another_are_not_weighed_by_the_weights_of_independent_ones() -> None:
+def test_coupled_hands_are_not_weighed_like_independent_ones() -> None:
     """Errata 9: K1 = 100, K2 = 1, 4 d1 d2 = 1.2 (2 T)^2 K1 K2 withstand any two operators.
 
     Not one who holds both handles with a spring between one and the mirror image of the other.
@@ -148,7 +146,7 @@ def test_hands_that_are_coupled_to_one_another_are_not_weighed_by_the_weights_of
 
 
 @given(st.tuples(*[st.floats(-10.0, 10.0)] * 4))
-def test_a_clip_brings_no_estimate_further_from_a_truth_in_the_box_or_at_its_edge(some: Any) -> None:
+def test_a_clip_brings_no_estimate_further_from_the_truth(some: Any) -> None:
     """Errata 16: V of the estimates does not rise."""
     estimate, (low, theta, high) = some[0], sorted(some[1:])
     for truth in (low, theta, high):

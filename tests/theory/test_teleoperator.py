@@ -56,7 +56,7 @@ def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> P
     )
 
 
-def test_hands_back_at_their_ports_make_the_loop_that_had_them() -> None:
+def test_hands_back_at_their_ports_make_loop_that_had_them() -> None:
     """A hand holds a pose by a torque: that had stayed when its spring and damper were taken off."""
     hand = {"kind": "spring", "from_rad": [-0.3, 1.6], "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 3.0}
     dashpot = {"kind": "viscous", "damping_nm_s_rad": 0.7}
@@ -73,7 +73,7 @@ def test_hands_back_at_their_ports_make_the_loop_that_had_them() -> None:
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
 
 
-def test_force_that_a_law_reflects_is_reflected_of_a_load_as_well() -> None:
+def test_force_that_law_reflects_is_reflected_of_load_as_well() -> None:
     hand = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 4.0}
     scenario = load_scenario(
         "contact", {"sites.m.hands": [], "sites.s.environment": [], "sites.s.hands": [hand]}
@@ -100,14 +100,14 @@ def test_what_acted_at_the_rest_goes_on_acting() -> None:
 
 @pytest.mark.parametrize("delay_ms", [0.0, 50.0, 200.0, 800.0])
 @pytest.mark.parametrize("name", ["free", "two_sites"])
-def test_the_paper_s_law_is_passive_in_r_and_not_in_qd_whatever_the_delay(name: str, delay_ms: float) -> None:
+def test_the_papers_law_is_passive_in_r_not_qd(name: str, delay_ms: float) -> None:
     """What its theorem states of the nonlinear loop with hands, docs/errata.md."""
     _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
     assert not check_passivity(build_admittance(loop), grid(loop)).passive
 
 
-def test_rows_of_dominance_that_do_not_circle_need_the_weights_of_the_proof() -> None:
+def test_dominance_rows_without_a_circle_need_the_proofs_weights() -> None:
     """beta = (0.444, 0.130, 0.426) / mean: passive; the paper's ones: not, where little damping hides it."""
     _, now, _, loop = at_pose("force_sharing", {**BARE, "control.Kp": 0.1})
     assert in_r(now, loop).passive

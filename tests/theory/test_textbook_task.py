@@ -150,7 +150,7 @@ def test_its_jacobian_is_the_difference_of_compiled_ticks(text: str, name: str, 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_rate_of_the_jacobian_is_its_derivative_along_the_motion(seed: int) -> None:
+def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
     site = build("posed", "s", "pd_d")
     rng = np.random.default_rng(seed)
     q, qd = rng.normal(0.0, 1.0, (2, len(site.q0)))

@@ -50,7 +50,7 @@ LAWS = {
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0])
-def test_a_small_deviation_goes_tick_by_tick_as_a_run_does(law: str, scheme: str, delay_ms: float) -> None:
+def test_small_deviation_goes_tick_by_tick_as_run_does(law: str, scheme: str, delay_ms: float) -> None:
     """The companion matrix carries it on; the run begins there, its peers' histories at their start poses."""
     small = 1e-6
     off = small * np.array([[1.0, -0.5], [-0.7, 0.3]])
@@ -95,7 +95,7 @@ def begun(whole: Array, late: NDArray[np.intp], names: Sequence[str], start: Arr
 
 @pytest.mark.parametrize(("scheme", "order"), [("second_order", 2), ("digital", 1)])
 @pytest.mark.parametrize("delay_ms", [0.0, 100.0])
-def test_it_goes_to_the_continuous_loop_with_the_order_of_its_scheme(
+def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
     scheme: str, order: int, delay_ms: float
 ) -> None:
     """Both with the same delay in use; the rightmost root, at rates that halve the period."""

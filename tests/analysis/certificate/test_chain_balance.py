@@ -41,7 +41,7 @@ def check_six(duration_s: float) -> LogMetrics:
     return metrics
 
 
-def test_energy_of_six_joints_closes_and_base_parameters_hold_all_that_is_learnt() -> None:
+def test_energy_of_six_joints_closes_with_the_base_parameters() -> None:
     metrics = check_six(2.0)
     estimates = metrics.estimates["s"].base
     assert estimates is not None

@@ -35,7 +35,7 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"])
-def test_it_closes_to_2e_5_of_the_largest_v_with_order_two(name: str) -> None:
+def test_the_balance_closes_to_2e_5_with_order_two(name: str) -> None:
     assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
     assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
@@ -45,14 +45,14 @@ def test_it_closes_until_both_hands_have_let_go() -> None:
     assert of_largest_v(runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
-def test_digital_closes_to_some_percent_with_order_one_and_sampling_is_what_is_left() -> None:
+def test_digital_closes_to_some_percent_with_order_one() -> None:
     b = runs.run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
     assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
     assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
     assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
-def test_jitter_closes_to_1e_4_where_the_jumps_are_booked_and_not_to_3e_3_where_they_are_not() -> None:
+def test_jitter_closes_to_1e_4_with_its_jumps_booked() -> None:
     b = runs.run("free", runs.JITTER).balance
     links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
@@ -80,7 +80,7 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     ("key", "limit", "term"),
     [("tau_rate_limit_nm_s", 100.0, "torque limit"), ("qd_des_limit_rad_s", 0.5, "rule")],
 )
-def test_what_a_limit_of_torque_rate_or_reference_takes_is_booked(key: str, limit: float, term: str) -> None:
+def test_what_limit_of_torque_rate_or_reference_takes_is_booked(key: str, limit: float, term: str) -> None:
     b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
     assert np.abs(b.work[term]).max() > 0.01 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
@@ -94,7 +94,7 @@ def test_a_site_that_stops_and_goes_on_is_booked() -> None:
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
 
 
-def test_a_wall_closes_to_1e_4_though_it_gives_energy_to_r() -> None:
+def test_a_wall_that_gives_energy_closes_to_1e_4() -> None:
     b = runs.run("wall").balance
     assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
@@ -137,7 +137,7 @@ def test_ones_for_beta_is_caught_and_named() -> None:
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
-def test_the_papers_v_rises_by_12_3_of_32_8_and_the_corrected_one_never() -> None:
+def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
     books = runs.run("free", runs.LYAPUNOV).energies
     ones, right = compute_energy_balance(books, ones=True), compute_energy_balance(books)
     assert ones.V[0] == pytest.approx(32.8, abs=0.1)

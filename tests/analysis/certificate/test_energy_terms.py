@@ -79,7 +79,7 @@ ticks = st.integers(1, NOW - 2)
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
-def test_the_work_of_links_is_what_their_jumps_change_in_v(
+def test_work_of_links_is_what_their_jumps_change_in_v(
     seed: int, before: tuple[int, int], after: tuple[int, int]
 ) -> None:
     """Against the same instant with samples in use that are as old as those before: m + 1 in place of m'."""
@@ -92,7 +92,7 @@ def test_the_work_of_links_is_what_their_jumps_change_in_v(
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.tuples(ticks, ticks), st.tuples(ticks, ticks))
-def test_the_right_end_of_a_period_is_where_the_ages_stayed_as_they_were(
+def test_the_right_end_of_a_period_keeps_its_sample_ages(
     seed: int, before: tuple[int, int], after: tuple[int, int]
 ) -> None:
     site = Situation(seed, before, after)
@@ -120,7 +120,7 @@ def test_a_held_torque_works_with_its_value_at_the_beginning(seed: int) -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
-def test_the_work_of_a_step_of_shares_is_what_it_changes_in_v(seed: int, share: float) -> None:
+def test_a_step_of_shares_works_what_it_changes_in_v(seed: int, share: float) -> None:
     stepped, kept = (Situation(seed, (5, 9), (6, 10)) for _ in range(2))
     after = np.array([share, 1.0 - share])
     stepped.shares.alpha[1] = after
@@ -131,7 +131,7 @@ def test_the_work_of_a_step_of_shares_is_what_it_changes_in_v(seed: int, share: 
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
-def test_a_slow_change_of_the_delay_gives_the_missing_term_of_the_theorem(seed: int) -> None:
+def test_slow_change_of_delay_gives_missing_term_of_theorem(seed: int) -> None:
     """a_ij T' [ 1/2 |qd_jd|^2_Kd + (Lambda Kd e_i + Lambda M r_i)' qd_jd ], of an age that grows slowly."""
     site = Situation(seed, (5, 9), (6, 10))
     peer = site.peers[0]

@@ -19,7 +19,7 @@ def found(data: bytes, **options: float) -> Certificate:
     return certify(opened(data), **options)
 
 
-def test_a_whole_log_is_stable_and_says_what_it_rests_on() -> None:
+def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
     certificate = found(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
     facts = certificate_to_json(certificate)["evidence"]

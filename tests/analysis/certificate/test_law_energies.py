@@ -24,7 +24,7 @@ def run(law: str) -> Log:
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
-def test_the_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
+def test_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
     log = run(law)
     found = observe_energies(log)
     assert found.finding is ObservedFinding.PASSIVE
@@ -46,7 +46,7 @@ def test_a_figure_shows_them_over_time() -> None:
 
 
 @pytest.mark.long
-def test_a_jolt_beyond_the_reserve_leaves_an_observer_negative_and_the_certificate_says_so() -> None:
+def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() -> None:
     """Sites that start apart; the reserve of a scenario that names none covers that."""
     changes = {"control.law": "tdpa", "scheme": "digital", "duration_s": 1.0, "sites.s.q0_rad": [0.8, 0.5]}
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
@@ -60,7 +60,7 @@ def test_a_jolt_beyond_the_reserve_leaves_an_observer_negative_and_the_certifica
 
 
 @pytest.mark.long
-def test_torque_of_the_leaders_velocity_makes_energy_at_a_follower_that_moves_by_less() -> None:
+def test_the_leaders_velocity_makes_energy_at_a_slower_follower() -> None:
     """As it is published: the follower's damper acts on a velocity at which it is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
@@ -83,8 +83,10 @@ def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("law", ["wave", "tdpa"])
-@pytest.mark.parametrize("link", [CONSTANT, JITTER], ids=["constant", "jitter"])
+@pytest.mark.parametrize("law", ["wave", pytest.param("tdpa", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "link", [pytest.param(CONSTANT, id="constant", marks=pytest.mark.long), pytest.param(JITTER, id="jitter")]
+)
 def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
     shares = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
     control = {**LAWS[law], **FOLLOWER}

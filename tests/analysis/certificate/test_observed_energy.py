@@ -66,7 +66,7 @@ def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
     assert stored == pytest.approx(force**2 * DELAY_S / B, rel=5e-3)
 
 
-def test_a_wave_that_is_held_over_an_outage_is_energy_from_nowhere() -> None:
+def test_wave_that_is_held_over_outage_is_energy_from_nowhere() -> None:
     """What is missing must be zero (Niemeyer and Slotine 2004); this law uses the last wave again and again.
 
     The hand lets go in the outage, so that the master sends less than what the slave goes on using.
@@ -87,13 +87,13 @@ def test_a_wave_that_is_held_over_an_outage_is_energy_from_nowhere() -> None:
     assert found.stability is not Stability.STABLE
 
 
-def test_a_law_that_sends_more_than_it_got_is_found_by_its_books() -> None:
+def test_books_find_a_law_that_sends_more_than_it_got() -> None:
     found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
     assert found.finding is ObservedFinding.BROKEN
     assert found.residual_j > 1e-4
 
 
-def test_code_from_outside_runs_only_on_request_and_other_laws_declare_nothing() -> None:
+def test_code_from_outside_runs_only_on_request() -> None:
     log = clamped()
     assert observe_energies(log) is None
     silent = {"sites.s.control.law": "tests.line_law:Silent", "duration_s": 0.1}

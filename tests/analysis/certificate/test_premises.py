@@ -59,7 +59,7 @@ def test_unequal_scalars_of_kd_hold() -> None:
     assert found.text == "one Kd but for a scalar: m1 1, m2 2, s 1"
 
 
-def test_a_hand_that_lets_go_is_no_failure_and_one_that_holds_on_is() -> None:
+def test_a_hand_that_holds_on_fails_a_premise() -> None:
     assert premises("paper", duration_s=3.0, rate_hz=100)["hands"].holds is False  # until 11 s
     lets_go = premises("paper", duration_s=12.5, rate_hz=100)["hands"]
     assert lets_go.holds
@@ -69,7 +69,7 @@ def test_a_hand_that_lets_go_is_no_failure_and_one_that_holds_on_is() -> None:
     assert "0.5 s of free motion at the end are less than 1 s" in briefly.text
 
 
-def test_a_damper_of_qd_may_give_with_respect_to_r_and_a_wall_does() -> None:
+def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     hands = next(p for p in runs.run("wall").certificate.premises if p.name == "hands")
     assert hands.holds is False
     assert hands.text.startswith("the hands and walls gave up to")

@@ -34,7 +34,7 @@ def joined(found: list[EnergyCourse]) -> EnergyCourse:
 
 
 @pytest.mark.parametrize("late", [0, 7])
-def test_v_and_the_work_of_hands_and_walls_are_those_of_the_whole_log(late: int) -> None:
+def test_v_and_work_while_running_are_those_of_the_log(late: int) -> None:
     """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
     whole = runs.run("rich").balance
     course = joined(courses(runs.run("rich").log, late=late))
@@ -45,7 +45,7 @@ def test_v_and_the_work_of_hands_and_walls_are_those_of_the_whole_log(late: int)
     assert np.abs(course.supplied - whole.external_work[rows]).max() < 1e-10 * most
 
 
-def test_v_without_some_records_is_that_of_a_log_that_lacks_them() -> None:
+def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
     """Records that cannot be had are passed over as `certify` passes over them."""
     log = runs.run("rich").log
     gap = frozenset(range(700, 760))
@@ -57,7 +57,7 @@ def test_v_without_some_records_is_that_of_a_log_that_lacks_them() -> None:
     assert np.isfinite(course.V).all()
 
 
-def test_v_of_a_session_that_is_joined_late_begins_when_all_under_way_is_known() -> None:
+def test_v_begins_late_in_a_session_joined_late() -> None:
     log, whole = runs.run("rich").log, runs.run("rich").balance
     windows = make_windows(log.scenario, log.sites, kept_s=4.0)
     running, found = RunningEnergy(log.scenario, windows), []

@@ -29,7 +29,7 @@ def damper(b: float, **more: object) -> list[dict[str, object]]:
     return [{"kind": "wall", "sampled": True, **place}, {"kind": "viscous", "damping_nm_s_rad": b, **more}]
 
 
-def test_a_sampled_wall_gives_half_k_dx_squared_of_every_tick_in_contact() -> None:
+def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
     log = run()
     wall, s = log.scenario.sites["s"].environment[0], log["s"]
     x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
@@ -89,7 +89,7 @@ def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = 
     return float((0.5 * K * steps**2 - B * speed * steps).sum() / taken)
 
 
-def test_damping_by_the_speed_at_a_tick_gives_what_that_of_differences_does_not() -> None:
+def test_damping_by_the_sampled_speed_gives_energy() -> None:
     """Ticks of 1 s, K 2, B 1: K h / 2 + B is 2. Faster motions than half the tick rate are without bound."""
     ticks, rng = 200, np.random.default_rng(5)
     t = np.arange(ticks * 400) / 400.0

@@ -66,9 +66,7 @@ def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
     assert found.verdict.text == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
 
 
-def test_an_arm_outside_is_judged_while_it_moves_as_its_theta_says_and_is_not_accused_where_it_does_not() -> (
-    None
-):
+def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
     as_told = certify(outside(still_free(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
@@ -83,7 +81,7 @@ def test_records_with_none_beside_them_are_no_period() -> None:
     assert found.verdict.text == f"V cannot be judged: {NO_PERIOD}"
 
 
-def test_a_period_too_long_for_the_gains_is_not_judged_and_accuses_nobody() -> None:
+def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
     """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
     light = {"arm.m2_kg": 0.001, "rate_hz": 333, "duration_s": 2.0}
     found = certify(trilat_net.simulate(load_scenario("two_sites", light)))
@@ -115,7 +113,7 @@ def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
         assert found.verdict.finding is not StabilityFinding.BROKEN
 
 
-def test_a_log_that_begins_late_and_was_not_finished_is_judged_as_far_as_it_goes() -> None:
+def test_an_unfinished_log_is_judged_as_far_as_it_goes() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
     found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
     assert found.balance is not None

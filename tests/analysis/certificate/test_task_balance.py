@@ -33,7 +33,7 @@ def test_it_closes_with_order_two() -> None:
     assert share(found[500]) / share(found[1000]) == pytest.approx(4.0, rel=0.1)
 
 
-def test_it_closes_with_links_that_jitter_a_box_and_a_torque_limit() -> None:
+def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
     jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
     box = judge(**{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2})
     limit = judge(**{"limits.tau_limit_nm": 25.0})
@@ -45,7 +45,7 @@ def test_it_closes_with_links_that_jitter_a_box_and_a_torque_limit() -> None:
     assert list(limit.verdict.rise.causes) == ["the torque limit"]
 
 
-def test_damping_near_a_singular_pose_is_a_premise_that_fails_and_work_that_is_booked() -> None:
+def test_damping_near_a_singular_pose_fails_a_premise() -> None:
     found = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
     premise = next(one for one in found.premises if one.name == "singular poses")
     assert premise.holds is False
@@ -74,7 +74,7 @@ def test_an_axis_that_only_one_follows_dissipates() -> None:
             assert np.abs(lame.residual).max() > 10 * np.abs(energy.residual).max()
 
 
-def test_a_site_that_is_followed_along_an_axis_that_it_leaves_alone_fails_a_premise() -> None:
+def test_following_an_axis_that_peers_leave_free_fails() -> None:
     found = judge(**{"sites.m.task.axes": ["x"]})
     premise = next(one for one in found.premises if one.name == "axes")
     assert premise.holds is False

@@ -53,7 +53,7 @@ def test_outside_and_yet_not_risen() -> None:
     assert found.bounded_by_v
 
 
-def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
+def test_a_rise_is_named_with_time_amount_and_giver() -> None:
     found = runs.run("free", runs.JITTER).certificate
     rise = found.verdict.rise
     assert found.verdict.finding is StabilityFinding.ROSE
@@ -66,7 +66,7 @@ def test_a_rise_is_named_with_its_time_its_amount_and_who_gave_it() -> None:
     assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
 
 
-def test_kd_of_different_shape_lets_v_rise_by_what_beta_does_not_cancel() -> None:
+def test_kd_of_different_shape_makes_v_rise() -> None:
     found = certify(made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1]))
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
@@ -87,7 +87,7 @@ def tampered(change: Callable[[State], State]) -> Certificate:
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
-def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) -> None:
+def test_record_that_was_changed_breaks_balance_of_its_site(field: str) -> None:
     def change(state: State) -> State:
         late = state.site == "m2" and state.tick >= 375
         values = [1.05 * x for x in getattr(state, field)]
@@ -99,7 +99,7 @@ def test_a_record_that_was_changed_breaks_the_balance_of_its_site(field: str) ->
     assert "were not made by the equations that the log claims" in found.verdict.text
 
 
-def test_a_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
+def test_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
     log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
     found = certify(
@@ -163,7 +163,7 @@ def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
     assert found.bounded_by_v
 
 
-def test_a_site_without_weight_is_left_to_growth_where_more_fails() -> None:
+def test_site_without_weight_is_left_to_growth_where_more_fails() -> None:
     hand = {"sites.m2.hands": [{"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}]}
     found = runs.run("free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}).certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
@@ -176,7 +176,7 @@ def still() -> Certificate:
     return runs.run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
 
 
-def test_a_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
+def test_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
     assert still().stability is Stability.STABLE
     assert still().passed
     assert still().reasons == ()
@@ -220,7 +220,7 @@ def test_an_unstable_rest_leaves_a_run_open() -> None:
     assert replace(still(), roots=roots._replace(verdict="stable")).passed
 
 
-def test_v_that_rises_at_the_end_or_ends_above_its_beginning_is_named() -> None:
+def test_v_that_rises_at_the_end_is_named() -> None:
     balance = still().balance
     assert balance is not None
     t_s, V = balance.t_s, balance.unsupplied

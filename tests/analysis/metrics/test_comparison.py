@@ -10,7 +10,7 @@ from trilat_net.analysis.metrics.log_metrics import compare_metrics, comparison_
 from .written import pair, simulated
 
 
-def test_a_row_is_the_largest_of_the_places_or_their_sum() -> None:
+def test_row_is_largest_of_places_or_their_sum() -> None:
     log = pair(
         lambda site, _: {"tau": [3.0 if site == "m" else 4.0, 0.0], "q": [0.1, 0.0], "q_des": [0.0, 0.0]}
     )

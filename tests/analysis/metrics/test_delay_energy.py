@@ -33,7 +33,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
 
 
 @pytest.mark.parametrize("law", ["pd_d", "adaptive", "p_d"])
-def test_delays_are_what_the_port_has_beyond_the_law_without_them(law: str) -> None:
+def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = simulated("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law})
     found, largest = compute_log_metrics(log), 0.0

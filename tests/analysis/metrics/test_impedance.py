@@ -61,7 +61,7 @@ def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     assert "no 4 s are recorded" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
-def test_in_a_closed_loop_the_one_who_drives_tells_whose_impedance_it_is() -> None:
+def test_in_a_closed_loop_the_driver_decides_whose_impedance() -> None:
     """A spring k held against a damper b that others shake: torque / speed is b + noise's, not -k/s.
 
     The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x the ratio is b;

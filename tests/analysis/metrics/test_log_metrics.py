@@ -54,7 +54,7 @@ def test_busy_and_uneven_sites_are_measured() -> None:
     told(logs.simulated("four"))
 
 
-def test_a_gap_and_a_late_begin_leave_numbers_and_are_counted() -> None:
+def test_gap_and_late_begin_leave_numbers_and_are_counted() -> None:
     log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
     torn = logs.rewritten(log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False)
     found = told(torn)
@@ -66,7 +66,7 @@ def test_a_gap_and_a_late_begin_leave_numbers_and_are_counted() -> None:
     assert late["run"]["spread_max_rad"] > 0.0
 
 
-def test_a_site_without_any_record_takes_only_its_own_figures_away() -> None:
+def test_site_without_any_record_takes_only_its_own_figures_away() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     found = told(logs.rewritten(log, lambda state: state.site != "m1"))
     assert found["sites"]["m2"]["controller_j"] is not None

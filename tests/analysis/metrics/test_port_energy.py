@@ -13,14 +13,14 @@ from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
 from .written import pair, simulated, under
 
 
-def test_the_work_of_a_spring_is_exact_and_independent_of_the_way() -> None:
+def test_work_of_spring_is_exact_and_independent_of_way() -> None:
     """int -K q dq = K (q_0^2 - q_1^2) / 2."""
     q = np.cumsum(np.random.default_rng(1).normal(size=(50, 2)), axis=0)
     K = np.array([3.0, 7.0])
     assert trapezoid_work(-K * q, q).sum() == pytest.approx(0.5 * float((K * (q[0] ** 2 - q[-1] ** 2)).sum()))
 
 
-def test_the_work_of_a_torque_that_is_held_is_torque_times_way() -> None:
+def test_work_of_torque_that_is_held_is_torque_times_way() -> None:
     q = np.array([[0.0, 1.0], [0.5, 1.0], [0.25, 3.0]])
     assert held_work(np.array([[2.0, 9.0], [4.0, 1.0]]), q).tolist() == [1.0, 1.0]
 
@@ -88,7 +88,7 @@ def test_periods_without_both_records_are_left_out() -> None:
     )
 
 
-def test_of_an_arm_that_is_not_known_there_is_no_mechanical_energy() -> None:
+def test_an_unknown_arm_has_no_mechanical_energy() -> None:
     """What the ports gave is known all the same; an arm outside of the program was told tau."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     outside = under(log, {"sites.s.plant": "external", "sites.s.arm.known": False})

@@ -15,7 +15,7 @@ ANCHORED = {
 }
 
 
-def test_learning_gravity_is_a_spring_that_ties_the_arms_to_a_pose() -> None:
+def test_learning_gravity_is_spring_that_ties_arms_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
     found = compute_log_metrics(simulated("paper", ANCHORED))
     assert [one.site for one in found.stiffness] == ["m1", "m1"]
@@ -28,7 +28,7 @@ def test_learning_gravity_is_a_spring_that_ties_the_arms_to_a_pose() -> None:
     assert first is None or abs(first) > 10.0 * second.stiffness_nm_rad
 
 
-def test_where_something_else_moves_the_arm_the_ratio_would_be_the_hands_own() -> None:
+def test_where_something_else_moves_arm_ratio_would_be_hands_own() -> None:
     """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
     found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
     assert found.static_windows.value == 2.0

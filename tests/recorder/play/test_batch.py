@@ -43,7 +43,7 @@ def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, size: int)
 
 
 @given(messages, messages)
-def test_what_was_put_in_order_may_be_put_in_order_again_with_more(one: Messages, two: Messages) -> None:
+def test_ordered_messages_may_be_ordered_again_with_more(one: Messages, two: Messages) -> None:
     """For messages whose numbers ascend in the file, as they come of a log that misses nothing."""
     rising = [(t_ns, channel, n, payload + b".") for n, (t_ns, channel, _, payload) in enumerate(one + two)]
     again = gathered(rising[len(one) :], gathered(rising[: len(one)]).ordered())

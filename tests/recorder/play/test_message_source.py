@@ -39,7 +39,7 @@ def sorted_in(messages: list[PlayedMessage], *how: int, **limits: int) -> tuple[
     steps=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 2), st.integers(0, 30)), max_size=60),
     step_ns=st.integers(1, 20),
 )
-def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
+def test_messages_within_the_horizon_are_put_in_order(
     steps: list[tuple[int, int, int]], step_ns: int
 ) -> None:
     """Messages come up to 30 ns late in the file; a channel's times go with its numbers."""
@@ -53,18 +53,18 @@ def test_what_stands_within_the_horizon_of_its_turn_is_put_in_its_turn(
     assert sorted_in(messages, 30, step_ns) == (whole(messages), 0)
 
 
-def test_what_stands_further_away_is_played_all_the_same_and_counted() -> None:
+def test_what_stands_further_away_is_played_all_same_and_counted() -> None:
     rising = [(t, 0, t, b"") for t in range(1, 100)]
     played, strays = sorted_in([*rising, (0, 0, 0, b"stray")], 30, 10)
     assert (len(played), strays) == (100, 1)
 
 
-def test_a_time_before_the_epoch_that_stands_for_a_number_is_none_too_far_away() -> None:
+def test_a_time_before_the_epoch_is_too_far_away() -> None:
     before = [(t, 0, t, b"") for t in range(-50, 50)]
     assert sorted_in(before, 30, 10) == (before, 0)
 
 
-def test_what_would_be_too_much_to_hold_is_given_before_its_time() -> None:
+def test_messages_beyond_the_memory_limit_are_given_early() -> None:
     """A file that says that everything was sent at once."""
     given = [(0, 0, n, bytes(100)) for n in range(1000)]
     assert sorted_in(given, limit_bytes=20_000) == (given, 0)
@@ -101,7 +101,7 @@ def rounds(source: MessageSource, count: int) -> Iterator[list[PlayedMessage]]:
         source.restart()
 
 
-def test_a_process_of_its_own_gives_round_after_round_what_would_have_been_loaded(log_file: Path) -> None:
+def test_a_process_of_its_own_gives_the_same_rounds(log_file: Path) -> None:
     preloaded, block = loaded(log_file)
     with reading(log_file, loop=True) as (source, header):
         assert list(rounds(source, 3)) == [list(block.messages())] * 3

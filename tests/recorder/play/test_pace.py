@@ -23,7 +23,7 @@ def test_what_is_later_in_the_log_is_never_due_earlier(pace: Pace, one: int, oth
 
 
 @given(paces, times)
-def test_a_deadline_is_the_origin_and_what_passed_by_the_rate(pace: Pace, t_ns: int) -> None:
+def test_deadline_is_origin_and_what_passed_by_rate(pace: Pace, t_ns: int) -> None:
     assert pace.due_ns(pace.start_ns) == pace.origin_ns
     passed_ns = pace.due_ns(t_ns) - pace.origin_ns
     if math.isinf(pace.rate):

@@ -26,7 +26,7 @@ def test_every_message_comes_once_and_times_never_go_back(given: Messages) -> No
 
 
 @given(messages)
-def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_file(given: Messages) -> None:
+def test_a_channel_plays_in_order_of_its_numbers(given: Messages) -> None:
     order, _ = ordered(given)
     for channel in range(4):
         own = [(given[place][2], place) for place in order if given[place][1] == channel]
@@ -34,7 +34,7 @@ def test_a_channel_comes_in_the_order_of_its_numbers_and_equal_ones_as_in_the_fi
 
 
 @given(messages)
-def test_none_is_due_later_than_its_time_and_earlier_only_for_a_later_number(given: Messages) -> None:
+def test_none_is_due_late_and_early_only_for_later_numbers(given: Messages) -> None:
     order, due_ns = ordered(given)
     for place, due in zip(order, due_ns, strict=True):
         t_ns, channel, number = given[place]
@@ -43,7 +43,7 @@ def test_none_is_due_later_than_its_time_and_earlier_only_for_a_later_number(giv
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), max_size=30))
-def test_where_numbers_go_with_the_file_it_is_sorting_by_time_that_keeps_the_file_within_an_instant(
+def test_numbers_in_file_order_make_it_a_sort_by_time(
     given: list[tuple[int, int]],
 ) -> None:
     """As in every log whose recorder missed nothing; channels' times there never go back."""
@@ -57,7 +57,7 @@ def test_where_numbers_go_with_the_file_it_is_sorting_by_time_that_keeps_the_fil
     assert due_ns == [rising[n][0] for n in order]
 
 
-def test_a_record_that_was_filled_in_later_is_played_in_its_place() -> None:
+def test_a_record_filled_in_later_is_played_in_its_place() -> None:
     """By its time of sending; and by its time of arrival right before the one that it belongs before."""
     state, other = 0, 1
     by_sending = [(0, state, 0), (2, state, 2), (2, other, 0), (1, state, 1)]

@@ -160,7 +160,7 @@ def test_pings_are_answered_at_once(log_file: Path) -> None:
     assert {pong.member: pong.boot for pong in pongs} == hall.facts.boots
 
 
-def test_the_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
+def test_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
     hall = Hall(log_file)
     rings: list[Inbox] = []
 
@@ -186,7 +186,7 @@ def test_the_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
     assert outcome.refilled == sum(len(past.payloads) for past in (early, later, unplayed, links))
 
 
-def test_a_recorder_that_comes_in_the_middle_learns_when_tick_0_was(log_file: Path) -> None:
+def test_recorder_that_comes_in_middle_learns_when_tick_0_was(log_file: Path) -> None:
     """By the code of the recorder's own way into a session."""
     hall = Hall(log_file)
     bus = hall.network.join()
@@ -210,7 +210,7 @@ def test_a_recorder_that_comes_in_the_middle_learns_when_tick_0_was(log_file: Pa
 
 
 @pytest.mark.parametrize(("stores", "stays_ns"), [(True, 0), (False, LINGER_NS)])
-def test_it_stays_until_the_recorder_has_everything_or_for_a_while(
+def test_it_stays_until_recorder_has_everything_or_for_while(
     log_file: Path, stores: bool, stays_ns: int
 ) -> None:
     hall = Hall(log_file, PlayOptions(SESSION, needs_recorder=True))
@@ -222,7 +222,7 @@ def test_it_stays_until_the_recorder_has_everything_or_for_a_while(
     assert hall.clock.now_ns - ended[-1] == pytest.approx(stays_ns, abs=200_000_000)
 
 
-def test_it_is_played_in_its_own_name_with_nothing_of_the_recorder(log_file: Path) -> None:
+def test_a_log_is_played_in_its_own_name(log_file: Path) -> None:
     hall = Hall(log_file, PlayOptions("other"), PlaySelection(ChannelFilter(exclude=("**/link",))))
     hall.play()
     wanted = {key: found for key, found in session_payloads(log_file).items() if not key.endswith("link")}

@@ -166,7 +166,7 @@ def test_it_stops_when_asked(count: int) -> None:
     assert count <= len(stage.heard) <= count + 10 or len(stage.heard) == 250
 
 
-def test_everything_else_has_its_turn_even_where_no_time_is_left() -> None:
+def test_other_tasks_have_their_turn_even_without_time_left() -> None:
     """As fast as can be: a hundred times a second; and while nothing is due: a thousand times."""
     stage = Stage(given_at_once((0, 0) for _ in range(200)))
     for n in range(200):

@@ -67,7 +67,7 @@ def test_times_are_those_of_sending_or_of_coming(tmp_path: Path) -> None:
         assert block.times_ns.tolist() == [t * 1_000_000 for t in expected]
 
 
-def test_parts_of_one_session_are_one_log_and_other_sessions_are_refused(tmp_path: Path) -> None:
+def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
     two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
     facts, block = loaded(one, two)
@@ -78,7 +78,7 @@ def test_parts_of_one_session_are_one_log_and_other_sessions_are_refused(tmp_pat
         preload_messages([one, other], PlaySelection(), LARGE)
 
 
-def test_a_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Path) -> None:
+def test_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: Path) -> None:
     path = tmp_path / "torn.mcap"
     path.write_bytes(short_log[: len(short_log) * 95 // 100])
     facts, block = loaded(path)
@@ -86,7 +86,7 @@ def test_a_torn_file_is_read_as_far_as_it_is_whole(short_log: bytes, tmp_path: P
     assert facts.torn == {path: "the file was not finished"}
 
 
-def test_more_than_the_limit_is_left_to_be_read_while_it_plays(log_file: Path) -> None:
+def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
     for limit_bytes in (0, 50_000):
         facts, block = preload_messages([log_file], PlaySelection(), limit_bytes)
         assert block is None
@@ -105,14 +105,14 @@ def test_more_than_the_limit_is_left_to_be_read_while_it_plays(log_file: Path) -
         ),
     ],
 )
-def test_where_nothing_is_to_be_played_it_is_said_what_there_is(
+def test_where_nothing_can_be_played_the_choice_is_told(
     selection: PlaySelection, problem: str, log_file: Path
 ) -> None:
     with pytest.raises(UsageError, match=problem):
         preload_messages([log_file], selection, LARGE)
 
 
-def test_a_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
+def test_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)])
     _, block = loaded(path)
     assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]

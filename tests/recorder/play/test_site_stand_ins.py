@@ -45,7 +45,7 @@ def naive(numbers: list[int], first: int, last: int) -> tuple[int, list[int]]:
     st.integers(0, 130),
     st.integers(0, 130),
 )
-def test_it_tells_what_there_is_from_a_number_on_up_to_the_next_gap(
+def test_it_answers_records_from_a_number_to_the_next_gap(
     numbers: list[int], data: st.DataObject, first: int, more: int
 ) -> None:
     played = data.draw(st.integers(0, len(numbers)))

@@ -84,13 +84,14 @@ def test_an_interrupted_suite_goes_on_to_the_same_bytes(whole: BenchResults, tmp
     assert files(again) == files(whole)
 
 
+@pytest.mark.long
 def test_what_runs_the_cells_enters_no_result(whole: BenchResults, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
         found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
     assert files(found) == files(whole)
 
 
-def test_seeds_are_other_runs_where_anything_is_drawn_and_the_same_twice(whole: BenchResults) -> None:
+def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> None:
     still, first, second = whole.runs
     assert (still.random, first.random) == (False, True)
     assert first.error_rad != second.error_rad
@@ -161,7 +162,7 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     assert "no contact" in build_bench_page(results, "trilat bench")
 
 
-def test_what_is_not_stable_is_so_in_a_run_of_twice_the_length() -> None:
+def test_what_is_not_stable_stays_so_over_twice_the_length() -> None:
     (cell,) = asked(links=["rtt272"]).cells
     run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=0.5), 1))
     assert run.stability is Stability.NOT_STABLE
@@ -175,7 +176,7 @@ def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
     return RecordBatch(t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int))
 
 
-def test_the_least_energy_is_that_of_the_outside_until_any_instant() -> None:
+def test_least_energy_is_that_of_outside_until_any_instant() -> None:
     """It puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
     t_ns = np.arange(3001) * 1_000_000
     power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
@@ -232,7 +233,7 @@ def test_a_run_lasts_for_forty_round_trips() -> None:
 
 
 @pytest.mark.long
-def test_a_shared_slave_errs_by_its_distance_from_the_mean_by_dominance() -> None:
+def test_shared_slave_errs_by_its_distance_from_mean_by_dominance() -> None:
     """After the handover the second user has three quarters; the error is of the present shares."""
     plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
     run = run_bench_task(BenchRunItem(plan.cells[0], 1))
@@ -252,7 +253,7 @@ def place(*errors: float | None) -> BenchPlace:
     return BenchPlace(cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)])
 
 
-def test_intervals_over_twenty_seeds_are_those_of_scipy_and_of_fewer_there_are_none() -> None:
+def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
     found: Any = place(*errors).mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
@@ -283,7 +284,7 @@ def test_every_link_fits_both_forms() -> None:
             assert sorted(cut) == sorted(name for name in scenario.links if "s" in name.split("->"))
 
 
-def test_the_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
+def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
     gains = read_gains()
     for study in STUDIES.values():
         for form, laws in study.laws.items():
@@ -345,9 +346,8 @@ def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> No
     assert words in str(refused.value)
 
 
-def test_a_folder_takes_more_of_the_suite_and_nothing_from_elsewhere(
-    whole: BenchResults, tmp_path: Path
-) -> None:
+@pytest.mark.long
+def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(whole: BenchResults, tmp_path: Path) -> None:
     first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
     made: list[int] = []
     more = run_bench(

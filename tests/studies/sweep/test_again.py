@@ -27,7 +27,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
 
 
-def test_the_command_of_a_cell_makes_its_numbers_bit_for_bit(results: SweepResults, tmp_path: Path) -> None:
+def test_command_of_cell_makes_its_numbers_bit_for_bit(results: SweepResults, tmp_path: Path) -> None:
     assert any(row["diverged_s"] is not None for row in results.rows)
     assert any(row["extended"] for row in results.rows)
     for row in results.rows:

@@ -36,7 +36,7 @@ def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -
     assert not run_cell(CellItem(same, same.cell(5), 1)).random
 
 
-def test_the_command_of_a_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
+def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
     plan = asked(tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"])
     run_cell(CellItem(plan, plan.cell(1), 1))
     words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))

@@ -50,7 +50,7 @@ def test_every_panel_has_its_own_lines() -> None:
 
 
 @pytest.mark.long
-def test_lines_do_not_depend_on_what_ran_nor_on_how_many_processes_there_are() -> None:
+def test_lines_depend_on_neither_runs_nor_processes() -> None:
     everything = results()
     one = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
     (closed, rooted), (again, other) = (
@@ -61,7 +61,7 @@ def test_lines_do_not_depend_on_what_ran_nor_on_how_many_processes_there_are() -
     assert np.array_equal(rooted.spare, other.spare)
 
 
-def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -> None:
+def test_for_short_delays_p_d_has_its_condition_as_line() -> None:
     """The mode at the edge is slow against 1/T there, and the condition exact: within 2 % at 100 ms."""
     at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.46, 0.48, 0.50, 0.52), "d")
@@ -74,7 +74,7 @@ def test_the_linear_line_of_p_d_is_at_its_condition_where_the_delay_is_short() -
 
 
 @pytest.mark.long
-def test_a_coarse_map_has_the_line_of_the_linear_analysis_to_its_digits() -> None:
+def test_coarse_map_has_line_of_linear_analysis_to_its_digits() -> None:
     """Another mode is the rightmost one from 0.6 on: straight between 0.2 and 0.7 the line were at 0.593."""
     at = partial(load_place, plan_sweep("p_d_margin"), (), *KEYS)
     damping = PlaneAxis("control.d", (0.2, 0.7, 1.2), "d")
@@ -98,7 +98,7 @@ def test_a_strip_has_no_lines() -> None:
     assert build_stability_map(SweepResults(asked, made), ()).lines == ((),)
 
 
-def test_a_place_of_a_panel_is_the_cell_of_the_plan() -> None:
+def test_place_of_panel_is_cell_of_plan() -> None:
     """What lines are drawn for is what runs: every cell's scenario, with every law."""
     asked = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
     made = []
@@ -144,7 +144,7 @@ def spare(excess: float) -> StabilityCriterion:
     return StabilityCriterion("", "", "", excess)
 
 
-def test_the_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
+def test_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
     """No d of the map is little enough for no delay, or enough for 800 ms."""
     line = trace_closed_form(at, DELAY, DAMPING)
     assert line is not None
@@ -159,7 +159,7 @@ def test_a_law_without_a_condition_has_no_line() -> None:
     assert trace_closed_form(lambda x, _: load_scenario("free", {"link.delay_ms": x}), DELAY, DAMPING) is None
 
 
-def test_a_condition_that_nothing_of_the_map_changes_has_no_line() -> None:
+def test_condition_that_nothing_of_map_changes_has_no_line() -> None:
     assert (
         trace_closed_form(
             lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}), DELAY, DAMPING
@@ -213,7 +213,7 @@ def test_a_column_may_be_crossed_again_and_again() -> None:
 
 
 @given(st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6), st.sampled_from([-1.0, 1.0]))
-def test_a_column_is_crossed_at_its_edges_however_near_they_are(shares: list[float], sign: float) -> None:
+def test_column_is_crossed_at_its_edges_however_near_they_are(shares: list[float], sign: float) -> None:
     side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
     edges = {n: n + share for n, share in enumerate(shares)}
     column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
@@ -229,7 +229,7 @@ def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
     assert line.crossings(0, side) == line.crossings(1, side) == [1.5]
 
 
-def test_where_nothing_changes_there_is_no_line_and_reasons_are_told_once() -> None:
+def test_where_nothing_changes_there_is_no_line() -> None:
     why = ["nobody knows the delay"]
     side = PlaneAxis("y", (0.0, 1.0), "y")
     line, remarks = trace_linear_analysis([GrowthColumn([np.nan, np.nan], {}, why)] * 2, side)
@@ -256,7 +256,7 @@ def test_equal_sites_ask_for_half_of_stiffness_times_delay(K: float, d: float, d
 
 
 @given(GAIN, GAIN, GAIN, GAIN, DELAY_MS, DELAY_MS)
-def test_two_sites_are_judged_by_the_sign_of_the_general_condition(
+def test_two_sites_are_judged_by_sign_of_general_condition(
     K1: float, K2: float, d1: float, d2: float, there_ms: int, back_ms: int
 ) -> None:
     names = load_scenario("p_d_margin_two").names
@@ -278,7 +278,7 @@ def test_of_two_equal_sites_both_conditions_are_one() -> None:
     assert excess(one) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_digital_scheme_rests_on_gravity_learnt_slower_than_a_tick_allows() -> None:
+def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> None:
     settings = {"scheme": "digital", "link.delay_ms": 0.0, "rate_hz": 100, "control.Gamma": 1.0}
     assert excess(load_scenario("paper", settings)) == pytest.approx(1.0 - 9.81**2 / 100)
     gravity = {**settings, "control.Gamma": [9.0, 9.0, 9.0, 1.0, 1.0]}
@@ -315,10 +315,10 @@ def test_play_out_counts_as_delay() -> None:
     [{"scheme": "digital"}, {"sites.s.rate_hz": 500}, {"control.d": 70.0}],
     ids=["another scheme", "two rates", "d h above the least inertia"],
 )
-def test_where_the_ticks_are_not_those_it_was_derived_for_it_says_nothing(changes: dict[str, Any]) -> None:
+def test_a_condition_says_nothing_at_other_tick_rates(changes: dict[str, Any]) -> None:
     assert evaluate_criterion(load_scenario("p_d_margin", changes)) is None
 
 
-def test_of_shares_that_turn_in_a_circle_the_roots_are_complex_and_nothing_is_said() -> None:
+def test_shares_in_a_circle_have_complex_roots_and_no_line() -> None:
     circle = {f"dominance.{a}": {b: 1.0} for a, b in (("m1", "m2"), ("m2", "s"), ("s", "m1"))}
     assert evaluate_criterion(load_scenario("p_d_margin", circle)) is None

@@ -123,7 +123,7 @@ def test_cells_are_spread_over_the_edge() -> None:
     assert max(delays) - min(delays) >= 300
 
 
-def test_undecided_cells_are_not_run_and_the_edge_is_beyond_them() -> None:
+def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> CellClass:
         return CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
 

@@ -144,7 +144,7 @@ def test_what_is_written_is_read_number_for_number(path: Path) -> None:
 
 
 @given(data=st.data())
-def test_a_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
+def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     cut = data.draw(st.integers(0, len(five)))
@@ -181,7 +181,7 @@ def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
     assert read(path, "another sweep") == FIVE
 
 
-def test_a_run_that_a_full_disk_refuses_is_not_done_and_says_how_to_go_on(path: Path) -> None:
+def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
     """`/dev/full` answers as a disk does that is full."""
     with opened(path, "sweep") as journal:
         journal.add(FIVE[0])

@@ -73,7 +73,7 @@ def test_what_the_scenarios_are_known_to_do(name: str, changes: dict[str, Any], 
 
 
 @pytest.mark.long
-def test_a_law_in_python_is_judged_as_the_same_law_of_the_kernel() -> None:
+def test_law_in_python_is_judged_as_same_law_of_kernel() -> None:
     """`tests.laws:Adaptive` is Eq. (13) and (15) by other code, with the gains of the scenario."""
     short = {"duration_s": 2.0, "link.delay_ms": 5.0}
     theirs = load_scenario("free", {**short, "control.law": "tests.laws:Adaptive"})
@@ -81,7 +81,7 @@ def test_a_law_in_python_is_judged_as_the_same_law_of_the_kernel() -> None:
 
 
 @pytest.mark.long
-def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
+def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
     """Of a growth of 0.01/s nothing is to be seen in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
@@ -96,7 +96,7 @@ def test_what_is_not_plain_goes_on_and_is_the_longer_run() -> None:
     assert msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict()) == found
 
 
-def test_a_slow_trend_of_a_run_with_chance_in_it_decides_nothing() -> None:
+def test_slow_trend_of_run_with_chance_in_it_decides_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
     found = judged(
         load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}), longest_s=160.0
@@ -113,7 +113,7 @@ def test_it_is_never_extended_beyond_what_was_asked() -> None:
 
 
 @pytest.mark.parametrize("d", [0.95, 1.05])
-def test_a_few_per_cent_beside_the_edge_the_word_is_right(d: float) -> None:
+def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
     """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here: what 20 s cannot tell, 160 s do."""
     scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
     found = judged(scenario, longest_s=160.0)

@@ -99,7 +99,7 @@ def found(*spans: StableInterval, stable: bool | None = None) -> GridPointMargin
     )
 
 
-def test_the_table_tells_edges_islands_and_what_there_is_none_of() -> None:
+def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
     edges = (StableInterval(0.49, 0.492, False, True), StableInterval(1.8, 2.1, True, False))
     every = [found(*edges), found(stable=True), found(stable=False), found()]
     grid = SweepMargins(asked(), WITHIN, every).table()
@@ -178,7 +178,7 @@ def test_what_stays_undecided_is_the_interval_that_is_given(edge: float, width: 
 
 
 @pytest.mark.parametrize("side", [True, False, None])
-def test_without_a_change_there_is_no_edge_and_the_side_is_told(side: bool | None) -> None:
+def test_without_change_there_is_no_edge_and_side_is_told(side: bool | None) -> None:
     found = search_key_margin(lambda _: side, 0.2, 3.0)
     assert (found.spans, found.stable, found.runs) == ((), side, SCAN_POINTS)
 
@@ -193,7 +193,7 @@ def test_an_island_has_both_its_shores() -> None:
 
 
 @given(st.floats(20.2, 299.8))
-def test_whole_numbers_are_narrowed_to_neighbours_and_nothing_else_is_run(edge: float) -> None:
+def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
     def stable(value: float) -> bool:
         assert value == round(value)
         return value > edge

@@ -31,7 +31,7 @@ def test_metrics_of_a_cell_are_those_of_its_log(tmp_path: Path) -> None:
         assert {key: row[key] for key in KEYS} == {key: of_run(log, key) for key in KEYS}
 
 
-def test_the_numbers_of_every_row_are_the_metrics_of_their_keys(tmp_path: Path) -> None:
+def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
     (row,) = trilat_net.sweep(
         "contact", ["link.delay_ms=20"], ["duration_s=12"], longest_s=12, out=tmp_path / "o", jobs=1
     ).rows
@@ -41,7 +41,7 @@ def test_the_numbers_of_every_row_are_the_metrics_of_their_keys(tmp_path: Path) 
     assert row["force_peak_n"] > 0.1
 
 
-def test_metrics_are_kept_with_the_results_and_in_a_sweep_that_goes_on(tmp_path: Path) -> None:
+def test_metrics_are_kept_with_results_of_a_resumed_sweep(tmp_path: Path) -> None:
     found = swept(tmp_path / "o")
     assert read_results(tmp_path / "o").to_rows() == found.to_rows()
     assert swept(tmp_path / "o").to_rows() == found.to_rows()

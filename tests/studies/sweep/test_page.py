@@ -152,7 +152,7 @@ def test_the_legend_has_only_what_occurs() -> None:
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
 
-def test_of_several_runs_the_share_is_drawn_with_a_scale_and_doubt_in_numbers() -> None:
+def test_several_runs_show_their_share_with_a_scale() -> None:
     plane = drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4)
     made = figure(plane, 7.0)
     share = meshes(made)[0].get_array()
@@ -167,7 +167,7 @@ def test_of_several_runs_the_share_is_drawn_with_a_scale_and_doubt_in_numbers() 
 
 
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
-def test_every_panel_is_there_with_its_title_and_one_label_for_all(panels: int, width_in: float) -> None:
+def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: float) -> None:
     plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
     made = figure(plane, width_in, (LINE,))
     assert made.get_figwidth() == width_in

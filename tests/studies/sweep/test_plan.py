@@ -91,14 +91,14 @@ def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
     assert (again.seeds, again.longest_s) == (cube.seeds, cube.longest_s)
 
 
-def test_a_law_that_all_sites_have_keeps_the_gains_of_the_scenario() -> None:
+def test_law_that_all_sites_have_keeps_gains_of_scenario() -> None:
     found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
     stays, other = (found.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
     assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
     assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
 
 
-def test_another_law_replaces_that_of_every_site_its_own_gains_too() -> None:
+def test_another_law_replaces_every_sites_law_and_gains() -> None:
     found = plan_sweep("contact", laws=["p_f", "p_d"])
     assert found.cell(0).overrides == ()
     of_all = found.scenario(*found.cell(1).overrides)
@@ -116,7 +116,7 @@ def test_seeds_are_counted_from_the_scenarios_own_or_named(tmp_path: Path) -> No
     assert "from 0 to 2^63 - 1, not -1" in refused("paper", seeds=[-1])
 
 
-def test_an_undecided_cell_may_run_eight_times_as_long_unless_told_otherwise(tmp_path: Path) -> None:
+def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
     assert asked(tmp_path).longest_s == 4.0
     assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
     assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
@@ -136,7 +136,7 @@ def test_an_undecided_cell_may_run_eight_times_as_long_unless_told_otherwise(tmp
         (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
     ],
 )
-def test_an_axis_that_cannot_be_right_is_refused_before_anything_runs(
+def test_axis_that_cannot_be_right_is_refused_before_anything_runs(
     over: list[str], words: tuple[str, ...]
 ) -> None:
     problem = refused("p_d_margin", over=over)
@@ -175,7 +175,7 @@ def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str
         assert word in problem
 
 
-def test_an_axis_that_a_swept_law_has_not_is_refused_with_the_law() -> None:
+def test_axis_that_swept_law_has_not_is_refused_with_law() -> None:
     problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
     assert "control.d: with law adaptive: unknown key" in problem
     assert "is swept twice" in refused("p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"])
@@ -193,7 +193,7 @@ def axis_refused(text: str) -> str:
 
 
 @given(first=decimals, step=steps, count=st.integers(1, 300), beyond=st.decimals(0, Decimal("0.9"), places=2))
-def test_a_range_is_its_first_value_and_whole_steps_up_to_its_end(
+def test_a_range_is_whole_steps_from_its_first_value(
     first: Decimal, step: Decimal, count: int, beyond: Decimal
 ) -> None:
     last = first + (count - 1 + beyond) * step
@@ -264,7 +264,7 @@ def test_a_range_of_very_many_values_takes_no_room() -> None:
         ("duration_s=1,2", ("longest_s",)),
     ],
 )
-def test_what_makes_no_axis_is_refused_with_what_would_be_right(text: str, words: tuple[str, ...]) -> None:
+def test_an_invalid_axis_is_refused_with_a_valid_one(text: str, words: tuple[str, ...]) -> None:
     problem = axis_refused(text)
     for word in words:
         assert word in problem

@@ -170,7 +170,7 @@ def test_what_a_number_means_is_told_by_the_scenario() -> None:
     )
 
 
-def test_every_suffix_of_a_shipped_arm_and_its_limits_is_a_unit() -> None:
+def test_every_suffix_of_shipped_arm_and_its_limits_is_unit() -> None:
     """No label shows a piece of a unit as if it were a word."""
     spec = next(iter(load_scenario(list_shipped()[0]).sites.values()))
     for table in (spec.arm, spec.limits):

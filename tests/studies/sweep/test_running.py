@@ -42,7 +42,7 @@ class _StopError(Exception):
     pass
 
 
-def test_what_is_done_is_not_done_again_wherever_it_was_interrupted(tmp_path: Path, judge: Judge) -> None:
+def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> None:
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
     run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
     whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
@@ -99,7 +99,7 @@ def test_an_estimate_counts_seeds_where_something_is_random(tmp_path: Path, judg
     assert judge.texts
 
 
-def test_an_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
+def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
     with pytest.raises(UsageError) as error:
@@ -114,7 +114,7 @@ def test_an_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) 
     assert len(judge.texts) == 8
 
 
-def test_a_cell_that_cannot_run_is_named_and_what_is_done_is_kept(tmp_path: Path, judge: Judge) -> None:
+def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
     """The ends of both axes are fine alone and together; a pair between them is not."""
     sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
     folder = prepare_sweep_folder(sweep, tmp_path / "o")

@@ -64,7 +64,7 @@ def test_rows_are_in_the_order_of_cells_and_seeds(swept: tuple[Path, SweepResult
         results.of_cell(8)
 
 
-def test_bytes_do_not_depend_on_the_order_in_which_runs_ended(
+def test_bytes_do_not_depend_on_order_in_which_runs_ended(
     swept: tuple[Path, SweepResults, Judge],
 ) -> None:
     path, results, _ = swept
@@ -135,7 +135,7 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
     refused(tmp_path / "other.parquet", "holds no results of a sweep")
 
 
-def test_without_polars_or_with_an_old_one_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_polars_or_with_old_one_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "polars", types.ModuleType("polars"))
     with pytest.raises(UsageError, match=r"polars 1\.30 or newer: pip install"):
         require_polars()
@@ -185,7 +185,7 @@ def test_intervals_are_those_of_a_published_table(successes: int, runs: int, low
 
 
 @pytest.mark.parametrize("runs", [10, 20, 100])
-def test_the_truth_lies_inside_95_times_of_100_on_the_average_over_shares(runs: int) -> None:
+def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
     """Coverage by the binomial sums, over even shares: 0.95 within 0.01; nowhere below 0.83."""
     shares = np.linspace(0.0005, 0.9995, 1000)
     held = np.zeros(len(shares))

@@ -323,7 +323,7 @@ def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any
             np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
 
 
-def test_any_metric_may_be_expected_of_a_run_and_of_its_log() -> None:
+def test_any_metric_may_be_expected_of_run_and_log() -> None:
     """Equal to what `trilat compare` has of the whole run; what has no number does not hold, and says why."""
     asked = {"chatter_nm": [0.0, 1e-9], "rms_error_rad": [0.0, 10.0], "theta_error_last": [0.0, 1.0]}
     scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})

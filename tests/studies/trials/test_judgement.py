@@ -126,7 +126,7 @@ def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: f
             assert outcome.held == (abs(off) < within)
 
 
-def test_every_site_with_a_pose_has_an_outcome_of_its_own() -> None:
+def test_every_site_with_pose_has_outcome_of_its_own() -> None:
     outcomes = evaluate_expectations(Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM)
     assert [(o.key, o.held) for o in outcomes] == [("end_pose_rad.m1", True), ("end_pose_rad.s", False)]
     assert not only(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
@@ -146,9 +146,7 @@ def window(**limits: Any) -> Expect:
 
 
 @given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
-def test_a_quantity_of_a_window_holds_where_all_of_it_lies_between_its_limits(
-    least: float, width: float
-) -> None:
+def test_a_windows_quantity_holds_wholly_between_its_limits(least: float, width: float) -> None:
     most = least + width
     for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
         outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
@@ -159,12 +157,12 @@ def test_a_quantity_of_a_window_holds_where_all_of_it_lies_between_its_limits(
             assert outcome.held == (outcome.margin >= 0.0)
 
 
-def test_a_window_that_the_run_did_not_reach_does_not_hold() -> None:
+def test_window_that_run_did_not_reach_does_not_hold() -> None:
     outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
     assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
 
 
-def test_a_window_names_its_units_and_all_sites_where_it_is_of_all() -> None:
+def test_a_window_names_units_and_all_sites() -> None:
     asked = ExpectWindow(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0))
     outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
@@ -202,7 +200,9 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
     return outcome.held
 
 
-@pytest.mark.parametrize(("three", "below", "above"), [(True, 0.9, 1.3), (False, 1.8, 2.5)])
+@pytest.mark.parametrize(
+    ("three", "below", "above"), [pytest.param(True, 0.9, 1.3, marks=pytest.mark.long), (False, 1.8, 2.5)]
+)
 def test_the_verdict_changes_at_the_margin_of_theory(three: bool, below: float, above: float) -> None:
     assert held(three, below, stable=False)
     assert not held(three, below, stable=True)
@@ -211,7 +211,7 @@ def test_the_verdict_changes_at_the_margin_of_theory(three: bool, below: float, 
 
 
 @pytest.mark.long
-def test_jitter_of_the_same_mean_decays_where_the_constant_delay_grows_and_play_out_diverges() -> None:
+def test_jitter_decays_where_constant_delay_grows_and_play_out_diverges() -> None:
     jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
     assert held(True, 0.6, stable=True, **jitter)
     assert held(True, 0.6, stable=False, delay_ms=200.0)

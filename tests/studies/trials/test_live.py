@@ -26,7 +26,7 @@ def written(folder: Path, data: bytes) -> Path:
     return path
 
 
-def test_a_session_that_ended_in_order_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
+def test_session_that_ended_in_order_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
     log = written(tmp_path, recorded("free"))
     result = evaluate_live_log(trial, log, [], 1.0)
     assert result.held
@@ -49,7 +49,7 @@ def test_missing_records_fail_it(trial: Trial, tmp_path: Path) -> None:
     ]
 
 
-def test_a_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path: Path) -> None:
+def test_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path: Path) -> None:
     def bent(record: dict) -> dict:  # type: ignore[type-arg]
         return {**record, "tau": [0.0, 1.0]} if (record["site"], record["tick"]) == ("s", 50) else record
 
@@ -60,7 +60,7 @@ def test_a_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_pa
 
 
 @pytest.mark.parametrize("content", [None, b"no log", "empty"])
-def test_without_records_there_is_no_result_and_the_reason_is_told(
+def test_without_records_there_is_no_result_and_reason_is_told(
     content: bytes | str | None, trial: Trial, tmp_path: Path
 ) -> None:
     log = tmp_path / "run.mcap"

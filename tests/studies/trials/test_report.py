@@ -20,7 +20,7 @@ def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
     return ExpectationResult(key, margin >= 0.0, f"{0.1 * (1 - margin):.4g} rad", "≤ 0.1 rad", margin)
 
 
-def test_a_row_shows_the_worst_of_its_runs_and_how_many_held() -> None:
+def test_row_shows_worst_of_its_runs_and_how_many_held() -> None:
     report = TrialReport([result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0)
     (row,) = report.rows()
     assert (row.worst.margin, row.held, row.runs) == (-0.2, 2, 4)
@@ -36,7 +36,7 @@ def test_what_failed_comes_before_the_smallest_margin() -> None:
     assert row.worst is failed
 
 
-def test_every_failed_run_is_named_and_the_first_ones_with_their_commands() -> None:
+def test_every_failed_run_is_named_first_ones_with_commands() -> None:
     report = TrialReport([result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0)
     lines = report.failures()
     for seed in range(1, MAX_FAILURES_SHOWN + 1):
@@ -127,7 +127,7 @@ def test_the_shape_is_the_one_that_readers_know() -> None:
         assert element.tag not in ("testsuite", "testcase", "property") or element.get("name")
 
 
-def test_a_suite_per_scenario_a_case_per_run_and_the_counts_add_up() -> None:
+def test_suite_per_scenario_case_per_run_and_counts_add_up() -> None:
     root = document(mixed())
     suites = root.findall("testsuite")
     assert [suite.get("name") for suite in suites] == ["quick.toml", "b.toml"]

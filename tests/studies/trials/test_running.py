@@ -25,7 +25,7 @@ def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], 
 
 
 @pytest.mark.long
-def test_two_processes_give_the_results_of_one_in_the_same_order() -> None:
+def test_two_processes_give_results_of_one_in_same_order() -> None:
     batch = trilat_net.trials(quick(), [5, 2, 9, 4])
     told: list[TrialResult] = []
     report = run_trials(batch, 2, told.append)
@@ -100,7 +100,7 @@ RECIPE = textwrap.dedent(str(trilat_net.studies.trials.__doc__).split("per seed:
 
 
 @pytest.mark.long
-def test_the_recipe_gives_a_test_per_seed_that_fails_with_figures(quick_file: Path, tmp_path: Path) -> None:
+def test_recipe_gives_test_per_seed_that_fails_with_figures(quick_file: Path, tmp_path: Path) -> None:
     """The same lines on a scenario that holds, and on one that does not."""
     assert len(RECIPE.strip().splitlines()) <= 10
     for good in (True, False):

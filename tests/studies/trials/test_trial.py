@@ -18,7 +18,7 @@ from .results import TOO_MUCH, quick
 CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
 
 
-def test_a_random_scenario_has_a_trial_per_seed_each_with_its_own_run(quick_file: Path) -> None:
+def test_a_random_scenario_has_a_trial_per_seed(quick_file: Path) -> None:
     batch = trilat_net.trials(quick_file, [3, 1, 3, 2])
     assert [trial.scenario.seed for trial in batch] == [3, 1, 2]
     assert len({trial.scenario.sha256 for trial in batch}) == 3
@@ -26,7 +26,7 @@ def test_a_random_scenario_has_a_trial_per_seed_each_with_its_own_run(quick_file
     assert len({trial.run().outcomes[-1].measured for trial in batch}) == 3
 
 
-def test_where_nothing_is_random_one_run_tells_all_unless_a_network_has_a_say() -> None:
+def test_without_chance_or_network_one_run_tells_all() -> None:
     constant = quick(**CONSTANT)
     assert [trial.scenario.seed for trial in trilat_net.trials(constant, range(4, 9))] == [4]
     assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
@@ -38,14 +38,14 @@ def test_a_seed_out_of_range_is_refused(seed: int) -> None:
         trilat_net.trials(quick(), [seed])
 
 
-def test_a_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file: Path) -> None:
+def test_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file: Path) -> None:
     quick_file.write_text(quick_file.read_text().partition("[expect]")[0])
     for source in (quick_file, load_scenario(quick_file)):
         with pytest.raises(ScenarioError, match=r"quick.*\[expect\].*stable = true"):
             trilat_net.trials(source)
 
 
-def test_what_is_expected_of_a_time_that_no_run_reaches_is_refused() -> None:
+def test_an_expectation_of_an_unreached_time_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"synchronised_by_s.*0\.5 s"):
         trilat_net.trials(quick(), set={"expect.synchronised_by_s": 0.5})
     window = {"from_s": 0.4, "to_s": 0.6, "error_peak_rad": [0.0, 1.0]}
@@ -60,7 +60,7 @@ def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
     assert [outcome.key for outcome in result.outcomes] == ["peak_error_max_rad", "mean_age_max_ms"]
 
 
-def test_a_trial_that_fails_says_what_by_how_much_and_how_to_repeat_it(quick_file: Path) -> None:
+def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
     (trial,) = trilat_net.trials(quick_file, [7], TOO_MUCH)
     with pytest.raises(AssertionError) as failed:
         trial.check()
@@ -94,5 +94,5 @@ def test_a_table_as_an_override_is_told_key_by_key() -> None:
     assert shlex.split(trial.again)[-4:] == ["--set", 'link.model="constant"', "--set", "link.delay_ms=60"]
 
 
-def test_a_scenario_in_memory_is_called_by_a_file_that_it_could_be_saved_in() -> None:
+def test_a_scenario_in_memory_is_called_by_a_file_name() -> None:
     assert trilat_net.trials(quick())[0].again == "trilat test ./quick.toml --seeds 1"

@@ -58,7 +58,7 @@ def test_hands_take_it_where_stiff_arms_rest(K1: float, K2: float, x: float) -> 
     assert at_end(scenario)[0] == pytest.approx(rest.mean(), abs=1e-4)
 
 
-def test_a_joint_that_nobody_holds_stays_and_so_does_what_is_let_go() -> None:
+def test_a_joint_that_nobody_holds_stays() -> None:
     scenario = trio(hand("m1", (0.5, 0.7), (100.0, 0.0), start=0.5, end=1.0))
     before, held, after = compute_consensus_pose(scenario, np.array([0.2, 0.7, 1.9]))
     free = compute_consensus_pose(trio(), np.array([0.0]))[0]
@@ -79,7 +79,7 @@ def test_a_hand_moves_it_along_a_minimum_jerk_path() -> None:
     assert path[:, 1] == pytest.approx(2.0 * path[:, 0])
 
 
-def test_the_twin_has_no_torque_without_a_target_and_no_wall() -> None:
+def test_twin_has_no_torque_without_target_and_no_wall() -> None:
     assert build_twin(trio()) is None
     assert build_twin(trio(hand("m1", (0.3, -0.2), (9.0, 9.0)))) is None
     for setting in (PULSE, WALL):
@@ -103,7 +103,7 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
         ("sites.m2.plant=external", "sites.m2.plant: is external: that arm is outside of the program"),
     ],
 )
-def test_what_only_runs_live_or_has_no_common_angles_is_refused(setting: str, word: str) -> None:
+def test_a_scenario_without_common_angles_is_refused(setting: str, word: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         check_comparable(load_scenario("free", [setting, 'task.axes=["x", "y"]'][: 1 + ("task" in setting)]))
     assert word in str(refused.value)

@@ -44,7 +44,7 @@ def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
         (CALM, 0.1, 0.5, CandidateClass.APART),
     ],
 )
-def test_the_class_is_the_judgement_of_the_run_and_the_pose(
+def test_class_is_judgement_of_run_and_pose(
     end: RunEnd, fall_rad: float, apart_rad: float, outcome: CandidateClass
 ) -> None:
     assert classify_candidate((end, end), fall_rad, apart_rad) is outcome

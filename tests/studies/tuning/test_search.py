@@ -60,9 +60,7 @@ def test_the_seed_decides_all(law: str, budget: int, seed: int) -> None:
 
 @settings(max_examples=20)
 @given(law=LAWS, budget=BUDGETS, seed=SEEDS)
-def test_the_first_half_has_one_candidate_in_every_slice_of_every_range(
-    law: str, budget: int, seed: int
-) -> None:
+def test_the_first_half_samples_every_slice_of_every_range(law: str, budget: int, seed: int) -> None:
     """What makes a Latin hypercube of it (McKay, Beckman and Conover 1979)."""
     first = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR).ask(0)
     for knob in SEARCH_SPACES[law].knobs:
@@ -105,7 +103,7 @@ SCORES = st.lists(st.builds(score, st.sampled_from(list(CandidateClass)), NUMBER
 
 
 @given(points=POINTS)
-def test_nothing_that_competes_is_better_than_a_point_of_the_front(
+def test_nothing_that_competes_is_better_than_point_of_front(
     points: list[tuple[float, float] | None],
 ) -> None:
     competing = [point for point in points if point is not None]
@@ -124,7 +122,7 @@ def test_what_is_left_out_is_dominated_or_a_double(points: list[tuple[float, flo
 
 
 @given(points=POINTS)
-def test_a_front_is_in_the_order_of_effort_and_its_objective_falls(
+def test_front_is_in_order_of_effort_and_its_objective_falls(
     points: list[tuple[float, float] | None],
 ) -> None:
     kept = [point for n in find_pareto_front(points) if (point := points[n]) is not None]
@@ -140,7 +138,7 @@ def test_only_runs_that_settled_compete(scores: list[CandidateScore]) -> None:
             assert scores[n].outcome is CandidateClass.SETTLED
 
 
-def test_the_ends_of_a_front_are_loneliest_and_equal_gaps_are_equal() -> None:
+def test_ends_of_front_are_loneliest_and_equal_gaps_are_equal() -> None:
     assert compute_crowding([(4.0, 0.0), (3.0, 1.0), (2.0, 2.0), (0.0, 4.0)]) == [
         float("inf"),
         1.0,

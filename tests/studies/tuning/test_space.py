@@ -33,7 +33,7 @@ HELD = ("tdpa", "tanks", "wave")
 
 @pytest.mark.parametrize("law", sorted(SEARCH_SPACES))
 @pytest.mark.parametrize("scenario", ["contact", "free"])
-def test_a_candidate_is_its_law_at_every_site_and_nothing_else_changes(law: str, scenario: str) -> None:
+def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str) -> None:
     if law == "p_f" and scenario == "free":
         return
     scheme = ["scheme=digital"] if law in HELD else []
@@ -54,7 +54,7 @@ def test_a_candidate_is_its_law_at_every_site_and_nothing_else_changes(law: str,
     assert len(with_same_control) == len(experiment.scenario.names)
 
 
-def test_a_scenario_whose_sites_have_their_own_control_is_changed_site_by_site() -> None:
+def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
     found: TuningScenario = load_tuning_scenario("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
@@ -83,7 +83,7 @@ def six(state: ChainState, **overrides: object) -> TuningScenario:
     )
 
 
-def test_joints_of_chains_share_a_gain_by_the_inertia_that_pinocchio_says_they_show() -> None:
+def test_joints_share_a_gain_by_the_inertia_of_pinocchio() -> None:
     armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     for state in chain_references()["arm6"].states:
         inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
@@ -101,9 +101,7 @@ def test_joints_of_chains_share_a_gain_by_the_inertia_that_pinocchio_says_they_s
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("armature_kg_m2", [0.0, 0.001, 0.2])
-def test_every_choice_within_the_ranges_is_one_that_the_arms_can_take(
-    armature_kg_m2: float, scheme: str
-) -> None:
+def test_every_choice_within_ranges_is_one_that_arms_can_take(armature_kg_m2: float, scheme: str) -> None:
     state, *_ = chain_references()["arm6"].states
     small = {"law": "p_d", "K": 1.0, "d": 1e-3}
     experiment = six(state, scheme=scheme, control=small, **{"arm.armature_kg_m2": armature_kg_m2})
@@ -154,7 +152,7 @@ def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
 
 
 @given(percent=SHARES)
-def test_all_are_told_one_share_of_gravity_and_nothing_of_inertia(percent: float) -> None:
+def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> None:
     scenario = trio()
     prior = np.array(build_model_information(percent).prior(scenario, "m1"))
     truth = np.array([2.0, 1.0])  # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)

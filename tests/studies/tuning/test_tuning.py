@@ -27,7 +27,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
 
 
 @pytest.mark.long
-def test_the_same_request_makes_the_same_result_whatever_the_number_of_processes(
+def test_same_request_makes_same_result_whatever_number_of_processes(
     found: TuningResult, tmp_path: Path
 ) -> None:
     again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
@@ -41,7 +41,7 @@ def test_every_law_has_its_budget_and_every_run_one_outcome(found: TuningResult)
         assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
 
 
-def test_the_clamp_and_all_but_the_law_are_the_same_for_every_candidate(found: TuningResult) -> None:
+def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult) -> None:
     shared = set()
     for one in found.found:
         for place in range(len(one.tried)):
@@ -55,7 +55,7 @@ def test_the_clamp_and_all_but_the_law_are_the_same_for_every_candidate(found: T
     assert next(iter(shared))[0][0].tau_limit_nm == 60.0
 
 
-def test_a_front_is_not_dominated_and_what_all_share_is_not_by_any_law(found: TuningResult) -> None:
+def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
     points = {
         one.space.law: [found.plan.objective.point(score) for score in one.scores] for one in found.found
     }
@@ -134,7 +134,7 @@ def test_a_search_that_would_take_days_is_refused() -> None:
         plan_tuning("free", ["duration_s=86400"])
 
 
-def test_the_time_is_told_before_and_is_of_the_right_order(tmp_path: Path) -> None:
+def test_time_is_told_before_and_is_of_right_order(tmp_path: Path) -> None:
     few = asked(tmp_path, laws=["p_d"], budget=8)
     assert 0.0 < few.estimate_s(1) < 600.0
     assert few.runs == 10
