@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from ..errors import LogRefused, UsageError
 from ..files import publish_file, refuse_existing, sync_folder
@@ -35,7 +35,7 @@ class DiskReserve:
     def __init__(self, folder: Path) -> None:
         self.size = 0
         self._folder = folder
-        self._file: BinaryIO | None = None
+        self._file: IO[bytes] | None = None
         self._possible = True
 
     def grow(self, size: int) -> None:
