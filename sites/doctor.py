@@ -352,7 +352,7 @@ _RATES = (
 def examine_rate() -> DoctorFinding:
     """Returns the highest tick rate that a site alone holds here and now, measured for a second each."""
     if not is_core_cached():
-        return DoctorFinding("rate", "warn", "not measured: the core is not yet compiled")
+        return DoctorFinding("rate", "warn", "not measured: the core is not yet compiled, see below")
     done = subprocess.run([sys.executable, "-c", _RATES], capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         return DoctorFinding("rate", "warn", "could not be measured")
@@ -360,7 +360,9 @@ def examine_rate() -> DoctorFinding:
     within = f"{HELD_SHARE:.0%} of the ticks began within {last.late_us / 1e3:.2f} ms of their time"
     text = f"{within}, all within {last.largest_us / 1e3:.1f} ms"
     if not last.held:
-        return DoctorFinding("rate", "fail", f"a site alone does not even hold {last.rate_hz} Hz: {text}")
+        return DoctorFinding(
+            "rate", "fail", f"a site alone holds not even {last.rate_hz} Hz: {text}; end other programs"
+        )
     text = f"a site alone holds {last.rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
     if missed:
         text += f"; at {missed[-1].rate_hz} Hz within {missed[-1].late_us / 1e3:.2f} ms: lower rate_hz"
