@@ -78,6 +78,9 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	for other in win32 darwin; do \
+		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net || exit 1; \
+	done
 	$(BIN)/lint-imports
 
 faults: $(VENV)/dev.stamp

@@ -152,7 +152,7 @@ def _start(
 ) -> tuple[list[_Child], _Child]:
     """Starts every site and the recorder; their output goes into `processes/`."""
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
-    file.write_text(scenario.text, encoding="utf-8")
+    file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     connect = [["--connect", endpoint] for endpoint in endpoints]

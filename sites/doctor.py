@@ -1,11 +1,12 @@
-"""What stands in the way of a session on this machine: keys, links, clock, rights, room; a finding each.
+"""What stands in the way of a session on this machine: keys, links, clock, rights, rate and room.
 
 Invariant: nothing is changed and nothing is sent but what a member sends that connects; a finding says what
-was found, and, unless it is well, what to do. The rights are those that a process of its own got.
+was found, and, unless it is well, what to do. Rights and rate are those that a process of its own got.
 """
 
 import json
 import os
+import platform
 import re
 import shutil
 import socket
@@ -21,7 +22,10 @@ from typing import Any, Literal, NamedTuple
 
 from trilat_net import process
 from trilat_net.core.jit import is_core_cached
+from trilat_net.core.site_step import Site
+from trilat_net.core.ticks import NS_PER_S, Arrival, TickInput, TickRecord
 from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.files import find_rights_of_others
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
     ENCRYPTED,
@@ -31,11 +35,16 @@ from trilat_net.net.connection import (
     resolve_member_connection,
     secure_connection,
 )
+from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
+from trilat_net.net.timing import SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
+from trilat_net.scenario import Scenario, load_scenario
 
 from .session_ping import ping_session
+from .site_loop import PeerInbox, StateBlock, run_loop
+from .site_parts import warm_up
 
 FindingState = Literal["ok", "warn", "fail"]
 ENDS_SOON = timedelta(days=7)
@@ -45,6 +54,9 @@ LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
 STEADY_NS, STEP_NS, BOUND_US = 100_000_000, 1_000_000, 1_000
 """How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
 PINGS = 20
+RATES_HZ, REHEARSAL_S = (1000, 500, 200, 100), 1.0
+HELD_PERIODS, HELD_SHARE = 0.5, 0.99
+"""A rate is held if this share of its ticks begins in this part of a period, from when each is due."""
 
 
 class DoctorFinding(NamedTuple):
@@ -81,7 +93,9 @@ def examine_machine(
     if session is not None:
         safe = secure_connection(connection, owned, insecure=insecure)
         yield from examine_offsets(safe, clock, session)
+    yield examine_system()
     yield from examine_rights()
+    yield examine_rate()
     yield from examine_room(folder)
 
 
@@ -108,7 +122,7 @@ def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
         yield DoctorFinding("keys", "warn", f"{text}: soon; make new ones for all with trilat keys new")
     else:
         yield DoctorFinding("keys", "ok", text)
-    if folder.stat().st_mode & 0o077:
+    if find_rights_of_others(folder):
         yield DoctorFinding("keys", "warn", f"others can look into {folder}: chmod 700 {folder}")
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
@@ -249,7 +263,7 @@ _RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(pre
 
 def examine_rights() -> Iterator[DoctorFinding]:
     """Yields which real-time settings a site would get."""
-    done = subprocess.run([sys.executable, "-c", _RIGHTS], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", _RIGHTS], capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         yield DoctorFinding("rights", "warn", "could not be tried")
         return
@@ -261,6 +275,98 @@ def examine_rights() -> Iterator[DoctorFinding]:
         yield DoctorFinding(
             "rights", "ok" if got else "warn", f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
         )
+
+
+def examine_system() -> DoctorFinding:
+    """Returns which half of the program is promised on this system."""
+    name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
+    if name == "Linux":
+        return DoctorFinding("system", "ok", "Linux: live sessions and studies are both promised")
+    text = f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+    return DoctorFinding("system", "warn", text)
+
+
+class Rehearsal(LoopStats):
+    """The live loop of a site alone: all that it does in a tick but for the network."""
+
+    def __init__(self, scenario: Scenario, name: str) -> None:
+        self._stepped, self._ticks = Site(scenario.setup(name)), scenario.ticks(name)
+        super().__init__(self._stepped, 1, [scenario.sites[peer].rate_hz for peer in self._stepped.peers])
+        self._late_us: list[int] = []
+
+    def run(self, clock: Clock) -> list[int]:
+        """Makes its ticks in real time; returns how late each began, us."""
+        inbox = PeerInbox((), (), (), (), (), self.dropped, ())
+        timing = SiteTiming(clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), "")
+        timed: Any = (clock, inbox, timing, self, StateBlock(self._stepped, 1, lambda _: None), self)
+        run_loop(self._stepped, 1, self._ticks, *timed)
+        return self._late_us
+
+    def tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+        """Counts one tick, and keeps its lateness."""
+        super().tick(late_us, busy_us, skipped)
+        self._late_us.append(late_us)
+
+    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
+        """Steps the site."""
+        return self._stepped.step(TickInput(k, arrivals))
+
+    def attend(self, *_: object) -> bool:
+        """Drops what a site would send and tell; nobody asks anything, or ends it."""
+        return False
+
+    publish_sample = publish_link = report = should_stop = use_slack = attend
+
+
+class HeldRate(NamedTuple):
+    """A rate (Hz), the lateness (us) within which `HELD_SHARE` of its ticks began, and the largest."""
+
+    rate_hz: int
+    late_us: int
+    largest_us: int
+
+    @property
+    def held(self) -> bool:
+        """True if that is within `HELD_PERIODS`."""
+        return self.late_us <= HELD_PERIODS * 1e6 / self.rate_hz
+
+
+def rehearse_rates(clock: Clock) -> list[HeldRate]:
+    """Runs a site at one rate after the other until one is held, the last is held, or none."""
+    found: list[HeldRate] = []
+    for rate_hz in RATES_HZ:
+        if not found or not found[-1].held:
+            scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
+            warm_up(scenario, "s", clock)
+            late_us = sorted(Rehearsal(scenario, "s").run(clock))
+            found.append(HeldRate(rate_hz, late_us[int(HELD_SHARE * len(late_us))], late_us[-1]))
+    return found
+
+
+_RATES = (
+    "import json; from sites import doctor, realtime; realtime.prepare(None); "
+    "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
+)
+
+
+def examine_rate() -> DoctorFinding:
+    """Returns the highest tick rate that a site alone holds here and now, measured for a second each."""
+    if not is_core_cached():
+        return DoctorFinding("rate", "warn", "not measured: the core is not yet compiled, see below")
+    done = subprocess.run([sys.executable, "-c", _RATES], capture_output=True, encoding="utf-8", check=False)
+    if done.returncode:
+        return DoctorFinding("rate", "warn", "could not be measured")
+    *missed, last = (HeldRate(*one) for one in json.loads(done.stdout.splitlines()[-1]))
+    within = f"{HELD_SHARE:.0%} of the ticks began within {last.late_us / 1e3:.2f} ms of their time"
+    text = f"{within}, all within {last.largest_us / 1e3:.1f} ms"
+    if not last.held:
+        return DoctorFinding(
+            "rate", "fail", f"a site alone holds not even {last.rate_hz} Hz: {text}; end other programs"
+        )
+    text = f"a site alone holds {last.rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
+    if missed:
+        text += f"; at {missed[-1].rate_hz} Hz within {missed[-1].late_us / 1e3:.2f} ms: lower rate_hz"
+    return DoctorFinding("rate", "warn" if missed else "ok", text)
 
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:

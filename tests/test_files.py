@@ -1,5 +1,6 @@
 """An export is there as a whole or not at all, and replaces only what one asks it to replace."""
 
+import ast
 import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -7,8 +8,18 @@ from pathlib import Path
 
 import pytest
 
+from tests import house
+from tests.other_systems import replace_os
+from trilat_net import files
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.files import make_results_folder, open_regular, refuse_existing, stage_output, write_whole
+from trilat_net.files import (
+    make_results_folder,
+    open_regular,
+    refuse_existing,
+    stage_output,
+    sync_folder,
+    write_whole,
+)
 from trilat_net.reporting.export import EXPORT_MANIFEST
 
 
@@ -103,6 +114,48 @@ def test_a_file_is_written_whole_or_what_was_there_stays(
         write_whole(path, "3", remedy="make room")
     assert raised.value.exit_code == 5
     assert everything(tmp_path) == {"report.json": "1"}
+
+
+def test_a_file_that_is_open_elsewhere_stays_with_the_functions_of_windows_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows replaces no file that a program has open."""
+    write_whole(tmp_path / "report.json", "1")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(UsageError, match=r"report.json: cannot be written: Permission denied"):
+        write_whole(tmp_path / "report.json", "2")
+    with pytest.raises(UsageError, match=r"report.json: cannot be written: Permission denied"):
+        make(tmp_path / "report.json", "3", folder=False, force=True)
+    assert everything(tmp_path) == {"report.json": "1"}
+
+
+def test_a_folder_that_cannot_be_synced_is_left_with_the_functions_of_windows_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows opens no folder."""
+
+    def refuse(*_: object) -> int:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(files, "os", replace_os(open=refuse))
+    sync_folder(tmp_path)
+
+
+def test_every_text_that_is_written_states_its_line_ends() -> None:
+    """A stream of text translates them on Windows; `write_whole` and bytes do not."""
+    found = []
+    for path in house.files():
+        for call in (node for node in ast.walk(house.tree(path)) if isinstance(node, ast.Call)):
+            name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+            modes = [one.value for one in call.args if isinstance(one, ast.Constant)]
+            writes = name == "write_text" or (name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes})
+            if writes and "newline" not in {keyword.arg for keyword in call.keywords}:
+                found.append((path.name, call.lineno))
+    assert not found
 
 
 def test_link_stays_link_and_device_is_written_to(tmp_path: Path) -> None:

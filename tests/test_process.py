@@ -1,18 +1,23 @@
 """A signal is a value that a loop polls; worker processes leave Ctrl-C to their parent."""
 
 import contextlib
+import multiprocessing
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.net.waiting import until
-from trilat_net.process import ENDING_SIGNALS, Interrupt, hold_sigint, worker_pool
+from tests.other_systems import replace_os
+from trilat_net import process
+from trilat_net.process import ENDING_SIGNALS, Interrupt, hold_sigint, join_words, worker_pool
 
 
 def test_a_signal_is_remembered_and_ends_nothing() -> None:
@@ -153,3 +158,47 @@ def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> Non
 def unmasked(act: Callable[[], None]) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     act()
+
+
+WINDOWS_WORDS = ["trilat", "sweep", r"my runs\\one", "m1->s", 'say "no"', r"C:\\runs", "--set", "a=-1.5"]
+
+
+def test_a_command_is_quoted_as_the_shell_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shlex.split(join_words(WINDOWS_WORDS)) == WINDOWS_WORDS
+    monkeypatch.setattr(process, "os", replace_os())
+    plain = r'trilat sweep "my runs\\one" "m1->s" "say \"no\"" C:\\runs --set a=-1.5'
+    assert join_words(WINDOWS_WORDS) == plain
+
+
+class ProcessEndedError(Exception):
+    """Stands for the end of a process."""
+
+
+def test_a_worker_ends_with_its_parent_with_the_functions_of_windows_replaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """There the number of a parent that has gone stays the same; a handle to it, here a pipe, tells."""
+    ended, alive = multiprocessing.Pipe()
+    codes: list[int] = []
+
+    def end(code: int) -> None:
+        codes.append(code)
+        raise ProcessEndedError
+
+    monkeypatch.setattr(process, "os", replace_os(_exit=end, getppid=lambda: 4))
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: SimpleNamespace(sentinel=ended.fileno()))
+    alive.close()
+    with pytest.raises(ProcessEndedError):
+        process._exit_after(4)
+    assert codes == [1]
+
+
+def test_a_closed_window_is_a_signal_with_the_functions_of_windows_replaced() -> None:
+    program = (
+        "import signal\n"
+        "signal.SIGBREAK = signal.SIGHUP\n"
+        "del signal.SIGHUP, signal.pthread_sigmask\n"
+        "from trilat_net.process import ENDING_SIGNALS\n"
+        "assert ENDING_SIGNALS == (signal.SIGINT, signal.SIGTERM, signal.SIGBREAK)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

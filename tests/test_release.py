@@ -58,7 +58,10 @@ def test_what_the_workflows_run_is_there() -> None:
 def test_it_is_built_once_installed_everywhere_and_then_published_without_a_secret() -> None:
     jobs = RELEASE["jobs"]
     assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
-    assert [jobs[name].get("needs") for name in ("build", "install", "publish")] == [None, "build", "install"]
+    assert [jobs[name].get("needs") for name in ("build", "install", "studies")] == [None, "build", "build"]
+    assert jobs["publish"]["needs"] == ["install", "studies"]
+    systems = jobs["studies"]["strategy"]["matrix"]["system"]
+    assert [one.partition("-")[0] for one in systems] == ["ubuntu", "macos", "windows"]
     assert jobs["publish"]["environment"]["name"] == "pypi"
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
     assert [name for name in jobs if "permissions" in jobs[name]] == ["publish"]

@@ -1,5 +1,10 @@
-"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands."""
+"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands.
 
+Invariant: what is printed into a file or pipe is UTF-8 with the line ends of POSIX on every system, like any
+text that is written; a terminal that lacks a letter shows its number.
+"""
+
+import io
 import os
 import sys
 from contextlib import suppress
@@ -7,9 +12,15 @@ from contextlib import suppress
 
 def main() -> None:
     """Runs `trilat`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            if not stream.isatty():
+                stream.reconfigure(encoding="utf-8", newline="\n")
+            stream.reconfigure(errors="backslashreplace")
     if sys.argv[1:2] == ["stop"]:
-        with suppress(AttributeError, OSError):  # before the other programs of a busy machine, if it may
-            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        if sys.platform == "linux":
+            with suppress(OSError):  # before the other programs of a busy machine, if it may
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net.known_sites import stop_at_once
 
         left = stop_at_once(sys.argv[2:])

@@ -58,6 +58,11 @@ def open_regular(path: Path, **how: Any) -> Any:
     return stream
 
 
+def find_rights_of_others(path: Path) -> int:
+    """Returns the bits of a file's mode that let others in; 0 on Windows, where a list says who may."""
+    return 0 if os.name == "nt" else path.stat().st_mode & 0o077
+
+
 def make_folder(folder: Path) -> Path:
     """Makes a folder and its parents, and returns it.
 

@@ -1,4 +1,4 @@
-"""Process control: garbage collection, SIGINT, SIGTERM and SIGHUP, worker processes.
+"""Process control: garbage collection, signals that end a program, commands for a shell, worker processes.
 
 Invariants: garbage collection pauses only around code whose many objects form no cycles (records, lists of
 numbers). A signal ends nothing by itself: a loop polls it and ends in order. Worker processes leave Ctrl-C
@@ -8,10 +8,13 @@ to the process that started them, and end with it or when it fails.
 import gc
 import os
 import queue
+import re
+import shlex
 import signal
+import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
@@ -81,7 +84,7 @@ class LinePrinter:
                 self._say(text)
 
 
-_HANG_UP = getattr(signal, "SIGHUP", None)
+_HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))  # the terminal, or window, has gone
 ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None)
 """Signals that end a program in order."""
 
@@ -165,6 +168,14 @@ def _breaks_off(owner: object) -> bool:
     return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
+def join_words(words: Iterable[str]) -> str:
+    """Returns a command as it is typed into a shell of this system."""
+    if os.name != "nt":
+        return shlex.join(words)
+    quoted = ('"' + word.replace('"', '\\"') + '"' for word in words)  # as cmd and PowerShell both take it
+    return " ".join(one[1:-1] if re.fullmatch(r'"[\w.:/\\=+-]+"', one) else one for one in quoted)
+
+
 def count_cores() -> int:
     """Returns the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -199,7 +210,7 @@ def hold_sigint() -> Iterator[None]:
     The mask is for the processes. It does not hold what arrives in another thread of this one, whose handler
     Python runs here all the same: so the handler is exchanged too.
     """
-    if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
         return
     arrived: list[int] = []
@@ -221,6 +232,12 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 
 
 def _exit_after(parent: int) -> None:
+    from multiprocessing import connection, parent_process
+
+    started_by = getattr(parent_process(), "sentinel", None)
+    if os.name == "nt" and started_by is not None:  # the number of a parent stays the same when it has gone
+        connection.wait([started_by])
+        os._exit(1)
     pause = threading.Event()
     while os.getppid() == parent:
         pause.wait(_PARENT_POLL_S)

@@ -129,6 +129,27 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     assert messages(active_path(path)) == []
 
 
+def test_a_log_that_is_open_elsewhere_is_kept_beside_with_the_functions_of_windows_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows replaces no file that a viewer has open."""
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"earlier")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    def make() -> None:
+        with LogFile(path, force=True) as file:
+            begun(file).finish()
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(LogRefused, match=r"Permission denied; the finished log is .*active: give it a name"):
+        make()
+    assert path.read_bytes() == b"earlier"
+    assert messages(active_path(path)) == []
+
+
 def test_without_hard_links_a_log_still_gets_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

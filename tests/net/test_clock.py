@@ -1,8 +1,10 @@
 """One contract for the machine's clocks, the one that a test moves, and one that runs beside another."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from hypothesis import given
@@ -65,6 +67,14 @@ def test_a_signal_does_not_shorten_a_sleep() -> None:
         assert caught == [signal.SIGALRM]
     finally:
         signal.signal(signal.SIGALRM, before)
+
+
+def test_the_clock_is_that_of_posix_and_not_the_coarse_one_of_windows() -> None:
+    """Python 3.12 reads GetTickCount64 for `monotonic` on Windows, which goes in steps of 16 ms."""
+    fine, coarse = time.get_clock_info("perf_counter"), time.get_clock_info("monotonic")
+    assert SystemClock.monotonic_ns is time.perf_counter_ns
+    if os.name == "posix":
+        assert fine == coarse
 
 
 def test_processes_of_one_machine_share_their_clock() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import shutil
 import socket
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from sites import doctor
 from sites.doctor import examine_clock, examine_keys, examine_links, examine_machine, examine_room
 from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
+from tests.other_systems import replace_os
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, find_free_endpoints
 from trilat_net.net.member_keys import create_keys, read_member_keys
@@ -29,6 +31,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     create_keys(made, MEMBERS, [], 30)
     shutil.move(made / "authority", made.parent / "safe")
     return made
+
+
+class UnpunctualClock(ManualClock):
+    """A clock that only sleeping moves, and on which some sleeps end late."""
+
+    def __init__(self, late_ns: int, every: int) -> None:
+        super().__init__()
+        self._late_ns, self._every, self._sleeps = late_ns, every, 0
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        self._sleeps += 1
+        super().sleep_until(deadline_ns + (self._late_ns if self._sleeps % self._every == 0 else 0))
 
 
 def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
@@ -138,8 +152,69 @@ def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) 
     assert states(doctor.examine_rights()) == ["warn", "ok", "ok"]
 
 
+@pytest.mark.parametrize(
+    ("late_ns", "every", "held"),
+    [
+        (400_000, 10, [True]),
+        (600_000, 10, [False, True]),  # more than half a period of 1000 Hz, and less than half of 500 Hz
+        (10_000_000, 10, [False] * 4),
+        (2_000_000, 400, [True]),
+    ],
+)
+def test_a_rate_is_held_if_ticks_begin_in_time(late_ns: int, every: int, held: list[bool]) -> None:
+    """One tick in a hundred may begin in the second half of its period, or later."""
+    found = doctor.rehearse_rates(UnpunctualClock(late_ns, every))
+    assert [one.held for one in found] == held
+    assert [one.rate_hz for one in found] == list(doctor.RATES_HZ[: len(held)])
+    assert found[0].largest_us == late_ns // 1000
+
+
+@pytest.mark.parametrize(
+    ("rates", "state", "text"),
+    [
+        ([(1000, 90, 4000)], "ok", "holds 1000 Hz: 99% of the ticks began within 0.09 ms of their time"),
+        ([(1000, 700, 900), (500, 700, 900)], "warn", "holds 500 Hz"),
+        ([(100, 9000, 12000)], "fail", "holds not even 100 Hz"),
+    ],
+)
+def test_the_rate_is_told_with_how_late_ticks_were(
+    rates: list[tuple[int, int, int]], state: str, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = SimpleNamespace(returncode=0, stdout=json.dumps(rates))
+    monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
+    found = doctor.examine_rate()
+    assert found.state == state
+    assert text in found.text
+
+
+def test_a_real_loop_is_measured_in_a_process_of_its_own() -> None:
+    assert doctor.examine_rate().text.startswith("a site alone ")
+
+
+@pytest.mark.parametrize(("kernel", "name"), [("Windows", "Windows"), ("Darwin", "macOS"), ("Linux", "")])
+def test_what_is_promised_here_is_told(kernel: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "system", lambda: kernel)
+    found = doctor.examine_system()
+    assert found.state == ("warn" if name else "ok")
+    assert name in found.text
+
+
+def test_open_rights_are_no_finding_with_the_functions_of_windows_replaced(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows lets a mode tell nothing but whether a file can be written."""
+    (folder / "m1" / "private.key").chmod(0o666)
+    try:
+        monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))
+        monkeypatch.setattr("trilat_net.files.os", replace_os())
+        assert states(examine_keys(folder / "m1")) == ["ok"]
+    finally:
+        (folder / "m1" / "private.key").chmod(0o600)
+
+
 def test_the_command_exits_with_1_if_something_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "examine_rights", lambda: iter(()))
+    monkeypatch.setattr(doctor, "examine_rate", lambda: doctor.DoctorFinding("rate", "ok", ""))
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     done = trilat("doctor", "--json", cwd=tmp_path)
     assert {one["check"] for one in json.loads(done.out)} >= {"keys", "links", "clock", "disk", "processors"}

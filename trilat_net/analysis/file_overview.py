@@ -76,7 +76,7 @@ class FileInventory:
         self.metadata.update(walk.metadata)
         self.files.append(
             {
-                "path": str(path),
+                "path": path.as_posix(),
                 "size_bytes": walk.size,
                 "library": walk.library,
                 "finished": walk.complete,

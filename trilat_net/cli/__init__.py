@@ -135,17 +135,18 @@ def main() -> None:
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # the reader of a pipe has closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except (MemoryError, ImportError, RuntimeError, OSError) as error:
         if isinstance(error, MemoryError) or any(text in str(error) for text in _WITHOUT_MEMORY):
             sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
             sys.exit(1)
         if not isinstance(error, OSError):  # else a full disk, a folder that vanished
             raise
+        refused = os.name == "nt" and error.errno == errno.EINVAL  # a name, or without one a closed pipe
+        if isinstance(error, BrokenPipeError) or (refused and not error.filename):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(0)
         print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
-        bad_name = error.errno == errno.ENAMETOOLONG
+        bad_name = refused or error.errno == errno.ENAMETOOLONG
         sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
     finally:
         TrilatError.in_command = False

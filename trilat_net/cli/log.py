@@ -72,7 +72,7 @@ def log_sign_command(
     with terminal.progress_bar(f"reading {file}") as progress:
         made = sign_log(file, key, force=force, progress=progress)
     if as_json:
-        terminal.print_json({"file": str(file), "signature": str(made)})
+        terminal.print_json({"file": file.as_posix(), "signature": made.as_posix()})
     else:
         terminal.print_text(f"{made}: signs {file}")
 
@@ -129,7 +129,7 @@ def log_export_command(
         exporter.export(log, progress)
     records = {site: len(log[site]) for site in log.sites}
     if as_json:
-        terminal.print_json({"file": str(exporter.path), "format": form, "records": records})
+        terminal.print_json({"file": exporter.path.as_posix(), "format": form, "records": records})
     else:
         terminal.print_text(f"{exporter.path}: {sum(records.values())} records of {', '.join(records)}")
 

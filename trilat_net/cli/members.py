@@ -381,7 +381,7 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
         "recorders": outcome.recorders,
         "stored": outcome.stored if outcome.recorders else None,
         "told": outcome.refilled,
-        "torn": {str(path): text for path, text in outcome.torn.items()},
+        "torn": {path.as_posix(): text for path, text in outcome.torn.items()},
     }
 
 

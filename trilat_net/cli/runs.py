@@ -230,7 +230,7 @@ def figure_command(
         with terminal.progress_bar("drawing") as progress:
             paths = write_figures(log, place, names or (), progress=progress, **shape)
     if as_json:
-        terminal.print_json([str(path) for path in paths])
+        terminal.print_json([path.as_posix() for path in paths])
         return
     terminal.print_paths(paths)
 

@@ -4,7 +4,6 @@ Invariant: everything printed is in the result files too, except live runs, whic
 interrupted prints the command that resumes it.
 """
 
-import shlex
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
+from ..process import join_words
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
@@ -166,7 +166,7 @@ def _run_in_folder(
         with show_progress("sweeping", terminal.print_text) as progress:
             return run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
-        resume = f"trilat sweep --resume {shlex.quote(str(folder.path))}"
+        resume = join_words(["trilat", "sweep", "--resume", str(folder.path)])
         kept = f"{len(folder.read_done())} runs are done and kept; go on with: {resume}"
         terminal.err.print(kept, markup=False, soft_wrap=True)
         raise

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from ..errors import LogRefused, UsageError
 from ..files import publish_file, refuse_existing, sync_folder
@@ -35,7 +35,7 @@ class DiskReserve:
     def __init__(self, folder: Path) -> None:
         self.size = 0
         self._folder = folder
-        self._file: BinaryIO | None = None
+        self._file: IO[bytes] | None = None
         self._possible = True
 
     def grow(self, size: int) -> None:
@@ -305,6 +305,8 @@ class LogFile:
             return LogRefused(f"{self.path}: {what}; the log ends there, finished, with {content}; {advice}")
         if not self.size:
             return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
+        if self.whole and self.trouble is None:  # another program has what it should replace open, on Windows
+            return LogRefused(f"{self.path}: {what}; the finished log is {self.working}: give it a name")
         return LogRefused(
             f"{self.working}: {what}, even for the end of the log; its {self.size / 1e6:.1f} MB up to the "
             f"last whole chunk are kept; {advice}; make it whole with: trilat log recover {self.working}"

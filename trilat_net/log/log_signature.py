@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from ..errors import LogError, UsageError
-from ..files import open_regular, refuse_existing, write_whole
+from ..files import find_rights_of_others, open_regular, refuse_existing, write_whole
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
@@ -165,7 +165,7 @@ def _load_private_key(path: Path) -> Ed25519PrivateKey:
     key = _load_key(path, lambda data: serialization.load_pem_private_key(data, password=None))
     if not isinstance(key, Ed25519PrivateKey):
         raise UsageError(f"{path}: is no private Ed25519 key; make a pair with: trilat keys pair NAME")
-    if path.stat().st_mode & 0o077:
+    if find_rights_of_others(path):
         raise UsageError(f"{path}: can be read by others: chmod 600 {path}")
     return key
 

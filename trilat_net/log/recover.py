@@ -81,8 +81,8 @@ class Recovery(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat log recover --json`."""
         return {
-            "file": str(self.path),
-            "output": str(self.output),
+            "file": self.path.as_posix(),
+            "output": self.output.as_posix(),
             "finished": self.finished,
             "lossless": self.lossless,
             "messages": self.messages,

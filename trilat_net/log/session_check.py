@@ -83,7 +83,7 @@ def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogChe
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    return LogCheckResult([str(path) for path in paths], list(check.findings()), check.ours)
+    return LogCheckResult([path.as_posix() for path in paths], list(check.findings()), check.ours)
 
 
 class ChannelCheck:

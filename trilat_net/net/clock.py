@@ -31,12 +31,13 @@ class Clock(Protocol):
 class SystemClock:
     """The machine's clocks."""
 
-    monotonic_ns = staticmethod(time.monotonic_ns)
+    monotonic_ns = staticmethod(time.perf_counter_ns)
+    """The same clock as `time.monotonic_ns`, but on Windows, where that one may go in steps of 16 ms."""
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
         """See `Clock`. CPython sleeps to an absolute deadline of its own, so signals do not shorten it."""
-        rest_ns = deadline_ns - time.monotonic_ns()
+        rest_ns = deadline_ns - self.monotonic_ns()
         if rest_ns > 0:
             time.sleep(rest_ns * 1e-9)
 
@@ -46,7 +47,7 @@ class SystemClock:
             boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
             namespace = Path("/proc/self/ns/time").readlink().name
         except OSError:
-            return f"{platform.node()}/{time.get_clock_info('monotonic').implementation}"
+            return f"{platform.node()}/{time.get_clock_info('perf_counter').implementation}"
         return f"{boot}/{namespace}"
 
 

@@ -12,6 +12,7 @@ import json
 import os
 import re
 import stat
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
-from ..files import make_folder, open_regular, stage_output
+from ..files import find_rights_of_others, make_folder, open_regular, stage_output
 from .access_rules import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
@@ -190,7 +191,12 @@ def _read(path: Path) -> bytes:
 
 
 def _refuse_of_others(path: Path, facts: os.stat_result) -> None:
-    """Refuses what another user can change; in a folder of many (sticky) nobody changes files of others."""
+    """Refuses what another user can change; in a folder of many (sticky) nobody changes files of others.
+
+    On Windows these bits do not tell who may: nothing is refused.
+    """
+    if sys.platform == "win32":
+        return
     if os.geteuid() and facts.st_uid not in (0, os.geteuid()):
         raise UsageError(f"{path}: belongs to another user, who can change it: take keys of your own")
     shared = stat.S_ISDIR(facts.st_mode) and facts.st_mode & stat.S_ISVTX
@@ -241,7 +247,7 @@ def _find_fault(
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)
     for fault, text in (
-        (private.stat().st_mode & 0o077, f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
+        (find_rights_of_others(private), f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
         (common != member, f"the certificate is that of {common}, and {MEMBERS} names {member}"),
         (member not in members, f"{MEMBERS} does not list {member}"),
         (key.public_key() != certificate.public_key(), "the private key is not that of the certificate"),

@@ -110,7 +110,7 @@ def store_tables(
 
 def describe_folder(log: Log, folder: Path, about: str) -> None:
     """Writes the description of an exported folder into it, and the scenario."""
-    (folder / EXPORT_MANIFEST).write_text(about, encoding="utf-8")
+    (folder / EXPORT_MANIFEST).write_bytes(about.encode())
     (folder / SCENARIO).write_bytes(log.scenario_text.encode())
 
 

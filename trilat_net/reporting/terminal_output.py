@@ -8,7 +8,6 @@ nothing of the bar; it calls a function with (done, total). Imports only Rich at
 
 import json
 import re
-import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
@@ -18,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
+
+from ..process import join_words
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
@@ -148,8 +149,8 @@ def conclude_files(
         with progress_bar("executing and drawing") as progress:
             conclusion = conclude(log, folder, progress, png=png)
     except KeyboardInterrupt:
-        files = shlex.join(map(str, paths))
-        later = f"trilat report {files} -o {shlex.quote(str(folder))} --force"
+        files = join_words(map(str, paths))
+        later = f"trilat report {files} -o {join_words([str(folder)])} --force"
         print_note(f"the log is kept: {files}; its report can be drawn later: {later}")
         raise
     print_result(conclusion, as_json=as_json)

@@ -1,18 +1,18 @@
 """The commands that studies show, so that a person can repeat a run."""
 
-import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import tomli_w
 
 from ..errors import ScenarioError
+from ..process import join_words
 from ..scenario.imported_law import name_law_classes
 
 
 def format_command(*words: str) -> str:
-    """Returns a command of the program, quoted for a shell."""
-    return shlex.join(["trilat", *words])
+    """Returns a command of the program."""
+    return join_words(["trilat", *words])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:

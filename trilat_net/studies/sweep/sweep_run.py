@@ -16,7 +16,6 @@ import hashlib
 import io
 import json
 import math
-import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -360,10 +359,10 @@ def _cells(count: int) -> str:
 
 def list_next_commands(folder: Path) -> list[str]:
     """Returns commands that use the results."""
-    where = shlex.quote(str(folder))
+    where = format_command("sweep", str(folder))
     return [
-        f"trilat sweep {where} --cell 0      # the command that makes a log of a cell",
-        f"trilat sweep {where} --map         # its map, with the lines of theory",
+        f"{where} --cell 0      # the command that makes a log of a cell",
+        f"{where} --map         # its map, with the lines of theory",
     ]
 
 
