@@ -30,10 +30,10 @@ from trilat_net.net.access_rules import BRIDGE
 from trilat_net.net.arm_client import ArmClient, Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.discovery import find_members, list_past_events, send_change
+from trilat_net.net.connection import Connection
+from trilat_net.net.discovery import find_members, list_past_events
 from trilat_net.net.membership import read_events, read_records
 from trilat_net.net.messages import Info, State
-from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.net.ros2_graph import (
     Attachment,
     QualityOfService,
@@ -47,7 +47,7 @@ from trilat_net.scenario import Scenario, parse_embedded
 from trilat_net.scenario.operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
 
-from .running_session import RunningSession, open_hand, order_sites, read_replies, stop_session
+from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
 """Least time between two looks at what has come."""
@@ -55,8 +55,6 @@ LOOK_NS = 200_000_000
 """Between two looks for what is not there yet, or not any more."""
 SILENCE_NS = 200_000_000
 """A target that nobody repeats for so long lets the arm go."""
-RAMP_S = 1.0
-"""Of a change of shares, as of `trilat set dominance`."""
 RIVAL_NS = NS_PER_S
 """A publisher that was heard within this time has not gone."""
 SAFE_NS = 10_000_000
@@ -365,12 +363,12 @@ class DominanceTopic:
 
     Args:
         peers: of the site, in the order of the numbers of a message.
-        change: asks the site, and waits for its reply.
+        change: asks the site, and waits until it agrees.
         clock: of the bridge.
     """
 
     def __init__(
-        self, peers: Sequence[str], change: Callable[[dict[str, float]], ChangeReply], clock: Clock
+        self, peers: Sequence[str], change: Callable[[dict[str, float]], object], clock: Clock
     ) -> None:
         self._peers, self._change, self._sender = peers, change, OneSender(clock)
         self._wanted: dict[str, float] | None = None
@@ -387,11 +385,10 @@ class DominanceTopic:
 
     def ask(self) -> None:
         """Asks the site for what is wanted, if that is new; raises TrilatError if it refuses."""
-        if (wanted := self._wanted) is None or wanted == self._asked:
-            return
-        self._asked = wanted
-        if not (reply := self._change(wanted)).accepted:
-            raise UsageError(reply.text)
+        wanted = self._wanted
+        if wanted is not None and wanted != self._asked:
+            self._asked = wanted
+            self._change(wanted)
 
 
 class RobotArm:
@@ -543,6 +540,7 @@ class Bridge(NamedTuple):
 def open_bridge(ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> Bridge:
     """Returns the bridge of a session that runs, whose topics and services are there from now on."""
     graph, bus, clock, session, _ = ends
+    running = RunningSession(session, Connection(), bus)
     frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
     sites = {name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names}
     targets, dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
@@ -552,11 +550,10 @@ def open_bridge(ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> Bridge:
             last, kind, read, act = describe_target(scenario, name, hand, shown.frame)
             target = targets[ends.topic(name, last)] = TargetTopic(hand, read, act, clock)
             graph.subscribe(ends.topic(name, last), kind, target.take)
-        change, topic = partial(_set_dominance, bus, clock, session, name), ends.topic(name, "set_dominance")
-        dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
+        topic = ends.topic(name, "set_dominance")
+        dominance[topic] = DominanceTopic(scenario.peers(name), partial(running.set_dominance, name), clock)
         graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance[topic].take)
-    for service, order in list_services(bus, clock, session, scenario):
-        graph.serve(service, TRIGGER, partial(_answer, order))
+    serve_orders(graph, running, scenario.names)
     diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
 
     def diagnose() -> None:
@@ -598,31 +595,24 @@ def _diagnose(session: str, record: State) -> cdr.Diagnosis:
     )
 
 
-def list_services(
-    bus: Bus, clock: Clock, session: str, scenario: Scenario
-) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yields the services of a session, and what they do: `/<session>/stop`, `/<session>/<site>/stop`, ..."""
-    orders: tuple[OrderName, ...] = ("stop", "enable", "reset")
+def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
+    """Offers the services of a session: `/<session>/stop`, `/<session>/<site>/stop`, ..."""
 
-    def give(order: OrderName, *sites: str) -> str:
-        return "; ".join(read_replies(order_sites(bus, clock, session, sites, order)))
+    def serve(order: Callable[..., list[str]], *site: str) -> None:
+        name = "/".join([running.name, *site, order.__name__])
+        graph.serve(name, TRIGGER, lambda _: _answer(order, *site))
 
-    for order in orders:
-        yield f"{session}/{order}", partial(give, order)
-        for site in scenario.names:
-            yield f"{session}/{site}/{order}", partial(give, order, site)
-    yield f"{session}/end", lambda: "; ".join(stop_session(bus, clock, session))
+    for order in (running.stop, running.enable, running.reset):
+        serve(order)
+        for site in sites:
+            serve(order, site)
+    serve(running.end)
 
 
-def _set_dominance(bus: Bus, clock: Clock, session: str, site: str, shares: dict[str, float]) -> ChangeReply:
-    request = ChangeRequest(dominance=site, to=shares, ramp_s=RAMP_S)
-    return send_change(bus, clock, session, site, request)
-
-
-def _answer(order: Callable[[], str], _request: bytes) -> bytes:
+def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
     """Does what a service is asked for; what is refused is an answer as well."""
     try:
-        return cdr.pack_trigger_response(success=True, text=order())
+        return cdr.pack_trigger_response(success=True, text="; ".join(order(*sites)))
     except TrilatError as error:
         return cdr.pack_trigger_response(success=False, text=str(error))
 

@@ -36,11 +36,11 @@ from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained
 from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.core.ticks import Mode, TickRecord
-from trilat_net.errors import UsageError
+from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
-from trilat_net.net.requests import ArmMeasurement, ChangeReply
+from trilat_net.net.requests import ArmMeasurement
 from trilat_net.net.ros2_graph import Attachment, Refusals
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import load_scenario
@@ -300,9 +300,10 @@ def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
     asked: list[dict[str, float]] = []
     said: list[str] = []
 
-    def change(wanted: dict[str, float]) -> ChangeReply:
+    def change(wanted: dict[str, float]) -> None:
         asked.append(wanted)
-        return ChangeReply(member="s", accepted=sum(wanted.values()) == 1.0, text="must sum to 1")
+        if sum(wanted.values()) != 1.0:
+            raise RunFailed("must sum to 1")
 
     refusals, clock = Refusals(said.append), ManualClock()
     topic = DominanceTopic(["m1", "m2"], change, clock)
