@@ -210,13 +210,7 @@ def _find_shares(ramps: Sequence[DominanceRamp], t_ns: int) -> tuple[float, ...]
 
 
 class SiteTopics:
-    """What one site shows, under `/<session>/<site>`, and its part of `/tf`.
-
-    Args:
-        ends: of the bridge.
-        scenario, site: whose.
-        epoch_unix_ns: Unix time of tick 0, from which stamps count.
-        frames: publishes on `/tf`.
+    """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count from the epoch.
 
     Attributes:
         frame: in which the end effector is: that of the arm's base, or the one that the sites share.
@@ -315,19 +309,11 @@ class OneSender:
 class TargetTopic:
     """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or `target_wrench`.
 
-    Args:
-        hand: the hand; its context is that of the bridge.
-        read: returns the goal of a message; a ValueError says what is wrong with it.
-        act: gives a goal to the hand.
-        clock: of the bridge.
+    `read` returns the goal of a message, or raises ValueError, and `act` gives it to the hand.
     """
 
     def __init__(
-        self,
-        hand: Hand,
-        read: Callable[[bytes], Sequence[float]],
-        act: Callable[..., int],
-        clock: Clock,
+        self, hand: Hand, read: Callable[[bytes], Sequence[float]], act: Callable[..., int], clock: Clock
     ) -> None:
         self.hand, self._read, self._act, self._clock = hand, read, act, clock
         self._sender, self._lock = OneSender(clock), threading.Lock()
@@ -359,12 +345,8 @@ class TargetTopic:
 class DominanceTopic:
     """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest message wins.
 
-    One that only repeats what was asked for, without a pause of a second, asks for nothing.
-
-    Args:
-        peers: of the site, in the order of the numbers of a message.
-        change: asks the site, and waits until it agrees.
-        clock: of the bridge.
+    One that only repeats what was asked for, without a pause of a second, asks for nothing. Its numbers are
+    in the order of `peers`; `change` asks the site, and waits until it agrees.
     """
 
     def __init__(
@@ -402,7 +384,6 @@ class RobotArm:
         joints: of each joint of the arm, in the scenario's order, the names by which the robot may call it.
         robot: the order of its controller, and what is safe.
         commands: publishes to that controller.
-        clock: of the bridge.
 
     Attributes:
         armed: whether torques are sent, and not only what is safe.
@@ -519,51 +500,96 @@ def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[fl
     return _check_finite(numbers[:axes])
 
 
-class Bridge(NamedTuple):
-    """A bridge that is open.
+class Bridge:
+    """The bridge of a session that runs; its topics and services are there from now on.
+
+    Args:
+        ends: of the bridge.
+        scenario: of the session.
+        epoch_unix_ns: Unix time of its tick 0.
 
     Attributes:
-        sites: by name what a site shows.
-        targets: by topic what holds arms.
+        targets: by topic what holds an arm.
         dominance: by topic what changes who leads.
-        diagnose: publishes `/diagnostics` of the newest records.
-        epoch_unix_ns: of the session.
     """
 
-    sites: dict[str, SiteTopics]
-    targets: dict[str, TargetTopic]
-    dominance: dict[str, DominanceTopic]
-    diagnose: Callable[[], None]
-    epoch_unix_ns: int
-
-
-def open_bridge(ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> Bridge:
-    """Returns the bridge of a session that runs, whose topics and services are there from now on."""
-    graph, bus, clock, session, _ = ends
-    running = RunningSession(session, Connection(), bus)
-    frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
-    sites = {name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names}
-    targets, dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
-    for name, shown in sites.items():
-        if find_live_hand(scenario.sites[name].hands) is not None:
+    def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
+        graph, bus, clock, session, _ = self._ends = ends
+        states, events = (topics.key(session, "*", channel) for channel in (topics.STATE, topics.EVENT))
+        self._records, self._events = bus.inbox(states, 4096), bus.inbox(events, 4096)
+        self._presence = bus.presence(topics.presence_key(session, "*"))
+        self._present: set[topics.KeyParts] = set()
+        self._epoch_unix_ns = epoch_unix_ns
+        frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
+        self._sites = {
+            name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names
+        }
+        self._diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+        running = RunningSession(session, Connection(), bus)
+        self.targets, self.dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
+        for name, shown in self._sites.items():
+            for event in list_past_events(bus, clock, session, name):
+                shown.shares.take(event.command)
+            topic, change = ends.topic(name, "set_dominance"), partial(running.set_dominance, name)
+            self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
+            graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
+        for name in [one for one in scenario.names if find_live_hand(scenario.sites[one].hands) is not None]:
             hand = open_hand(bus, clock, session, name, scenario, "ros2")
-            last, kind, read, act = describe_target(scenario, name, hand, shown.frame)
-            target = targets[ends.topic(name, last)] = TargetTopic(hand, read, act, clock)
-            graph.subscribe(ends.topic(name, last), kind, target.take)
-        topic = ends.topic(name, "set_dominance")
-        dominance[topic] = DominanceTopic(scenario.peers(name), partial(running.set_dominance, name), clock)
-        graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance[topic].take)
-    serve_orders(graph, running, scenario.names)
-    diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+            last, kind, read, act = describe_target(scenario, name, hand, self._sites[name].frame)
+            topic = ends.topic(name, last)
+            self.targets[topic] = TargetTopic(hand, read, act, clock)
+            graph.subscribe(topic, kind, self.targets[topic].take)
+        serve_orders(graph, running, scenario.names)
 
-    def diagnose() -> None:
+    def run(self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]) -> bool:
+        """Shows the session at a rate, the newest record each time, until it ends or `stopped`.
+
+        Returns True if another session has begun under its name.
+        """
+        clock, connected = self._ends.clock, True
+        wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
+        poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
+        while not stopped() and not self._is_over():
+            if self._show(rate_hz):
+                return True
+            for target in self.targets.values():
+                target.watch()
+            now_ns = clock.monotonic_ns()
+            if now_ns - looked_ns > LOOK_NS:
+                looked_ns, before, connected = now_ns, connected, self._ends.graph.connected
+                if connected != before:
+                    say(f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}")
+            if now_ns - diagnosed_ns > NS_PER_S:
+                diagnosed_ns = now_ns
+                self._diagnose()
+            wake_ns = max(wake_ns + poll_ns, now_ns)
+            clock.sleep_until(wake_ns)
+        return False
+
+    def _show(self, rate_hz: float) -> bool:
+        """Shows what has come; returns whether another session has begun under the name of this one."""
+        for record in read_records(self._records):
+            if record.site in self._sites:
+                self._sites[record.site].show(record, rate_hz)
+        anew = False
+        for event in read_events(self._events):
+            anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
+            if event.member in self._sites:
+                self._sites[event.member].shares.take(event.command)
+        for parts, alive in topics.read_presence(self._presence):
+            if parts.member in self._sites:
+                (self._present.add if alive else self._present.discard)(parts)
+        return anew
+
+    def _is_over(self) -> bool:
+        return not self._present and any(shown.newest for shown in self._sites.values())
+
+    def _diagnose(self) -> None:
         """Publishes the state of every site."""
-        records = [shown.newest for shown in sites.values() if shown.newest is not None]
+        records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
         newest_ns = max((record.t_ns for record in records), default=0)
-        parts = [_diagnose(session, record) for record in records]
-        diagnostics.put(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
-
-    return Bridge(sites, targets, dominance, diagnose, epoch_unix_ns)
+        parts = [_diagnose(self._ends.session, record) for record in records]
+        self._diagnostics.put(cdr.pack_diagnostics(max(0, self._epoch_unix_ns + newest_ns), parts))
 
 
 def describe_target(
@@ -617,69 +643,6 @@ def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
         return cdr.pack_trigger_response(success=False, text=str(error))
 
 
-class _SessionNews:
-    """What comes from a session whose bridge is open."""
-
-    def __init__(self, ends: Ends, bridge: Bridge) -> None:
-        bus, session = ends.bus, ends.session
-        self._sites, self._epoch_unix_ns = bridge.sites, bridge.epoch_unix_ns
-        self._records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
-        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 4096)
-        self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._present: set[topics.KeyParts] = set()
-        for site, shown in self._sites.items():
-            for event in list_past_events(bus, ends.clock, session, site):
-                shown.shares.take(event.command)
-
-    def show(self, rate_hz: float) -> bool:
-        """Shows what has come; returns whether another session has begun under the name of this one."""
-        for record in read_records(self._records):
-            if record.site in self._sites:
-                self._sites[record.site].show(record, rate_hz)
-        anew = False
-        for event in read_events(self._events):
-            anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
-            if event.member in self._sites:
-                self._sites[event.member].shares.take(event.command)
-        for parts, alive in topics.read_presence(self._presence):
-            if parts.member in self._sites:
-                (self._present.add if alive else self._present.discard)(parts)
-        return anew
-
-    @property
-    def over(self) -> bool:
-        """True once all sites have gone."""
-        return not self._present and any(shown.newest for shown in self._sites.values())
-
-
-def run_bridge(
-    ends: Ends, bridge: Bridge, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
-) -> bool:
-    """Shows the session at a rate, the newest record each time, until it ends or `stopped`.
-
-    Returns True if another session has begun under its name.
-    """
-    news, clock, connected = _SessionNews(ends, bridge), ends.clock, True
-    wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
-    poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
-    while not stopped() and not news.over:
-        if news.show(rate_hz):
-            return True
-        for target in bridge.targets.values():
-            target.watch()
-        now_ns = clock.monotonic_ns()
-        if now_ns - looked_ns > LOOK_NS:
-            looked_ns, before, connected = now_ns, connected, ends.graph.connected
-            if connected != before:
-                say(f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}")
-        if now_ns - diagnosed_ns > NS_PER_S:
-            diagnosed_ns = now_ns
-            bridge.diagnose()
-        wake_ns = max(wake_ns + poll_ns, now_ns)
-        clock.sleep_until(wake_ns)
-    return False
-
-
 @contextmanager
 def _repeated(
     period_s: float, act: Callable[[], None], last: Callable[[], None] = lambda: None
@@ -712,14 +675,7 @@ def serve_ros2(
 ) -> None:
     """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for a router and for it.
 
-    Args:
-        running: the session.
-        open_graph: opens the graph, if its router answers, with what takes refusals.
-        rate_hz: messages a second of each topic.
-        table: the names of topics, and the robots.
-        stopped: whether to end.
-        say: takes a line for people.
-        timeout_s: longest wait for the first answer of a site.
+    `timeout_s` is the longest wait for the first site or its router.
 
     Raises:
         UsageError: no router, or what the table says of a robot does not fit the session.
@@ -762,7 +718,7 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
             robots[site].armed = True
         if (begun := await_site(ends, stopped, say, running=True)) is None:
             return False
-        bridge = open_bridge(ends, scenario, begun.epoch_unix_ns)
+        bridge = Bridge(ends, scenario, begun.epoch_unix_ns)
         for target in bridge.targets.values():
             stack.enter_context(target.hand)
         for topic, shares in bridge.dominance.items():
@@ -770,7 +726,7 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
         held = [f"; /{topic} holds an arm" for topic in bridge.targets]
         held += [f"; /{ends.topic(site, 'robot_states')} measures the arm of {site}" for site in robots]
         say(f"session {ends.session} is in the graph of ROS 2: /{ends.session}/...{''.join(held)}")
-        return run_bridge(ends, bridge, rate_hz, stopped, say)
+        return bridge.run(rate_hz, stopped, say)
 
 
 @contextmanager
