@@ -2,8 +2,10 @@
 
 import json
 import math
+import threading
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +32,23 @@ from sites.ros2_bridge import (
     read_place_target,
     read_topic_table,
     refuse_other_robots,
+    show_session,
 )
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from tests.net.waiting import drained
+from tests.net.waiting import drained, until
 from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.core.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
-from trilat_net.net.requests import ArmMeasurement
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.membership import describe_member, liveliness_token
+from trilat_net.net.messages import Event
+from trilat_net.net.requests import ArmMeasurement, Backfill
 from trilat_net.net.ros2_graph import Attachment, Refusals
-from trilat_net.net.wire import decode, encode_state
+from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import load_scenario
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -241,10 +247,19 @@ class Topic(list[bytes]):
 
 
 class Listener:
-    """A graph in which every topic is heard."""
+    """A graph in which every topic is heard, and nobody says anything."""
+
+    connected = True
 
     def __init__(self) -> None:
         self.came: dict[str, Topic] = defaultdict(Topic)
+        self.refusals, self.served = Refusals(print), list[str]()
+
+    def subscribe(self, *_: object) -> None:
+        pass
+
+    def serve(self, service: str, _kind: str, _answer: object) -> None:
+        self.served.append(service)
 
     def publisher(self, topic: str, _kind: str, _qos: object) -> Topic:
         return self.came[topic]
@@ -477,3 +492,86 @@ def test_a_robot_without_a_torque_gets_again_and_again_what_is_safe() -> None:
 def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
     with pytest.raises(UsageError, match="have one of each joint: shoulder, elbow"):
         Robot(controller)
+
+
+class Sites:
+    """The sites of a session: who they are, what they have noted, and records; a bridge that shows them."""
+
+    def __init__(self, noted: Sequence[Event]) -> None:
+        network, self._scenario = LocalNetwork(), load_scenario("paper")
+        bus, self._info = network.join(), b""
+        past = {"channel": "event", "first": 0, "payloads": [*map(encode, noted)], "made": len(noted)}
+        for site in self._scenario.names:
+            bus.announce(liveliness_token("t", site, 1))
+            bus.respond(topics.key("t", site, topics.INFO), lambda _: self._info)
+            kept = encode(Backfill(member=site, boot=1, **past))
+            bus.respond(topics.key("t", site, topics.PAST), lambda _, kept=kept: kept)
+        self._state, self._event = (
+            bus.publisher(topics.key("t", "s", channel)) for channel in (topics.STATE, topics.EVENT)
+        )
+        self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
+        self._ends: Any = Ends(self.graph, network.join(), SystemClock(), "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+
+    def begin(self, epoch_unix_ns: int) -> None:
+        about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
+        self._info = encode(describe_member("s", 1, SystemClock(), self._scenario.text, **about))
+        self._event(encode(event("epoch", epoch_unix_ns=epoch_unix_ns)))
+
+    def ticks(self, k: int) -> None:
+        zeros = [0.0, 0.0]
+        motion = zeros, zeros, zeros, zeros, zeros, zeros, [0.0] * 5
+        record = TickRecord(k, k * 10**6, Mode.RUN, *motion, [-1, -1], 0, [], [])
+        self._state(encode_state("s", 1, ["m1", "m2"], record, (), 0, 0))
+
+    @contextmanager
+    def shown(self) -> Iterator[threading.Thread]:
+        """The bridge shows the session, and has shown a record."""
+        over = threading.Event()
+
+        def show() -> None:
+            self.anew.append(show_session(self._ends, 100.0, over.is_set, self.said.append))
+
+        bridge = threading.Thread(target=show)
+        bridge.start()
+        self.graph.came.clear()
+        until(lambda: self.ticks(7) or self.graph.came["t/s/joint_states"])  # type: ignore[func-returns-value]
+        yield bridge
+        over.set()
+        bridge.join()
+
+    def seconds(self) -> set[int]:
+        """Of the stamps that were shown."""
+        states = [
+            ROS.deserialize_cdr(data, "sensor_msgs/msg/JointState")
+            for data in self.graph.came["t/s/joint_states"]
+        ]
+        return {message.header.stamp.sec for message in states}
+
+
+def event(kind: str, **fields: Any) -> Event:
+    return Event(member="s", boot=1, kind=kind, text="", **fields)
+
+
+def test_a_session_that_begins_anew_is_shown_with_its_own_epoch() -> None:
+    sites = Sites([])
+    sites.begin(10**18)
+    with sites.shown() as bridge:
+        sites.begin(10**18)  # another attempt of its own
+        assert sites.seconds() == {10**9}
+        sites.begin(2 * 10**18)
+        bridge.join(20.0)
+        assert sites.anew == [True]
+    with sites.shown():
+        assert sites.seconds() == {2 * 10**9}
+    assert sites.anew == [True, False]
+    assert len(sites.said) == 2
+
+
+def test_shares_that_were_changed_before_are_shown() -> None:
+    change = '{"at_s": 0.001, "dominance": "s", "to": {"m1": 0.75, "m2": 0.25}}'
+    sites = Sites([event("setup"), event("change", command="none"), event("change", command=change)])
+    sites.begin(10**18)
+    with sites.shown():
+        (told,) = until(lambda: sites.graph.came["t/s/dominance"])
+        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [0.75, 0.25]
+        assert {"t/stop", "t/s/stop", "t/m1/reset", "t/end"} <= set(sites.graph.served)
