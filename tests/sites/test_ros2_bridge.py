@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import threading
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -175,25 +176,22 @@ def test_joints_that_are_missing_or_not_finite_are_named(
         read_joint_target(NAMES, joints(names, angles))
 
 
-FILE = """
-joint_states = "arm/joint_states"
-
-[sites.s]
-robot_states = "/joint_states"
-robot_commands = "/effort_controller/commands"
-joints = ["shoulder", "elbow"]
-controller = ["elbow", "shoulder"]
-safe = [0.5, -0.5]
-"""
+PAGE = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text(encoding="utf-8")
+FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGE, re.DOTALL))
+"""The examples of the page."""
 
 
 def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
     (tmp_path / "names.toml").write_text(FILE)
     table = read_topic_table(str(tmp_path / "names.toml"))
     assert table.find("play", "m1", "joint_states") == "play/m1/arm/joint_states"
+    assert table.find("play", "m1", "target_pose") == "m1/goal"
     assert table.find("play", "s", "robot_states") == "joint_states"
     assert table.find("play", "m1", "robot_states") == "play/m1/robot/joint_states"
-    assert table.robots == {"s": RobotTable(["shoulder", "elbow"], ["elbow", "shoulder"], [0.5, -0.5])}
+    assert table.robots == {
+        "s": RobotTable(["shoulder", "elbow"], ["elbow", "shoulder"], [0.0, 0.0]),
+        "m1": RobotTable(),
+    }
     assert read_topic_table("crtk").find("play", "s", "target_pose") == "play/s/servo_cp"
     assert read_topic_table("crisp").find("play", "s", "target_pose") == "play/s/target_pose"
 
@@ -224,7 +222,9 @@ def test_names_that_cannot_be_right_are_refused(tmp_path: Path, text: str | None
 
 @pytest.mark.parametrize("site", ["m", "nobody"])
 def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site: str) -> None:
-    (tmp_path / "names.toml").write_text(FILE.replace("sites.s", f"sites.{site}"))
+    (tmp_path / "names.toml").write_text(
+        FILE.replace("sites.s", f"sites.{site}").replace("sites.m1", "sites.s")
+    )
     scenario = load_scenario(str(Path(__file__).parents[2] / "examples" / "external_arm.toml"))
     with pytest.raises(UsageError, match=rf"sites\.{site}: there is no external arm; sites with one: s"):
         refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
