@@ -1,35 +1,39 @@
-"""A session in the graph of ROS 2: what its sites do as topics, its orders as services, its hands as targets.
+"""A session in the graph of ROS 2: what its sites do as topics, its orders as services, hands and robots.
 
 Invariant: ROS never sits in a loop. What comes from it enters only as a hand's message, which the site
-limits, fades and records, so that a log is verified without ROS. A topic that two publishers share moves
-nothing; one that falls silent for 200 ms lets go. Nothing that comes from ROS ends the bridge: it is refused,
-counted by its reason, and the first of each reason is said.
+limits, fades and records, or as a measurement of an external arm, so that a log is verified without ROS. A
+topic that two publishers share moves nothing; a target that falls silent for 200 ms lets go. A robot without
+a valid torque gets what is safe for it, never mere silence. Nothing that comes from ROS ends the bridge: it
+is refused, counted by its reason, and the first of each reason is said.
 """
 
 import math
 import threading
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import TrilatError, UsageError
+import msgspec
+
+from trilat_net.core.ticks import NS_PER_S, DominanceRamp
+from trilat_net.errors import ScenarioError, SessionError, TrilatError, UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import WORLD, RobotModel, find_quaternion
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.net import topics
-from trilat_net.net.arm_client import Hand
+from trilat_net.net.access_rules import BRIDGE
+from trilat_net.net.arm_client import ArmClient, Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.discovery import send_change
-from trilat_net.net.membership import read_records
-from trilat_net.net.messages import State
-from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.net.connection import Connection
+from trilat_net.net.discovery import find_members, list_past_events
+from trilat_net.net.membership import read_events, read_records
+from trilat_net.net.messages import Info, State
 from trilat_net.net.ros2_graph import (
     Attachment,
     QualityOfService,
@@ -39,22 +43,24 @@ from trilat_net.net.ros2_graph import (
     check_ros_name,
 )
 from trilat_net.net.zenoh_bus import RouterSilent
-from trilat_net.scenario import Scenario
+from trilat_net.scenario import Scenario, parse_embedded
 from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.run_changes import parse_core_change
 
-from .running_session import RunningSession, meet_sites, open_hand, order_sites, read_replies, stop_session
+from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
 """Least time between two looks at what has come."""
 LOOK_NS = 200_000_000
-"""Between two looks for what is not there yet."""
+"""Between two looks for what is not there yet, or not any more."""
 SILENCE_NS = 200_000_000
 """A target that nobody repeats for so long lets the arm go."""
-RAMP_S = 1.0
-"""Of a change of shares, as of `trilat set dominance`."""
 RIVAL_NS = NS_PER_S
 """A publisher that was heard within this time has not gone."""
-T = TypeVar("T")
+SAFE_NS = 10_000_000
+"""Between two commands that say to a robot what is safe."""
+DRIVE_S, ASK_S = 0.001, 0.05
+"""Between two looks for a torque; for shares that are wanted."""
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
 TRIGGER = "std_srvs/srv/Trigger"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -63,67 +69,157 @@ _OK, _WARNING, _ERROR = 0, 1, 2
 _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
 """Of `/diagnostics`, by mode; others warn."""
 
-
-CRTK = {
-    "joint_states": "measured_js",
-    "reference": "setpoint_js",
-    "tip_pose": "measured_cp",
-    "tip_wrench": "measured_cf",
-    "target_joint": "servo_jp",
-    "target_pose": "servo_cp",
-    "target_wrench": "servo_cf",
+NAMINGS = ("crisp", "crtk")
+TOPICS = {
+    "joint_states": ("joint_states", "measured_js"),
+    "reference": ("reference", "setpoint_js"),
+    "tip_pose": ("tip_pose", "measured_cp"),
+    "tip_wrench": ("tip_wrench", "measured_cf"),
+    "mode": ("mode", "mode"),
+    "dominance": ("dominance", "dominance"),
+    "robot_description": ("robot_description", "robot_description"),
+    "target_joint": ("target_joint", "servo_jp"),
+    "target_pose": ("target_pose", "servo_cp"),
+    "target_wrench": ("target_wrench", "servo_cf"),
+    "set_dominance": ("set_dominance", "set_dominance"),
+    "robot_states": ("robot/joint_states", "robot/measured_js"),
+    "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""By our names those of the Collaborative Robotics Toolkit, as the da Vinci Research Kit has them."""
+"""By our name of a topic the one that it has under `/<session>/<site>` in each of `NAMINGS`: as CRISP, and as
+the Collaborative Robotics Toolkit of the da Vinci Research Kit call it."""
 
 
-def read_topic_names(asked: str) -> Mapping[str, str]:
-    """Returns the names that topics have instead of ours: none for "crisp", those of "crtk" or of a file.
+class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a file says of the robot that is the arm of a site.
 
-    The file is TOML: `joint_states = "arm/joint_states"`.
+    Attributes:
+        joints: its names of the arm's joints, in the scenario's order; empty: as the scenario calls them.
+        controller: the same in the order of its controller; empty: in that of the scenario.
+        safe: what this controller gets while the arm is to brake; empty: zeros.
+    """
+
+    joints: list[str] = []
+    controller: list[str] = []
+    safe: list[float] = []
+
+
+class TopicTable(NamedTuple):
+    """The names of all topics, and the robots.
+
+    Attributes:
+        names: by our name of a topic the one that it has at every site.
+        of_site: the same for single sites, where it differs.
+        robots: by site.
+    """
+
+    names: Mapping[str, str]
+    of_site: Mapping[str, Mapping[str, str]] = {}
+    robots: Mapping[str, RobotTable] = {}
+
+    def find(self, session: str, site: str, topic: str) -> str:
+        """Returns the full name of a topic of a site; one that begins with / stands for itself."""
+        called = self.of_site.get(site, {}).get(topic, self.names[topic])
+        return called[1:] if called.startswith("/") else f"{session}/{site}/{called}"
+
+
+def read_topic_table(asked: str) -> TopicTable:
+    """Returns the names of "crisp" or "crtk", or those of a file, which is TOML upon those of CRISP.
+
+    As in `joint_states = "arm/joint_states"`; a table `[sites.s]` is for one site, and says of its robot
+    what a `RobotTable` has.
 
     Raises:
         UsageError: it cannot be read, or a name in it cannot be right.
     """
-    if asked in ("crisp", "crtk"):
-        return CRTK if asked == "crtk" else {}
+    plain = {topic: row[NAMINGS.index(asked) if asked in NAMINGS else 0] for topic, row in TOPICS.items()}
+    if asked in NAMINGS:
+        return TopicTable(plain)
     try:
         with open_regular(Path(asked)) as stream:
             found = tomllib.loads(stream.read().decode())
+        tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
+        robots = {site: _take_robot(table) for site, table in tables.items()}
     except OSError as error:
         raise UsageError(
             f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
         ) from None
+    except msgspec.ValidationError as error:
+        raise UsageError(f"{asked}: sites: {error}") from None
     except ValueError as error:
         raise UsageError(f"{asked}: is no TOML: {error}") from None
-    for key, name in found.items():
-        if key not in CRTK:
-            raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(CRTK))}")
+    for key, name in [pair for table in (found, *tables.values()) for pair in table.items()]:
+        if key not in TOPICS:
+            raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(TOPICS))}")
         check_ros_name(str(name), f"{asked}: {key}")
-    if len(set(found.values())) < len(found):
-        raise UsageError(f"{asked}: two topics have one name")
-    return found
+    table = TopicTable(plain | found, tables, robots)
+    shown = [topic for topic in TOPICS if topic != "robot_states"]  # several arms may stand in one message
+    places = [table.find("", site, topic) for site in (*tables, "*", "**") for topic in shown]
+    if len(set(places)) < len(places):
+        raise UsageError(f"{asked}: two topics have one name; one that begins with / is for one site")
+    return table
+
+
+def _take_robot(table: dict[str, Any]) -> RobotTable:
+    """Takes what is said of a robot out of the table of a site."""
+    own = {key: table.pop(key) for key in RobotTable.__struct_fields__ if key in table}
+    return msgspec.convert(own, RobotTable)
+
+
+class Ends(NamedTuple):
+    """Both ends of the bridge: the graph of ROS, and a session by its bus, its name and its topics."""
+
+    graph: Ros2Graph
+    bus: Bus
+    clock: Clock
+    session: str
+    table: TopicTable
+
+    def topic(self, site: str, name: str) -> str:
+        """Returns the full name of a topic."""
+        return self.table.find(self.session, site, name)
+
+
+class ShareHistory:
+    """The shares of a site in its peers, by the changes that are known."""
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._scenario, self._site = scenario, site
+        planned = [change for change in scenario.timeline if change.dominance == site]
+        self._ramps = {
+            scenario.ramp(site, scenario.dominance[site], -1, 0.0),
+            *(scenario.ramp(site, change.shares, change.start_ns, change.ramp_s) for change in planned),
+        }
+
+    def take(self, change: str) -> None:
+        """Takes a change of the site, as its events have it; one of anything else changes nothing."""
+        with suppress(ScenarioError):  # a stranger's
+            if (ramp := parse_core_change(self._scenario, self._site, change).ramp) is not None:
+                self._ramps.add(ramp)
+
+    def at(self, t_ns: int) -> tuple[float, ...]:
+        """Returns the shares at a time since the epoch, ns."""
+        return _find_shares(sorted(self._ramps), t_ns)
+
+
+def _find_shares(ramps: Sequence[DominanceRamp], t_ns: int) -> tuple[float, ...]:
+    *before, last = [ramp for ramp in ramps if ramp.start_ns <= t_ns]
+    if t_ns >= last.end_ns:
+        return last.alpha
+    part, old = (t_ns - last.start_ns) / (last.end_ns - last.start_ns), _find_shares(before, last.start_ns)
+    return tuple(a + part * (b - a) for a, b in zip(old, last.alpha, strict=True))
 
 
 class SiteTopics:
-    """What one site shows, under `/<session>/<site>`, and its part of `/tf`.
+    """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count from the epoch.
 
-    Args:
-        graph: publishes.
-        scenario, session, site: whose.
-        epoch_unix_ns: Unix time of tick 0, from which stamps count.
-        frames: publishes on `/tf`.
-        called: the names of topics, where they are not ours.
+    Attributes:
+        frame: in which the end effector is: that of the arm's base, or the one that the sites share.
+        shares: of its peers in its reference.
+        newest: the record that was shown last.
     """
 
     def __init__(
-        self,
-        graph: Ros2Graph,
-        scenario: Scenario,
-        session: str,
-        site: str,
-        epoch_unix_ns: int,
-        frames: TopicPublisher,
-        called: Mapping[str, str],
+        self, ends: Ends, scenario: Scenario, site: str, epoch_unix_ns: int, frames: TopicPublisher
     ) -> None:
         self._arm, self._epoch_unix_ns, self._frames = scenario.arms[site], epoch_unix_ns, frames
         task = None if self._arm.chain is None else self._arm.chain.task
@@ -131,21 +227,34 @@ class SiteTopics:
         self._robot, names = RobotModel(scenario, site), Ros2SiteChannels(scenario, site).joints
         self._pack_states = cdr.JointStatePacker(names).pack
         self._pack_reference = cdr.JointStatePacker(names, effort=False).pack
+        peers = scenario.peers(site)
+        self._pack_shares = cdr.make_float_array_packer(cdr.ArrayDimension(" ".join(peers), len(peers)))
+        self.shares = ShareHistory(scenario, site)
+        self._shown: tuple[float, ...] = ()
 
         def topic(name: str, kind: str, qos: QualityOfService = RELIABLE) -> TopicPublisher:
-            return graph.publisher(f"{session}/{site}/{called.get(name, name)}", kind, qos)
+            return ends.graph.publisher(ends.topic(site, name), kind, qos)
 
         self._states, self._modes = topic("joint_states", cdr.JOINT_STATE), topic("mode", cdr.STRING, LATCHED)
-        self._pose = topic("tip_pose", POSE)
+        self._pose, self._dominance = topic("tip_pose", POSE), topic("dominance", cdr.FLOAT64_ARRAY, LATCHED)
         shares = self._arm.shares_pose
         self._reference = None if shares else topic("reference", cdr.JOINT_STATE)
         self._wrench = topic("tip_wrench", WRENCH) if shares else None
         topic("robot_description", cdr.STRING, LATCHED).put(cdr.pack_string(self._robot.description))
         spec = scenario.sites[site].arm
-        self._frame, self._placed = self._robot.frames[0][1], any((*spec.base_xyz_m, *spec.base_rpy_rad))
+        self.frame, self._placed = self._robot.frames[0][1], any((*spec.base_xyz_m, *spec.base_rpy_rad))
         if self._placed:  # the end effector is in the frame that the sites share
-            self._frame = f"{site}/shared"
-            self._pack_shared = cdr.TransformPacker([(WORLD, self._frame)]).pack
+            self.frame = f"{site}/shared"
+            self._pack_shared = cdr.TransformPacker([(WORLD, self.frame)]).pack
+        self.newest: State | None = None
+
+    def show(self, record: State, rate_hz: float) -> None:
+        """Publishes a record if it is the first of its time at a rate; none is shown after a later one."""
+        last = self.newest
+        times = [int(one.t_ns * rate_hz) // NS_PER_S for one in (record, last or record)]
+        if last is None or record.boot != last.boot or times[0] > times[1]:
+            self.newest = record
+            self.publish(record)
 
     def publish(self, record: State) -> None:
         """Publishes a record, as far as somebody listens."""
@@ -157,10 +266,10 @@ class SiteTopics:
         if self._pose.heard:
             place = [*self._arm.end_effector(record.q), 0.0][:3]
             turned = find_quaternion(self._arm.end_turn(record.q))
-            self._pose.put(cdr.pack_frame_vectors(stamp_ns, self._frame, *place, *turned))
+            self._pose.put(cdr.pack_frame_vectors(stamp_ns, self.frame, *place, *turned))
         if self._wrench is not None and self._wrench.heard:
             pull = [-scale * one for scale, one in zip(self._scale, record.wrench, strict=False)]
-            self._wrench.put(cdr.pack_frame_vectors(stamp_ns, self._frame, *[*pull, *[0.0] * 6][:6]))
+            self._wrench.put(cdr.pack_frame_vectors(stamp_ns, self.frame, *[*pull, *[0.0] * 6][:6]))
         if self._frames.heard:
             self._frames.put(self._robot.pack(stamp_ns, record.q))
             if self._placed:
@@ -169,57 +278,63 @@ class SiteTopics:
         if record.mode != self._mode:
             self._mode = record.mode
             self._modes.put(cdr.pack_string(record.mode))
+        if (shares := self.shares.at(record.t_ns)) != self._shown:
+            self._shown = shares
+            self._dominance.put(self._pack_shares(*shares))
+
+
+class OneSender:
+    """Of several publishers that send on one topic none counts, until all but one are gone."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._gid = clock, b""
+        self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
+
+    def admit(self, gid: bytes) -> int:
+        """Takes note of a message of a publisher; returns how long nothing had come before it, ns.
+
+        Raises:
+            ValueError: another one was heard a moment ago.
+        """
+        now_ns = self._clock.monotonic_ns()
+        silent_ns = now_ns - self._heard_ns
+        if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
+            self._mixed_ns = now_ns
+        self._gid, self._heard_ns = gid, now_ns
+        if now_ns - self._mixed_ns < RIVAL_NS:
+            raise ValueError("has two publishers: neither moves the arm until the other is gone")
+        return silent_ns
 
 
 class TargetTopic:
     """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or `target_wrench`.
 
-    Args:
-        hand: the hand; its context is that of the bridge.
-        topic: its name.
-        read: returns the goal of a message; a ValueError says what is wrong with it.
-        act: gives a goal to the hand.
-        clock, refusals: of the bridge.
+    `read` returns the goal of a message, or raises ValueError, and `act` gives it to the hand.
     """
 
     def __init__(
-        self,
-        hand: Hand,
-        topic: str,
-        read: Callable[[bytes], Sequence[float]],
-        act: Callable[..., int],
-        clock: Clock,
-        refusals: Refusals,
+        self, hand: Hand, read: Callable[[bytes], Sequence[float]], act: Callable[..., int], clock: Clock
     ) -> None:
-        self.hand, self.topic, self._read, self._act = hand, topic, read, act
-        self._clock, self._refusals = clock, refusals
-        self._lock = threading.Lock()
-        self._heard_ns: dict[bytes, int] = {}
+        self.hand, self._read, self._act, self._clock = hand, read, act, clock
+        self._sender, self._lock = OneSender(clock), threading.Lock()
         self._held_ns: int | None = None
 
     def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's."""
-        now_ns = self._clock.monotonic_ns()
-        try:
-            with self._lock:
-                self._heard_ns[attachment.gid] = now_ns
-                rivals = sum(now_ns - heard < RIVAL_NS for heard in self._heard_ns.values())
-                if rivals > 1:
-                    self._let_go()
-                    raise ValueError("has two publishers: neither moves the arm until the other is gone")
-                self._act(*self._read(data))
-                self._held_ns = now_ns
-        except (ValueError, TrilatError) as error:
-            self._refusals.add(f"{self.topic} {error}")
+        """Takes a message, in a thread of Zenoh's; raises ValueError or TrilatError if that cannot be."""
+        with self._lock:
+            try:
+                self._sender.admit(attachment.gid)
+            except ValueError:
+                self._let_go()
+                raise
+            self._act(*self._read(data))
+            self._held_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
         """Lets go where nobody has repeated the target."""
-        now_ns = self._clock.monotonic_ns()
         with self._lock:
-            if self._held_ns is not None and now_ns - self._held_ns > SILENCE_NS:
+            if self._held_ns is not None and self._clock.monotonic_ns() - self._held_ns > SILENCE_NS:
                 self._let_go()
-            for gid in [gid for gid, heard in self._heard_ns.items() if now_ns - heard > RIVAL_NS]:
-                del self._heard_ns[gid]
 
     def _let_go(self) -> None:
         if self._held_ns is not None:
@@ -230,68 +345,141 @@ class TargetTopic:
 class DominanceTopic:
     """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest message wins.
 
+    One that only repeats what was asked for, without a pause of a second, asks for nothing. Its numbers are
+    in the order of `peers`; `change` asks the site, and waits until it agrees.
+    """
+
+    def __init__(
+        self, peers: Sequence[str], change: Callable[[dict[str, float]], object], clock: Clock
+    ) -> None:
+        self._peers, self._change, self._sender = peers, change, OneSender(clock)
+        self._wanted: dict[str, float] | None = None
+        self._asked: dict[str, float] | None = None
+
+    def take(self, data: bytes, attachment: Attachment) -> None:
+        """Takes a message, in a thread of Zenoh's; raises ValueError if that cannot be."""
+        shares = _check_finite(cdr.read_float_array(data))
+        if len(shares) != len(self._peers):
+            raise ValueError(f"has {len(shares)} numbers; the peers are {', '.join(self._peers)}")
+        if self._sender.admit(attachment.gid) > RIVAL_NS:
+            self._asked = None
+        self._wanted = dict(zip(self._peers, shares, strict=True))
+
+    def ask(self) -> None:
+        """Asks the site for what is wanted, if that is new; raises TrilatError if it refuses."""
+        wanted = self._wanted
+        if wanted is not None and wanted != self._asked:
+            self._asked = wanted
+            self._change(wanted)
+
+
+class RobotArm:
+    """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the site's torque.
+
+    It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's controller
+    gets again and again what is safe for it.
+
     Args:
-        topic: its name.
-        peers: of the site, in the order of the numbers of a message.
-        change: asks the site, and waits for its reply.
-        refusals: of the bridge.
+        make: returns a client of the site, of whatever start of it.
+        joints: of each joint of the arm, in the scenario's order, the names by which the robot may call it.
+        robot: the order of its controller, and what is safe.
+        commands: publishes to that controller.
+
+    Attributes:
+        armed: whether torques are sent, and not only what is safe.
+
+    Raises:
+        UsageError: the controller has not one number for each joint.
     """
 
     def __init__(
         self,
-        topic: str,
-        peers: Sequence[str],
-        change: Callable[[dict[str, float]], ChangeReply],
-        refusals: Refusals,
+        make: Callable[[], ArmClient],
+        joints: Sequence[Sequence[str]],
+        robot: RobotTable,
+        commands: TopicPublisher,
+        clock: Clock,
     ) -> None:
-        self.topic, self._peers, self._change, self._refusals = topic, peers, change, refusals
-        self._wanted: dict[str, float] | None = None
-        self._asked: dict[str, float] | None = None
+        self.armed = False
+        self._make, self._client, self._joints = make, make(), joints
+        order = robot.controller or [called[0] for called in joints]
+        self._order = [n for name in order for n, called in enumerate(joints) if name in called]
+        self._safe = robot.safe or [0.0] * len(joints)
+        whole = sorted(self._order) == list(range(len(joints))) and len(order) == len(joints)
+        if not whole or len(self._safe) != len(joints) or not all(map(math.isfinite, self._safe)):
+            named = ", ".join(called[0] for called in joints)
+            raise UsageError(f"--names: `controller` and `safe` have one of each joint: {named}")
+        self._pack = cdr.make_float_array_packer(cdr.ArrayDimension(" ".join(order), len(order)))
+        self._commands, self._clock = commands, clock
+        self._sender, self._lock = OneSender(clock), threading.Lock()
+        self._sent: tuple[int, int] | None = None  # boot and tick of the record whose torque went out last
+        self._safe_ns = clock.monotonic_ns() - SAFE_NS
 
-    def take(self, data: bytes, _: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's."""
-        try:
-            shares = _check_finite(cdr.read_float_array(data))
-            if len(shares) != len(self._peers):
-                raise ValueError(f"has {len(shares)} numbers; the peers are {', '.join(self._peers)}")
-            self._wanted = dict(zip(self._peers, shares, strict=True))
-        except ValueError as error:
-            self._refusals.add(f"{self.topic} {error}")
+    def take(self, data: bytes, attachment: Attachment) -> None:
+        """Takes a message, in a thread of Zenoh's, unless it is of another robot alone.
 
-    def ask(self) -> None:
-        """Asks the site for what is wanted, if that is new; waits for its reply."""
-        if (wanted := self._wanted) is None or wanted == self._asked:
+        Raises:
+            ValueError: it is no measurement of the arm.
+        """
+        found = cdr.read_joint_state(data)
+        if found.names and not any(name in found.names for called in self._joints for name in called):
             return
-        self._asked = wanted
-        try:
-            reply = self._change(wanted)
-        except TrilatError as error:
-            self._refusals.add(f"{self.topic} {error}")
-        else:
-            if not reply.accepted:
-                self._refusals.add(f"{self.topic} {reply.text}")
+        at = find_joint_places(self._joints, found)
+        if len(found.velocity) != len(found.position):
+            raise ValueError(f"has {len(found.position)} positions and {len(found.velocity)} velocities")
+        q, qd = (_check_finite([row[n] for n in at]) for row in (found.position, found.velocity))
+        with self._lock:
+            self._sender.admit(attachment.gid)
+            self._client.send(q, qd, stamp_ns=found.stamp_ns)
+
+    def drive(self) -> None:
+        """Publishes the torque of the newest record, once, or what is safe."""
+        if self._client.over:  # the site may come again
+            with self._lock:
+                self._client = self._make()
+        torque, record = self._client.torque(), self._client.record
+        if not self.armed or torque is None or record is None or len(torque) != len(self._order):
+            if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
+                self.brake()
+        elif self._sent != (record.boot, record.tick):
+            self._sent = record.boot, record.tick
+            self._commands.put(self._pack(*(torque[n] for n in self._order)))
+
+    def brake(self) -> None:
+        """Publishes what is safe."""
+        self._safe_ns = self._clock.monotonic_ns()
+        self._commands.put(self._pack(*self._safe))
 
 
-def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in the order of an arm's joints, whose names it has in any order.
+def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
+    """Returns where the joints of an arm stand in a `JointState`, which has them in any order.
 
     Args:
         names: of each joint the names by which it may be called.
-        data: the message; further joints in it are passed over, and without names it is in the arm's order.
+        found: the message; further joints in it are passed over.
+
+    Raises:
+        ValueError: it lacks a joint, or has one twice.
+    """
+    if len(found.names) != len(found.position):
+        raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
+    at = {name: n for n, name in enumerate(found.names)}
+    lacking = [called[0] for called in names if not at.keys() & set(called)]
+    if lacking:
+        raise ValueError(f"lacks {', '.join(lacking)}; it has {', '.join(found.names[:9]) or 'no names'}")
+    if twice := [name for called in names for name in called if found.names.count(name) > 1]:
+        raise ValueError(f"has {twice[0]} twice")
+    return [next(at[name] for name in called if name in at) for called in names]
+
+
+def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
+    """Returns the angles of a `JointState` in the order of an arm's joints, see `find_joint_places`.
 
     Raises:
         ValueError: it cannot be read, lacks a joint, or an angle is not finite.
     """
     found = cdr.read_joint_state(data)
-    if not found.names and len(found.position) == len(names):
-        return _check_finite(found.position)
-    if len(found.names) != len(found.position):
-        raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
-    at = dict(zip(found.names, found.position, strict=True))
-    lacking = [called[0] for called in names if not at.keys() & set(called)]
-    if lacking:
-        raise ValueError(f"lacks {', '.join(lacking)}; it has {', '.join(found.names[:9]) or 'no names'}")
-    return _check_finite([next(at[name] for name in called if name in at) for called in names])
+    return _check_finite([found.position[n] for n in find_joint_places(names, found)])
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
@@ -300,98 +488,129 @@ def _check_finite(numbers: Sequence[float]) -> list[float]:
     return list(numbers)
 
 
-def read_place_target(axes: int, count: int, data: bytes) -> list[float]:
+def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
     """Returns the place of a `PoseStamped` (7 numbers) or the force of a `WrenchStamped` (6), by the axes.
 
     Raises:
-        ValueError: it cannot be read, or a number is not finite.
+        ValueError: it cannot be read, is in another frame than this or none, or a number is not finite.
     """
-    return _check_finite(cdr.read_frame_vectors(data, count)[1][:axes])
+    found, numbers = cdr.read_frame_vectors(data, count)
+    if found not in ("", frame):
+        raise ValueError(f"is in the frame {found[:80]!r}, and here it is {frame!r}")
+    return _check_finite(numbers[:axes])
 
 
-class Bridge(NamedTuple):
-    """A bridge that is open.
+class Bridge:
+    """The bridge of a session that runs; its topics and services are there from now on.
+
+    Args:
+        ends: of the bridge.
+        scenario: of the session.
+        epoch_unix_ns: Unix time of its tick 0.
 
     Attributes:
-        sites: by name what a site shows.
-        targets: the topics that hold arms.
-        dominance: the topics that change who leads.
-        diagnose: publishes `/diagnostics` of the newest records.
+        targets: by topic what holds an arm.
+        dominance: by topic what changes who leads.
     """
 
-    sites: dict[str, SiteTopics]
-    targets: list[TargetTopic]
-    dominance: list[DominanceTopic]
-    diagnose: Callable[[dict[str, State]], None]
+    def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
+        graph, bus, clock, session, _ = self._ends = ends
+        states, events = (topics.key(session, "*", channel) for channel in (topics.STATE, topics.EVENT))
+        self._records, self._events = bus.inbox(states, 4096), bus.inbox(events, 4096)
+        self._presence = bus.presence(topics.presence_key(session, "*"))
+        self._present: set[topics.KeyParts] = set()
+        self._epoch_unix_ns = epoch_unix_ns
+        frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
+        self._sites = {
+            name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names
+        }
+        self._diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+        running = RunningSession(session, Connection(), bus)
+        self.targets, self.dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
+        for name, shown in self._sites.items():
+            for event in list_past_events(bus, clock, session, name):
+                shown.shares.take(event.command)
+            topic, change = ends.topic(name, "set_dominance"), partial(running.set_dominance, name)
+            self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
+            graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
+        for name in [one for one in scenario.names if find_live_hand(scenario.sites[one].hands) is not None]:
+            hand = open_hand(bus, clock, session, name, scenario, "ros2")
+            last, kind, read, act = describe_target(scenario, name, hand, self._sites[name].frame)
+            topic = ends.topic(name, last)
+            self.targets[topic] = TargetTopic(hand, read, act, clock)
+            graph.subscribe(topic, kind, self.targets[topic].take)
+        serve_orders(graph, running, scenario.names)
 
+    def run(self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]) -> bool:
+        """Shows the session at a rate, the newest record each time, until it ends or `stopped`.
 
-def open_bridge(
-    graph: Ros2Graph,
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    scenario: Scenario,
-    epoch_unix_ns: int,
-    called: Mapping[str, str],
-) -> Bridge:
-    """Returns the bridge of a session that runs, whose topics and services are there from now on.
+        Returns True if another session has begun under its name.
+        """
+        clock, connected = self._ends.clock, True
+        wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
+        poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
+        while not stopped() and not self._is_over():
+            if self._show(rate_hz):
+                return True
+            for target in self.targets.values():
+                target.watch()
+            now_ns = clock.monotonic_ns()
+            if now_ns - looked_ns > LOOK_NS:
+                looked_ns, before, connected = now_ns, connected, self._ends.graph.connected
+                if connected != before:
+                    say(f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}")
+            if now_ns - diagnosed_ns > NS_PER_S:
+                diagnosed_ns = now_ns
+                self._diagnose()
+            wake_ns = max(wake_ns + poll_ns, now_ns)
+            clock.sleep_until(wake_ns)
+        return False
 
-    `called` has the names of topics where they are not ours.
-    """
-    frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
-    sites = {
-        name: SiteTopics(graph, scenario, session, name, epoch_unix_ns, frames, called)
-        for name in scenario.names
-    }
-    able = [name for name in scenario.names if find_live_hand(scenario.sites[name].hands) is not None]
-    targets = []
-    for name in able:
-        hand = open_hand(bus, clock, session, name, scenario, "ros2")
-        last, kind, read, act = describe_target(scenario, name, hand)
-        topic = f"{session}/{name}/{called.get(last, last)}"
-        targets.append(TargetTopic(hand, topic, read, act, clock, graph.refusals))
-        graph.subscribe(topic, kind, targets[-1].take)
-    dominance = []
-    for name in scenario.names:
-        change = partial(_set_dominance, bus, clock, session, name)
-        peers = scenario.peers(name)
-        dominance.append(DominanceTopic(f"{session}/{name}/set_dominance", peers, change, graph.refusals))
-        graph.subscribe(dominance[-1].topic, cdr.FLOAT64_ARRAY, dominance[-1].take)
-    for service, order in list_services(bus, clock, session, scenario):
-        graph.serve(service, TRIGGER, partial(_answer, order))
-    diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
+    def _show(self, rate_hz: float) -> bool:
+        """Shows what has come; returns whether another session has begun under the name of this one."""
+        for record in read_records(self._records):
+            if record.site in self._sites:
+                self._sites[record.site].show(record, rate_hz)
+        anew = False
+        for event in read_events(self._events):
+            anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
+            if event.member in self._sites:
+                self._sites[event.member].shares.take(event.command)
+        for parts, alive in topics.read_presence(self._presence):
+            if parts.member in self._sites:
+                (self._present.add if alive else self._present.discard)(parts)
+        return anew
 
-    def diagnose(records: dict[str, State]) -> None:
+    def _is_over(self) -> bool:
+        return not self._present and any(shown.newest for shown in self._sites.values())
+
+    def _diagnose(self) -> None:
         """Publishes the state of every site."""
-        parts = [_diagnose(session, record) for record in records.values()]
-        newest_ns = max((record.t_ns for record in records.values()), default=0)
-        diagnostics.put(cdr.pack_diagnostics(max(0, epoch_unix_ns + newest_ns), parts))
-
-    return Bridge(sites, targets, dominance, diagnose)
-
-
-class TargetKind(NamedTuple):
-    """How a hand is moved from ROS: the last part of the topic, its type, what reads it, what it does."""
-
-    name: str
-    kind: str
-    read: Callable[[bytes], Sequence[float]]
-    act: Callable[..., int]
+        records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
+        newest_ns = max((record.t_ns for record in records), default=0)
+        parts = [_diagnose(self._ends.session, record) for record in records]
+        self._diagnostics.put(cdr.pack_diagnostics(max(0, self._epoch_unix_ns + newest_ns), parts))
 
 
-def describe_target(scenario: Scenario, site: str, hand: Hand) -> TargetKind:
-    """Returns how the live hand of a site is moved: by the mode that the scenario gives it."""
+def describe_target(
+    scenario: Scenario, site: str, hand: Hand, frame: str
+) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
+    """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it, what it does."""
     live = find_live_hand(scenario.sites[site].hands)
     assert live is not None
     axes = len(scenario.arms[site].end_effector(scenario.sites[site].q0_rad))
     if live.mode == "joint":
-        plain = scenario.arms[site].joint_names
-        shown = Ros2SiteChannels(scenario, site).joints
-        called = [tuple(dict.fromkeys(pair)) for pair in zip(shown, plain, strict=True)]
-        return TargetKind("target_joint", cdr.JOINT_STATE, partial(read_joint_target, called), hand.turn)
+        read = partial(read_joint_target, list_joint_names(scenario, site))
+        return "target_joint", cdr.JOINT_STATE, read, hand.turn
     if live.mode == "force":
-        return TargetKind("target_wrench", WRENCH, partial(read_place_target, axes, 6), hand.push)
-    return TargetKind("target_pose", POSE, partial(read_place_target, axes, 7), hand.move)
+        return "target_wrench", WRENCH, partial(read_place_target, frame, axes, 6), hand.push
+    return "target_pose", POSE, partial(read_place_target, frame, axes, 7), hand.move
+
+
+def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
+    """Returns the names of each joint of a site: the one that its topics show, and that of the scenario."""
+    pairs = zip(Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True)
+    return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
 def _diagnose(session: str, record: State) -> cdr.Diagnosis:
@@ -402,165 +621,157 @@ def _diagnose(session: str, record: State) -> cdr.Diagnosis:
     )
 
 
-def list_services(
-    bus: Bus, clock: Clock, session: str, scenario: Scenario
-) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yields the services of a session, and what they do: `/<session>/stop`, `/<session>/<site>/stop`, ..."""
-    orders: tuple[OrderName, ...] = ("stop", "enable", "reset")
+def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
+    """Offers the services of a session: `/<session>/stop`, `/<session>/<site>/stop`, ..."""
 
-    def give(order: OrderName, *sites: str) -> str:
-        return "; ".join(read_replies(order_sites(bus, clock, session, sites, order)))
+    def serve(order: Callable[..., list[str]], *site: str) -> None:
+        name = "/".join([running.name, *site, order.__name__])
+        graph.serve(name, TRIGGER, lambda _: _answer(order, *site))
 
-    for order in orders:
-        yield f"{session}/{order}", partial(give, order)
-        for site in scenario.names:
-            yield f"{session}/{site}/{order}", partial(give, order, site)
-    yield f"{session}/end", lambda: "; ".join(stop_session(bus, clock, session))
+    for order in (running.stop, running.enable, running.reset):
+        serve(order)
+        for site in sites:
+            serve(order, site)
+    serve(running.end)
 
 
-def _set_dominance(bus: Bus, clock: Clock, session: str, site: str, shares: dict[str, float]) -> ChangeReply:
-    request = ChangeRequest(dominance=site, to=shares, ramp_s=RAMP_S)
-    return send_change(bus, clock, session, site, request)
-
-
-def _answer(order: Callable[[], str], _request: bytes) -> bytes:
+def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
     """Does what a service is asked for; what is refused is an answer as well."""
     try:
-        return cdr.pack_trigger_response(success=True, text=order())
+        return cdr.pack_trigger_response(success=True, text="; ".join(order(*sites)))
     except TrilatError as error:
         return cdr.pack_trigger_response(success=False, text=str(error))
 
 
-def run_bridge(
-    bridge: Bridge,
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    rate_hz: float,
-    stopped: Callable[[], bool],
-) -> None:
-    """Shows the session at a rate, the newest record each time, until it ends or `stopped`."""
-    records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
-    presence = bus.presence(topics.presence_key(session, "*"))
-    newest: dict[str, State] = {}
-    shown: dict[str, tuple[int, int]] = {}
-    present: set[str] = set()
-    diagnosed_ns = clock.monotonic_ns()
-    poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
-    wake_ns = clock.monotonic_ns()
-    while not stopped():
-        for record in read_records(records):
-            if record.site in bridge.sites:
-                bucket = int(record.t_ns * rate_hz) // NS_PER_S
-                boot, last = shown.get(record.site, (record.boot, -1))
-                if bucket > last or record.boot != boot:  # none is shown after a later one
-                    shown[record.site] = record.boot, bucket
-                    newest[record.site] = record
-                    bridge.sites[record.site].publish(record)
-        for parts, alive in topics.read_presence(presence):
-            if parts.member in bridge.sites:
-                (present.add if alive else present.discard)(parts.member)
-        if newest and not present:
-            return
-        for target in bridge.targets:
-            target.watch()
-        if clock.monotonic_ns() - diagnosed_ns > NS_PER_S:
-            diagnosed_ns = clock.monotonic_ns()
-            bridge.diagnose(newest)
-        wake_ns = max(wake_ns + poll_ns, clock.monotonic_ns())
-        clock.sleep_until(wake_ns)
-
-
 @contextmanager
-def _asking(dominance: Sequence[DominanceTopic]) -> Iterator[None]:
-    """Asks sites for the shares that are wanted, in a thread of its own, since they take time to reply."""
+def _repeated(
+    period_s: float, act: Callable[[], None], last: Callable[[], None] = lambda: None
+) -> Iterator[None]:
+    """Does something again and again, in a thread of its own, and something else at the end."""
     over = threading.Event()
 
-    def ask() -> None:
-        while not over.wait(0.05):
-            for topic in dominance:
-                topic.ask()
+    def repeat() -> None:
+        while not over.wait(period_s):
+            act()
 
-    asker = threading.Thread(target=ask, name="shares", daemon=True)
-    asker.start()
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         over.set()
-        asker.join()
+        thread.join()
+        last()
 
 
 def serve_ros2(
     running: RunningSession,
     open_graph: Callable[[Refusals], Ros2Graph],
     rate_hz: float,
-    called: Mapping[str, str],
+    table: TopicTable,
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for it to begin and a router.
+    """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for a router and for it.
 
-    Args:
-        running: the session.
-        open_graph: opens the graph, if its router answers, with what takes refusals.
-        rate_hz: messages a second of each topic.
-        called: the names of topics, where they are not ours.
-        stopped: whether to end.
-        say: takes a line for people.
-        timeout_s: longest wait for the first answer of a site.
+    `timeout_s` is the longest wait for the first site or its router.
+
+    Raises:
+        UsageError: no router, or what the table says of a robot does not fit the session.
     """
     clock = SystemClock()
-    wait = partial(_wait_for, clock, stopped, say)
-    with running.reach(timeout_s=timeout_s) as bus:
-        begun = wait(partial(_find_begun, bus, clock, running.name), f"{running.name} has not begun: waiting")
-        if begun is None:
-            return
-        graph = wait(
-            partial(_try_graph, partial(open_graph, Refusals(say))),
-            "no router of ROS answers: waiting for it",
-        )
-        if graph is None:
-            return
-        scenario, epoch_unix_ns = begun
-        with graph, ExitStack() as hands:
-            bridge = open_bridge(graph, bus, clock, running.name, scenario, epoch_unix_ns, called)
-            for target in bridge.targets:
-                hands.enter_context(target.hand)
-            held = "".join(f"; {target.topic} holds an arm" for target in bridge.targets)
-            say(f"session {running.name} is in the graph of ROS 2: /{running.name}/...{held}")
-            with _asking(bridge.dominance):
-                run_bridge(bridge, bus, clock, running.name, rate_hz, stopped)
+    with running.reach(BRIDGE, timeout_s) as bus:
+        began_anew, told = True, False
+        while began_anew and not stopped():
+            try:
+                graph = open_graph(Refusals(say))
+            except RouterSilent as silent:
+                if not told:
+                    say(f"{silent}: waiting for it")
+                told = True
+                clock.sleep_until(clock.monotonic_ns() + LOOK_NS)
+                continue
+            with graph:
+                ends = Ends(graph, bus, clock, running.name, table)
+                began_anew = show_session(ends, rate_hz, stopped, say)
 
 
-def _wait_for(
-    clock: Clock,
-    stopped: Callable[[], bool],
-    say: Callable[[str], None],
-    find: Callable[[], T | None],
-    text: str,
-) -> T | None:
-    """Returns what is found in the end, having said once that it is waited for; None if `stopped`."""
+def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]) -> bool:
+    """Shows a session until it ends or `stopped`; waits for it to begin, which the arms of robots let it.
+
+    Returns True if another one has begun under its name.
+    """
+    with ExitStack() as stack:
+        robots: dict[str, RobotArm] = {}
+        for site, robot in ends.table.robots.items():
+            if robot.joints:  # as it can begin before any site answers
+                robots[site] = stack.enter_context(open_robot(ends, site, robot))
+        if (met := await_site(ends, stopped, say, running=False)) is None:
+            return False
+        scenario = parse_embedded(met.scenario, ends.session)
+        refuse_other_robots(ends.table, scenario)
+        for site in scenario.external:
+            if site not in robots:
+                robot, names = ends.table.robots.get(site, RobotTable()), list_joint_names(scenario, site)
+                robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
+            robots[site].armed = True
+        if (begun := await_site(ends, stopped, say, running=True)) is None:
+            return False
+        bridge = Bridge(ends, scenario, begun.epoch_unix_ns)
+        for target in bridge.targets.values():
+            stack.enter_context(target.hand)
+        for topic, shares in bridge.dominance.items():
+            stack.enter_context(_repeated(ASK_S, ends.graph.refusals.guard(topic, shares.ask)))
+        held = [f"; /{topic} holds an arm" for topic in bridge.targets]
+        held += [f"; /{ends.topic(site, 'robot_states')} measures the arm of {site}" for site in robots]
+        say(f"session {ends.session} is in the graph of ROS 2: /{ends.session}/...{''.join(held)}")
+        return bridge.run(rate_hz, stopped, say)
+
+
+@contextmanager
+def open_robot(
+    ends: Ends, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
+) -> Iterator[RobotArm]:
+    """Yields the robot of a site, which is heard and driven meanwhile, and brakes at the end."""
+    commands = ends.graph.publisher(ends.topic(site, "robot_commands"), cdr.FLOAT64_ARRAY, RELIABLE)
+    make = partial(ArmClient, ends.bus, ends.clock, ends.session, site)
+    names = joints or [(name,) for name in robot.joints]
+    arm = RobotArm(make, names, robot, commands, ends.clock)
+    ends.graph.subscribe(ends.topic(site, "robot_states"), cdr.JOINT_STATE, arm.take)
+    with _repeated(DRIVE_S, arm.drive, arm.brake):
+        yield arm
+
+
+def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
+    """Refuses the robot of a site without an external arm.
+
+    Raises:
+        UsageError: the table has one.
+    """
+    for site, robot in table.robots.items():
+        if site not in scenario.external and (robot != RobotTable() or site not in scenario.names):
+            able = ", ".join(scenario.external) or "none"
+            raise UsageError(f"--names: sites.{site}: there is no external arm; sites with one: {able}")
+
+
+def await_site(
+    ends: Ends, stopped: Callable[[], bool], say: Callable[[str], None], *, running: bool
+) -> Info | None:
+    """Returns what a site answers, of a session that is to be running or not; None if `stopped`.
+
+    It says once what it waits for.
+    """
+    why = f"session {ends.session} has not begun" if running else f"no site of session {ends.session} answers"
     told = False
     while not stopped():
-        if (found := find()) is not None:
-            return found
+        try:
+            for info in find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=1.0):
+                if info.scenario and (info.running or not running):
+                    return info
+        except SessionError as error:  # of another version of this program
+            why = str(error)
         if not told:
-            say(text)
-            told = True
-        clock.sleep_until(clock.monotonic_ns() + LOOK_NS)
+            say(f"{why}: waiting")
+        told = True
     return None
-
-
-def _find_begun(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, int] | None:
-    """Returns the scenario of a session that has begun, and its epoch in Unix time."""
-    scenario, found = meet_sites(bus, clock, session)
-    begun = [info for info in found.values() if info.running]
-    return (scenario, begun[0].epoch_unix_ns) if begun else None
-
-
-def _try_graph(open_graph: Callable[[], Ros2Graph]) -> Ros2Graph | None:
-    try:
-        return open_graph()
-    except RouterSilent:
-        return None

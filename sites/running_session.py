@@ -44,27 +44,33 @@ AHEAD_S = 0.5
 
 
 class RunningSession:
-    """A session that runs; see `session`. Methods return what the sites answer, a sentence each."""
+    """A session that runs; see `session`. Methods return what the sites answer, a sentence each.
 
-    def __init__(self, name: str, connection: Connection) -> None:
-        self.name, self._connection, self._clock = name, connection, SystemClock()
+    With a `bus` that reaches it, they use that one and connect no more.
+    """
+
+    def __init__(self, name: str, connection: Connection, bus: Bus | None = None) -> None:
+        self.name, self._connection, self._clock, self._bus = name, connection, SystemClock(), bus
 
     @contextmanager
-    def reach(self, *, operates: bool = True, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
-        """Yields a connection to the session; with keys that of an operator, or to look alone of anybody.
+    def reach(self, member: str = OPERATOR, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
+        """Yields a connection to the session; with keys those of a member, or with "" of anybody.
 
         Raises:
             SessionError: no site answers.
         """
-        if operates:
-            self._connection.require(OPERATOR)
+        if self._bus is not None:
+            yield self._bus
+            return
+        if member:
+            self._connection.require(member)
         there = self._connection, self._clock, self.name, embedded_names_reader(self.name)
         with connect_to_session(*there, stopped=lambda: False, timeout_s=timeout_s) as bus:
             assert bus is not None  # nothing stops it
             yield bus
 
     def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
-        with self.reach(operates=order != "stop") as bus:
+        with self.reach("" if order == "stop" else OPERATOR) as bus:
             return read_replies(order_sites(bus, self._clock, self.name, sites, order))
 
     def stop(self, *sites: str) -> list[str]:
@@ -115,7 +121,7 @@ class RunningSession:
         >>> with tn.session("paper").records("s") as take:  # doctest: +SKIP
         ...     [record.q_des for record in take()]
         """
-        with self.reach(operates=False) as bus:
+        with self.reach("") as bus:
             rings = [bus.inbox(topics.key(self.name, site, topics.STATE), 4096) for site in sites or ("*",)]
 
             def take() -> list[State]:

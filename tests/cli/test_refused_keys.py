@@ -21,7 +21,7 @@ from trilat_net.net import member_keys
 from trilat_net.net.arm_client import ArmClient, SwitchClient
 from trilat_net.net.member_keys import CERTIFICATE, MEMBERS, PRIVATE_KEY, create_keys, read_member_keys
 
-MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router")
+MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router", "bridge")
 AUTHORITY = "authority.pem"
 Change = Callable[[Path], object]
 
@@ -64,6 +64,7 @@ OF_ANOTHER = [
     (("stop", "--session", "paper", "--end"), "s", "operator"),
     (("watch", "--session", "paper"), "m1", "operator"),
     (("live", "--session", "paper"), "recorder", "operator"),
+    (("ros2", "--session", "paper"), "operator", "bridge"),
 ]
 
 

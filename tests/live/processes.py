@@ -31,6 +31,21 @@ GLIDE = (
     *("--set", "on_stale.align_speed_rad_s=1.0"),
     *("--set", "on_stale.align_limit_rad=3.0"),
 )
+OUTSIDE = [
+    word
+    for key, value in {
+        "plant": "external",
+        "arm.known": "false",
+        "on_stale.action": "glide",
+        "on_stale.align_limit_rad": "4",
+        "limits.tau_rate_limit_nm_s": "5000",
+        "limits.qd_des_limit_rad_s": "5",
+        "limits.q_min_rad": "-6.3",
+        "limits.q_max_rad": "6.3",
+    }.items()
+    for word in ("--set", f"sites.s.{key}={value}")
+]
+"""Options of a session whose site s has an arm outside of the program."""
 JOINS, FOLLOWS = "joins the running session", " s, run, "
 HOLDER = """
 import sys, time, trilat_net

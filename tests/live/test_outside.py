@@ -11,23 +11,9 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
+from .processes import OUTSIDE, PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
 
 ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
-OUTSIDE = [
-    word
-    for key, value in {
-        "plant": "external",
-        "arm.known": "false",
-        "on_stale.action": "glide",
-        "on_stale.align_limit_rad": "4",
-        "limits.tau_rate_limit_nm_s": "5000",
-        "limits.qd_des_limit_rad_s": "5",
-        "limits.q_min_rad": "-6.3",
-        "limits.q_max_rad": "6.3",
-    }.items()
-    for word in ("--set", f"sites.s.{key}={value}")
-]
 SLOW = """
 import time
 from tests.laws import Adaptive

@@ -16,7 +16,7 @@ import pytest
 
 from trilat_net.errors import UsageError
 from trilat_net.net import topics
-from trilat_net.net.access_rules import OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
+from trilat_net.net.access_rules import BRIDGE, OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
 from trilat_net.net.member_keys import (
@@ -33,7 +33,7 @@ from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 from .waiting import answered, drained, received, until
 
 SITES = ("m1", "m2", "s")
-ALL = (*SITES, RECORDER, OPERATOR, ROUTER)
+ALL = (*SITES, RECORDER, OPERATOR, ROUTER, BRIDGE)
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +154,34 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
             true(payload)
 
         assert {payload for _, payload in heard(say, inbox)} == {b"true"}
+
+
+def test_a_bridge_is_a_hand_and_an_arm_and_holds_no_switch(meeting: Meeting, folder: Path) -> None:
+    """It gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
+    bridge, operator = (meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR))
+    meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)
+    assert until(lambda: answered(bridge, key("m1", topics.SET), b"reset"))
+    for channel in (topics.HAND, topics.MEASURED):
+        inbox = meeting.m1.inbox(key("m1", channel))
+        assert {payload for _, payload in heard(bridge.publisher(key("m1", channel)), inbox)} == {b"true"}
+    switch = meeting.m1.inbox(key("m1", topics.ENABLE))
+    forged, true = (bus.publisher(key("m1", topics.ENABLE)) for bus in (bridge, operator))
+
+    def say(payload: bytes) -> None:
+        forged(b"forged")
+        true(payload)
+
+    assert {payload for _, payload in heard(say, switch)} == {b"true"}
+    states, samples = (bridge.inbox(key("*", channel)) for channel in (topics.STATE, topics.SAMPLE))
+    sample = meeting.m1.publisher(key("m1", topics.SAMPLE))
+
+    def tell(payload: bytes) -> None:
+        sample(payload)
+        state(payload)
+
+    state = meeting.m1.publisher(key("m1", topics.STATE))
+    assert heard(tell, states)
+    assert drained(samples) == []
 
 
 def test_every_member_may_ask_site_to_stop_and_nothing_else(meeting: Meeting, folder: Path) -> None:

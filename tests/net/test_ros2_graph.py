@@ -1,24 +1,38 @@
-"""The wire of ROS 2 over Zenoh: strings that rmw_zenoh documents, and hashes that rosbags computes anew."""
+"""The wire of ROS 2 over Zenoh: strings that rmw_zenoh documents, hashes that rosbags computes, a router."""
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
+from tests.net.waiting import until
 from trilat_net.errors import UsageError
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.ros2_graph import (
     TYPE_HASHES,
     Attachment,
     EndpointKind,
     GraphPlace,
     QualityOfService,
+    Refusals,
+    Ros2Graph,
     check_ros_name,
+    find_misfit,
     find_type_hash,
     make_gid,
     parse_attachment,
     topic_key,
 )
+from trilat_net.net.zenoh_bus import RouterSilent
+from trilat_net.net.zenoh_config import ZenohMode, make_zenoh_config
 
 STRING, LOG = "std_msgs/msg/String", "rcl_interfaces/msg/Log"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -144,3 +158,155 @@ def test_a_name_that_ros_refuses_is_refused(name: str) -> None:
 
 def test_a_name_of_ros_is_taken_without_its_slash() -> None:
     assert check_ros_name("/lab/arm_1", "session") == "lab/arm_1"
+
+
+@pytest.mark.parametrize(
+    ("domain", "kind", "type_hash", "misfit"),
+    [
+        (0, STRING, STRING_HASH, ""),
+        (0, STRING, "TypeHashNotSupported", ""),
+        (3, STRING, STRING_HASH, "in domain 3, and this is domain 0"),
+        (
+            0,
+            LOG,
+            STRING_HASH,
+            "as rcl_interfaces::msg::dds_::Log_, and here it is std_msgs::msg::dds_::String_",
+        ),
+        (0, STRING, "RIHS01_0", "with another definition of std_msgs/msg/String, RIHS01_0"),
+    ],
+)
+def test_a_publisher_that_does_not_fit_is_named(domain: int, kind: str, type_hash: str, misfit: str) -> None:
+    talker = GraphPlace(domain, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
+    sent = talker.endpoint_token(1, EndpointKind.PUBLISHER, "a/b", kind, type_hash, QualityOfService())
+    assert find_misfit(sent, 0, STRING) == misfit
+
+
+class Wire:
+    """A router, a graph of ours at it, and a stranger who speaks Zenoh alone."""
+
+    def __init__(self, place: str) -> None:
+        self.place, self.said, self._kept = place, list[str](), list[Any]()
+        self.router = opened("router", place)
+        self.stranger = opened("client", place)
+        self.graph = Ros2Graph(Refusals(self.said.append), [place], "play", "trilat", SystemClock())
+
+    def say(self, key: str, data: bytes, attachment: bytes | None) -> None:
+        """The stranger publishes, once somebody listens."""
+        with self.stranger.declare_publisher(key) as publisher:
+            until(lambda: publisher.matching_status.matching)
+            publisher.put(data, attachment=attachment)
+
+    def hears(self, key: str) -> list[bytes]:
+        """What comes to the stranger from now on, and of a latched topic what came before."""
+        came: list[bytes] = []
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        take = lambda sample: came.append(sample.payload.to_bytes())  # noqa: E731
+        self._kept.append(zenoh.ext.declare_advanced_subscriber(self.stranger, key, take, history=history))
+        return came
+
+    def close(self) -> None:
+        self.graph.__exit__()
+        self.stranger.close()
+        self.router.close()
+
+
+def opened(mode: ZenohMode, place: str) -> Any:
+    """A session of Zenoh: a client of a place, or what listens there."""
+    ends = ([], [place]) if mode == "client" else ([place], [])
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(*ends, mode))))
+
+
+@pytest.fixture
+def wire() -> Iterator[Wire]:
+    with closing(Wire(*find_free_endpoints(1))) as made:
+        yield made
+
+
+SENT = Attachment(1, 5, b"s" * 16)
+
+
+def test_a_message_of_another_type_or_without_attachment_is_not_taken(wire: Wire) -> None:
+    came: list[tuple[bytes, Attachment]] = []
+    wire.graph.subscribe("a", STRING, lambda data, sent: came.append((data, sent)))
+    right = topic_key(0, "a", STRING, STRING_HASH)
+    for attachment in (None, b"", b"x" * 33):
+        wire.say(right, b"bare", attachment)
+    for kind, type_hash in ((LOG, STRING_HASH), (STRING, "RIHS01_0")):
+        wire.stranger.put(topic_key(0, "a", kind, type_hash), b"other", attachment=SENT.encode())
+    wire.say(topic_key(0, "a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
+    wire.say(right, b"jazzy", SENT.encode())
+    until(lambda: len(came) == 2)
+    assert came == [(b"humble", SENT), (b"jazzy", SENT)]
+    assert wire.graph.refusals.counts == {"a: a message without an attachment of ROS": 3}
+
+
+def test_what_a_message_raises_is_refused_and_the_next_one_comes(wire: Wire) -> None:
+    came: list[bytes] = []
+
+    def take(data: bytes, _: Attachment) -> None:
+        came.append(data)
+        raise ValueError("is none")
+
+    wire.graph.subscribe("a", STRING, take)
+    for data in (b"1", b"2"):
+        wire.say(topic_key(0, "a", STRING, STRING_HASH), data, SENT.encode())
+    until(lambda: len(came) == 2)
+    until(lambda: wire.graph.refusals.counts == {"a is none": 2})
+    assert wire.said == ["refused: a is none"]
+
+
+def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None:
+    wire.graph.subscribe("a", STRING, lambda *_: None)
+    place = GraphPlace(3, str(wire.stranger.zid()), "", "talker")
+    token = place.endpoint_token(1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService())
+    with_token = wire.stranger.liveliness().declare_token(token)
+    until(lambda: wire.said == ["refused: a is published in domain 3, and this is domain 0"])
+    with_token.undeclare()
+
+
+def test_a_request_without_an_attachment_is_refused_and_answered_by_nobody(wire: Wire) -> None:
+    wire.graph.serve("end", TRIGGER, lambda _: b"done")
+    key = topic_key(0, "end", TRIGGER, find_type_hash(TRIGGER, "jazzy"))
+
+    def ask(**how: Any) -> list[Any]:
+        return [reply.ok for reply in wire.stranger.get(key, timeout=5.0, payload=b"", **how)]
+
+    until(lambda: ask(attachment=SENT.encode()))
+    (answer,) = ask(attachment=SENT.encode())
+    told = parse_attachment(answer.attachment.to_bytes())
+    assert told is not None
+    assert (answer.payload.to_bytes(), told.number, told.gid) == (b"done", 1, SENT.gid)
+    assert ask() == []
+    assert wire.said == ["refused: end: a request without an attachment of ROS"]
+
+
+def test_a_router_that_comes_back_carries_every_topic_again(wire: Wire) -> None:
+    plain = wire.graph.publisher("a", STRING, QualityOfService())
+    latched = wire.graph.publisher("b", STRING, QualityOfService(latched=True, depth=1))
+    latched.put(b"kept")
+    assert not plain.heard
+    for _ in range(3):
+        wire.stranger.close()
+        wire.router.close()
+        until(lambda: not wire.graph.connected)
+        wire.router = opened("router", wire.place)
+        until(lambda: wire.graph.connected)
+        wire.stranger = opened("client", wire.place)
+        now = wire.hears("0/a/**")
+        until(lambda: plain.heard)
+        plain.put(b"now")
+        kept = wire.hears("0/b/**")
+        until(now.copy)
+        until(kept.copy)
+        assert (now, kept) == ([b"now"], [b"kept"])
+
+
+def test_a_peer_forwards_nothing_and_is_named_with_the_cure() -> None:
+    (place,) = find_free_endpoints(1)
+    with closing(opened("peer", place)), pytest.raises(UsageError, match=r"is no router.*rmw_zenohd"):
+        Ros2Graph(Refusals(print), [place], "play", "trilat", SystemClock())
+
+
+def test_a_router_that_is_not_there_is_silent() -> None:
+    with pytest.raises(RouterSilent, match="no router of ROS answers at tcp"):
+        Ros2Graph(Refusals(print), find_free_endpoints(1), "play", "trilat", SystemClock())

@@ -1,8 +1,12 @@
-"""Targets from ROS 2: what holds an arm, what is refused and how it is said, and when an arm is let go."""
+"""What comes from ROS 2: what moves an arm, what is refused and how it is said, and when an arm is let go."""
 
+import json
 import math
+import re
+import threading
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +19,38 @@ from scipy.spatial.transform import Rotation
 
 import trilat_net
 from sites.ros2_bridge import (
+    RIVAL_NS,
+    SAFE_NS,
     SILENCE_NS,
     DominanceTopic,
+    Ends,
+    RobotArm,
+    RobotTable,
+    ShareHistory,
     SiteTopics,
     TargetTopic,
     read_joint_target,
     read_place_target,
-    read_topic_names,
+    read_topic_table,
+    refuse_other_robots,
+    show_session,
 )
+from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.errors import UsageError
+from tests.net.waiting import drained, until
+from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
+from trilat_net.core.ticks import Mode, TickRecord
+from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
-from trilat_net.net.requests import ChangeReply
+from trilat_net.net import topics
+from trilat_net.net.arm_client import FRESH_NS, ArmClient
+from trilat_net.net.clock import SystemClock
+from trilat_net.net.membership import describe_member, liveliness_token
+from trilat_net.net.messages import Event
+from trilat_net.net.requests import ArmMeasurement, Backfill
 from trilat_net.net.ros2_graph import Attachment, Refusals
+from trilat_net.net.wire import decode, encode, encode_state
+from trilat_net.scenario import load_scenario
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
 FIRST, SECOND = Attachment(1, 5, b"a" * 16), Attachment(1, 5, b"b" * 16)
@@ -60,17 +83,16 @@ class Desk:
         self.refusals = Refusals(self.said.append)
         self.topic = TargetTopic(
             self.arm,  # type: ignore[arg-type]
-            "play/m1/target_pose",
-            lambda data: read_place_target(2, 7, data),
+            lambda data: read_place_target("m1/base", 2, 7, data),
             self.arm.move,
             self.clock,
-            self.refusals,
         )
+        self.take = self.refusals.guard("play/m1/target_pose", self.topic.take)
 
-    def hears(self, x: float, sender: Attachment = FIRST, after_ns: int = 0) -> None:
+    def hears(self, x: float, sender: Attachment = FIRST, after_ns: int = 0, frame: str = "m1/base") -> None:
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.topic.watch()
-        self.topic.take(cdr.pack_frame_vectors(7, "m1/base", x, 0.5, 0, 0, 0, 0, 1), sender)
+        self.take(cdr.pack_frame_vectors(7, frame, x, 0.5, 0, 0, 0, 0, 1), sender)
 
 
 def joints(names: Sequence[str], angles: Sequence[float]) -> bytes:
@@ -109,7 +131,7 @@ def test_two_publishers_move_nothing_until_one_is_gone() -> None:
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_whatever_comes_is_taken_or_counted(data: bytes) -> None:
     desk = Desk()
-    desk.topic.take(data, FIRST)
+    desk.take(data, FIRST)
     assert len(desk.arm.goals) + desk.refusals.counts.total() == 1
     assert all(map(math.isfinite, (x for goal in desk.arm.goals for x in goal)))
 
@@ -125,6 +147,14 @@ def test_a_target_that_no_arm_can_take_is_refused_and_the_last_one_stays(x: floa
     assert desk.refusals.counts.total() == 2
 
 
+def test_a_pose_in_another_frame_moves_nothing() -> None:
+    desk = Desk()
+    desk.hears(0.1, frame="")
+    desk.hears(0.2, frame="camera")
+    assert desk.arm.goals == [(0.1, 0.5)]
+    assert desk.said == ["refused: play/m1/target_pose is in the frame 'camera', and here it is 'm1/base'"]
+
+
 def test_joints_are_found_by_their_names_in_any_order() -> None:
     assert read_joint_target(NAMES, joints(["m1_q2", "m1_q1"], [2.0, 1.0])) == [1.0, 2.0]
     assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [1.0, 2.0]
@@ -136,6 +166,7 @@ def test_joints_are_found_by_their_names_in_any_order() -> None:
         (["m1_q1"], [1.0], "lacks m1_q2; it has m1_q1"),
         ([], [], "lacks m1_q1, m1_q2; it has no names"),
         (["q1", "q2"], [1.0, math.nan], "has a number that is not finite"),
+        (["q1", "q2", "q1"], [1.0, 2.0, 3.0], "has q1 twice"),
     ],
 )
 def test_joints_that_are_missing_or_not_finite_are_named(
@@ -145,11 +176,24 @@ def test_joints_that_are_missing_or_not_finite_are_named(
         read_joint_target(NAMES, joints(names, angles))
 
 
+PAGE = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text(encoding="utf-8")
+FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGE, re.DOTALL))
+"""The examples of the page."""
+
+
 def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
-    (tmp_path / "names.toml").write_text('joint_states = "arm/joint_states"\n')
-    assert read_topic_names(str(tmp_path / "names.toml")) == {"joint_states": "arm/joint_states"}
-    assert read_topic_names("crtk")["target_pose"] == "servo_cp"
-    assert not read_topic_names("crisp")
+    (tmp_path / "names.toml").write_text(FILE)
+    table = read_topic_table(str(tmp_path / "names.toml"))
+    assert table.find("play", "m1", "joint_states") == "play/m1/arm/joint_states"
+    assert table.find("play", "m1", "target_pose") == "m1/goal"
+    assert table.find("play", "s", "robot_states") == "joint_states"
+    assert table.find("play", "m1", "robot_states") == "play/m1/robot/joint_states"
+    assert table.robots == {
+        "s": RobotTable(["shoulder", "elbow"], ["elbow", "shoulder"], [0.0, 0.0]),
+        "m1": RobotTable(),
+    }
+    assert read_topic_table("crtk").find("play", "s", "target_pose") == "play/s/servo_cp"
+    assert read_topic_table("crisp").find("play", "s", "target_pose") == "play/s/target_pose"
 
 
 @pytest.mark.parametrize(
@@ -157,8 +201,14 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
     [
         ("joint_state = 'a'", "no topic 'joint_state'.*joint_states"),
         ("joint_states = 'a b'", "joint_states 'a b' is no name of ROS 2"),
+        ("joint_states = 1", "joint_states '1' is no name of ROS 2"),
         ("joint_states", "is no TOML"),
         ("joint_states = 'a'\nreference = 'a'", "two topics have one name"),
+        ("robot_commands = '/commands'", "one that begins with / is for one site"),
+        ("[sites.s]\nmode = '/a'\n[sites.m]\nmode = '/a'", "two topics have one name"),
+        ("sites = 1", "sites: Expected `object`"),
+        ("[sites.s]\nsafe = ['a']", "sites: Expected `float`, got `str`"),
+        ("[sites.s]\njoint = ['a']", "no topic 'joint'"),
         (None, "--names is crisp, crtk or a file, and .* cannot be read: No such file"),
     ],
 )
@@ -167,7 +217,17 @@ def test_names_that_cannot_be_right_are_refused(tmp_path: Path, text: str | None
     if text is not None:
         file.write_text(text)
     with pytest.raises(UsageError, match=said.replace("--names", "names")):
-        read_topic_names(str(file))
+        read_topic_table(str(file))
+
+
+@pytest.mark.parametrize("site", ["m", "nobody"])
+def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site: str) -> None:
+    (tmp_path / "names.toml").write_text(
+        FILE.replace("sites.s", f"sites.{site}").replace("sites.m1", "sites.s")
+    )
+    scenario = load_scenario(str(Path(__file__).parents[2] / "examples" / "external_arm.toml"))
+    with pytest.raises(UsageError, match=rf"sites\.{site}: there is no external arm; sites with one: s"):
+        refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
 
 
 def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
@@ -187,10 +247,19 @@ class Topic(list[bytes]):
 
 
 class Listener:
-    """A graph in which every topic is heard."""
+    """A graph in which every topic is heard, and nobody says anything."""
+
+    connected = True
 
     def __init__(self) -> None:
         self.came: dict[str, Topic] = defaultdict(Topic)
+        self.refusals, self.served = Refusals(print), list[str]()
+
+    def subscribe(self, *_: object) -> None:
+        pass
+
+    def serve(self, service: str, _kind: str, _answer: object) -> None:
+        self.served.append(service)
 
     def publisher(self, topic: str, _kind: str, _qos: object) -> Topic:
         return self.came[topic]
@@ -215,7 +284,8 @@ def test_the_pose_of_the_tip_is_that_of_a_link_in_the_transforms(name: str) -> N
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
-        shown = SiteTopics(graph, log.scenario, "t", site, 0, graph.came["tf"], {})  # type: ignore[arg-type]
+        ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+        shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
         shown.publish(log[site].states[-1])
         messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]]
         frames = [one for message in messages for one in message.transforms]
@@ -245,11 +315,14 @@ def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
     asked: list[dict[str, float]] = []
     said: list[str] = []
 
-    def change(wanted: dict[str, float]) -> ChangeReply:
+    def change(wanted: dict[str, float]) -> None:
         asked.append(wanted)
-        return ChangeReply(member="s", accepted=sum(wanted.values()) == 1.0, text="must sum to 1")
+        if sum(wanted.values()) != 1.0:
+            raise RunFailed("must sum to 1")
 
-    topic = DominanceTopic("t/s/set_dominance", ["m1", "m2"], change, Refusals(said.append))
+    refusals, clock = Refusals(said.append), ManualClock()
+    topic = DominanceTopic(["m1", "m2"], change, clock)
+    take, ask = (refusals.guard("t/s/set_dominance", act) for act in (topic.take, topic.ask))
     for data in (
         shares(0.9, 0.1),
         shares(0.9, 0.1),
@@ -258,9 +331,9 @@ def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
         shares(math.nan, 0.0),
         b"x",
     ):
-        topic.take(data, FIRST)
-        topic.ask()
-        topic.ask()
+        take(data, FIRST)
+        ask()
+        ask()
     assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
@@ -268,3 +341,237 @@ def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
         "refused: t/s/set_dominance has a number that is not finite",
         "refused: t/s/set_dominance is not plain CDR, little-endian",
     ]
+    clock.sleep_until(2 * RIVAL_NS)  # whoever asks for the same later may have been overruled meanwhile
+    take(shares(0.5, 0.1), FIRST)
+    ask()
+    assert asked[2:] == [{"m1": 0.5, "m2": 0.1}]
+
+
+@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0)), max_size=5))
+def test_shares_are_those_that_the_certificate_sees(changes: list[tuple[int, int, float]]) -> None:
+    scenario = load_scenario("paper")
+    history, ramps = ShareHistory(scenario, "s"), []
+    for start, lasts, share in changes:
+        to, at_s, ramp_s = {"m1": share, "m2": 1.0 - share}, start / 10.0, lasts / 10.0
+        history.take(json.dumps({"at_s": at_s, "dominance": "s", "to": to, "ramp_s": ramp_s}))
+        history.take("{}")
+        ramps.append(scenario.ramp("s", to, round(at_s * 1e9), ramp_s))
+    if len({ramp.start_ns for ramp in ramps}) == len(ramps):
+        t_s = np.arange(100) / 10.0
+        first, scripted = list_scripted_ramps(scenario, "s")
+        planned = evaluate_ramps(first, [*scripted, *ramps], t_s, 0.0).alpha
+        np.testing.assert_allclose([history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9)
+
+
+class Robot:
+    """A robot whose controller has another order than the scenario, its site, and what lies between."""
+
+    def __init__(self, controller: Sequence[str] = ("elbow", "shoulder")) -> None:
+        network, self.clock, self.said = LocalNetwork(), ManualClock(10**9), list[str]()
+        site, bridge = network.join(), network.join()
+        self.refusals = Refusals(self.said.append)
+        self._measured = site.inbox(topics.key("t", "s", topics.MEASURED))
+        self._state = site.publisher(topics.key("t", "s", topics.STATE))
+        self.commands = Topic()
+        self.arm = RobotArm(
+            lambda: ArmClient(bridge, self.clock, "t", "s"),
+            [("shoulder",), ("elbow",)],
+            RobotTable(controller=list(controller), safe=[0.5, -0.5]),
+            self.commands,  # type: ignore[arg-type]
+            self.clock,
+        )
+        self.arm.armed = True
+        self.take = self.refusals.guard("joint_states", self.arm.take)
+
+    def says(
+        self,
+        names: Sequence[str],
+        q: Sequence[float],
+        qd: Sequence[float],
+        sender: Attachment = FIRST,
+        stamp_ns: int = 7,
+    ) -> None:
+        self.take(cdr.JointStatePacker(names, velocity=bool(qd), effort=False).pack(stamp_ns, q, qd), sender)
+
+    def measured(self) -> list[ArmMeasurement]:
+        return [decode(payload, ArmMeasurement) for _, payload in drained(self._measured)]
+
+    def ticks(self, k: int, *tau: float, mode: Mode = Mode.RUN, since_ns: int = 0) -> None:
+        """The site publishes the record of a tick."""
+        zeros, mem = [0.0, 0.0], [0.0, 0.0, float(since_ns)]
+        motion = zeros, zeros, zeros, zeros, list(tau), zeros, []
+        record = TickRecord(k, k * 10**6, mode, *motion, [-1], 0, [], mem)
+        self._state(encode_state("s", 1, ["m"], record, (), 0, 0))
+
+    def driven(self, after_ns: int = 0) -> list[list[float]]:
+        """What its controller gets in a look of the bridge."""
+        self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
+        self.commands.clear()
+        self.arm.drive()
+        got = [ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray") for data in self.commands]
+        return [message.data.tolist() for message in got]
+
+
+def test_joint_states_of_a_robot_are_the_measurements_of_its_site() -> None:
+    robot, of_another_clock = Robot(), 1_790_000_000 * 10**9
+    robot.says(["gripper", "elbow", "shoulder"], [9.0, 2.0, 1.0], [8.0, 4.0, 3.0], stamp_ns=of_another_clock)
+    robot.says(["shoulder", "elbow"], [1.5, 2.5], [0.0, 0.0], stamp_ns=0)
+    robot.says(["wheel"], [7.0], [7.0])  # another robot on the same topic
+    first, second = robot.measured()
+    assert (first.q, first.qd, first.sent_ns) == ([1.0, 2.0], [3.0, 4.0], of_another_clock)
+    assert (second.q, second.n, second.sent_ns) == ([1.5, 2.5], 1, 0)
+    assert not robot.said
+
+
+@pytest.mark.parametrize(
+    ("names", "q", "qd", "said"),
+    [
+        (["shoulder"], [1.0], [0.0], "lacks elbow; it has shoulder"),
+        ([], [], [], "lacks shoulder, elbow; it has no names"),
+        (["shoulder", "elbow"], [1.0, math.nan], [0.0, 0.0], "has a number that is not finite"),
+        (["shoulder", "elbow"], [1.0, 2.0], [0.0, math.inf], "has a number that is not finite"),
+        (["shoulder", "elbow"], [1.0, 2.0], [], "has 2 positions and 0 velocities"),
+        (["shoulder", "elbow", "elbow"], [1.0, 2.0, 3.0], [0.0] * 3, "has elbow twice"),
+    ],
+)
+def test_joint_states_that_measure_no_arm_are_named(
+    names: list[str], q: list[float], qd: list[float], said: str
+) -> None:
+    robot = Robot()
+    robot.says(names, q, qd)
+    assert robot.measured() == []
+    assert robot.said == [f"refused: joint_states {said}"]
+
+
+def test_two_robots_on_one_topic_measure_nothing_until_one_is_gone() -> None:
+    robot, pose = Robot(), (["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
+    robot.says(*pose)
+    robot.says(*pose, sender=SECOND)
+    robot.says(*pose)
+    assert len(robot.measured()) == 1
+    robot.clock.sleep_until(robot.clock.monotonic_ns() + RIVAL_NS)
+    robot.says(*pose)
+    assert len(robot.measured()) == 1
+    assert robot.said == [
+        "refused: joint_states has two publishers: neither moves the arm until the other is gone"
+    ]
+
+
+@given(st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
+def test_whatever_a_robot_says_is_taken_passed_over_or_counted(data: bytes) -> None:
+    robot = Robot()
+    robot.take(data, FIRST)
+    assert len(robot.measured()) + robot.refusals.counts.total() <= 1
+
+
+def test_a_robot_gets_each_torque_once_in_the_order_of_its_controller() -> None:
+    robot = Robot()
+    robot.ticks(0, 3.0, 4.0)
+    assert robot.driven() == [[4.0, 3.0]]
+    assert robot.driven() == []
+    robot.ticks(1, 5.0, 6.0)
+    robot.ticks(2, 7.0, 8.0)
+    assert robot.driven(2_000_000) == [[8.0, 7.0]]
+
+
+def test_a_robot_without_a_torque_gets_again_and_again_what_is_safe() -> None:
+    robot, safe = Robot(), [[0.5, -0.5]]
+    assert robot.driven() == safe  # the site has made no tick
+    assert robot.driven(SAFE_NS - 1) == []
+    robot.ticks(0, 3.0, 4.0)
+    assert robot.driven(SAFE_NS) == [[4.0, 3.0]]
+    assert robot.driven(FRESH_NS + 1) == safe  # it is silent
+    robot.ticks(200, 3.0, 4.0, mode=Mode.FAULT, since_ns=50 * 10**6)
+    assert robot.driven(SAFE_NS) == safe  # its arm has come to rest
+    robot.ticks(201, 3.0, 4.0)
+    robot.arm.armed = False
+    assert robot.driven(SAFE_NS) == safe
+
+
+@pytest.mark.parametrize("controller", [["elbow"], ["elbow", "wrist"], ["elbow", "shoulder", "wrist"]])
+def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
+    with pytest.raises(UsageError, match="have one of each joint: shoulder, elbow"):
+        Robot(controller)
+
+
+class Sites:
+    """The sites of a session: who they are, what they have noted, and records; a bridge that shows them."""
+
+    def __init__(self, noted: Sequence[Event]) -> None:
+        network, self._scenario = LocalNetwork(), load_scenario("paper")
+        bus, self._info = network.join(), b""
+        past = {"channel": "event", "first": 0, "payloads": [*map(encode, noted)], "made": len(noted)}
+        for site in self._scenario.names:
+            bus.announce(liveliness_token("t", site, 1))
+            bus.respond(topics.key("t", site, topics.INFO), lambda _: self._info)
+            kept = encode(Backfill(member=site, boot=1, **past))
+            bus.respond(topics.key("t", site, topics.PAST), lambda _, kept=kept: kept)
+        self._state, self._event = (
+            bus.publisher(topics.key("t", "s", channel)) for channel in (topics.STATE, topics.EVENT)
+        )
+        self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
+        self._ends: Any = Ends(self.graph, network.join(), SystemClock(), "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+
+    def begin(self, epoch_unix_ns: int) -> None:
+        about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
+        self._info = encode(describe_member("s", 1, SystemClock(), self._scenario.text, **about))
+        self._event(encode(event("epoch", epoch_unix_ns=epoch_unix_ns)))
+
+    def ticks(self, k: int) -> None:
+        zeros = [0.0, 0.0]
+        motion = zeros, zeros, zeros, zeros, zeros, zeros, [0.0] * 5
+        record = TickRecord(k, k * 10**6, Mode.RUN, *motion, [-1, -1], 0, [], [])
+        self._state(encode_state("s", 1, ["m1", "m2"], record, (), 0, 0))
+
+    @contextmanager
+    def shown(self) -> Iterator[threading.Thread]:
+        """The bridge shows the session, and has shown a record."""
+        over = threading.Event()
+
+        def show() -> None:
+            self.anew.append(show_session(self._ends, 100.0, over.is_set, self.said.append))
+
+        bridge = threading.Thread(target=show)
+        bridge.start()
+        self.graph.came.clear()
+        until(lambda: self.ticks(7) or self.graph.came["t/s/joint_states"])  # type: ignore[func-returns-value]
+        yield bridge
+        over.set()
+        bridge.join()
+
+    def seconds(self) -> set[int]:
+        """Of the stamps that were shown."""
+        states = [
+            ROS.deserialize_cdr(data, "sensor_msgs/msg/JointState")
+            for data in self.graph.came["t/s/joint_states"]
+        ]
+        return {message.header.stamp.sec for message in states}
+
+
+def event(kind: str, **fields: Any) -> Event:
+    return Event(member="s", boot=1, kind=kind, text="", **fields)
+
+
+def test_a_session_that_begins_anew_is_shown_with_its_own_epoch() -> None:
+    sites = Sites([])
+    sites.begin(10**18)
+    with sites.shown() as bridge:
+        sites.begin(10**18)  # another attempt of its own
+        assert sites.seconds() == {10**9}
+        sites.begin(2 * 10**18)
+        bridge.join(20.0)
+        assert sites.anew == [True]
+    with sites.shown():
+        assert sites.seconds() == {2 * 10**9}
+    assert sites.anew == [True, False]
+    assert len(sites.said) == 2
+
+
+def test_shares_that_were_changed_before_are_shown() -> None:
+    change = '{"at_s": 0.001, "dominance": "s", "to": {"m1": 0.75, "m2": 0.25}}'
+    sites = Sites([event("setup"), event("change", command="none"), event("change", command=change)])
+    sites.begin(10**18)
+    with sites.shown():
+        (told,) = until(lambda: sites.graph.came["t/s/dominance"])
+        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [0.75, 0.25]
+        assert {"t/stop", "t/s/stop", "t/m1/reset", "t/end"} <= set(sites.graph.served)

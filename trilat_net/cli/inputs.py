@@ -130,7 +130,7 @@ def keys_new_command(
     members: Annotated[
         list[str],
         typer.Argument(
-            help="The sites; and recorder, operator, router if there are any.", metavar="MEMBER..."
+            help="The sites; and recorder, operator, router, bridge if there are any.", metavar="MEMBER..."
         ),
     ],
     hosts: Annotated[

@@ -500,21 +500,26 @@ def ros2_command(
         ),
     ] = 100.0,
     names: Annotated[
-        str, value("--names", "crisp|crtk|FILE", "Names of the topics of a site, or a TOML file of them.")
+        str,
+        value(
+            "--names",
+            "crisp|crtk|FILE",
+            "Names of the topics, or a TOML file of them and of robots.",
+        ),
     ] = "crisp",
     timeout: options.AnswerOption = 10.0,
     *,
     reach: options.Reach,
 ) -> None:
-    """Shows a session to ROS 2, and lets its programs hold arms: topics, services and transforms.
+    """Shows a session to ROS 2; its programs hold arms, and its robots are external arms.
 
     ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here. The bridge waits
     for the router, and ends with the session. docs/ros2.md has all topics and services.
     """
-    from sites.ros2_bridge import read_topic_names, serve_ros2
+    from sites.ros2_bridge import read_topic_table, serve_ros2
     from sites.running_session import RunningSession
 
-    from ..errors import UsageError
+    from ..net.access_rules import BRIDGE
     from ..net.clock import SystemClock
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
     from ..process import Interrupt
@@ -522,13 +527,13 @@ def ros2_command(
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
-    called = read_topic_names(names)
-    running = RunningSession(name, reach.resolve())
+    table = read_topic_table(names)
+    running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
         return Ros2Graph(refusals, ros or [options.ROS_ROUTER], name, "trilat", SystemClock(), domain, distro)
 
     with Interrupt() as interrupt:
-        serve_ros2(running, open_graph, rate, called, interrupt.requested, terminal.print_line, timeout)
+        serve_ros2(running, open_graph, rate, table, interrupt.requested, terminal.print_line, timeout)
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from . import topics
 from .zenoh_config import SIZE_LIMITS, limit_sizes
 
-RECORDER, OPERATOR, ROUTER = topics.RECORDER, "operator", "router"
+RECORDER, OPERATOR, ROUTER, BRIDGE = topics.RECORDER, "operator", "router", "bridge"
 PROTOCOLS = ("tls", "quic")
 
 MOST_REPLY_BYTES = 8_388_608
@@ -60,7 +60,14 @@ OPERATOR_ROLE = _Role(
     asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     addresses=(topics.HAND, topics.ENABLE),
 )
-ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE}
+BRIDGE_ROLE = _Role(
+    publishes=(),
+    answers=(),
+    hears=(topics.STATE, topics.EVENT),
+    asks=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
+    addresses=(topics.HAND, topics.MEASURED),
+)
+ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE, BRIDGE: BRIDGE_ROLE}
 """Of members that are no sites."""
 
 

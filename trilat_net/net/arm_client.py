@@ -69,7 +69,8 @@ class SiteSender:
     def send(self, kind: type[R], **fields: object) -> R:
         """Sends the next message, and returns it."""
         about = {"site": self._site, "boot": self.boot, "n": self.number + 1}
-        message = kind(**about, sent_ns=self._clock.monotonic_ns(), **fields)  # type: ignore[call-arg,arg-type]
+        now = {"sent_ns": self._clock.monotonic_ns()}
+        message = kind(**about, **(now | fields))  # type: ignore[arg-type]
         self.number += 1
         self.repeat(message)
         return message
@@ -199,7 +200,13 @@ class ArmClient(OutsideClient):
 
     channel = topics.MEASURED
 
-    def send(self, q: Sequence[float], qd: Sequence[float], tau_x: Sequence[float] = ()) -> None:
+    def send(
+        self,
+        q: Sequence[float],
+        qd: Sequence[float],
+        tau_x: Sequence[float] = (),
+        stamp_ns: int | None = None,
+    ) -> None:
         """Sends what was measured of the arm.
 
         Args:
@@ -207,12 +214,14 @@ class ArmClient(OutsideClient):
             qd: joint velocities, rad/s.
             tau_x: torque of operator and environment, N m per joint, where the arm measures it; in the
                 paper's sign: the torque ON the arm is its negative.
+            stamp_ns: when, ns on a clock of the arm's own; None: now, on this program's monotonic clock.
 
         Raises:
             ValueError: tau_x is not as long as q, or not finite.
         """
         measured = {"q": q, "qd": qd, "tau_x": tau_x}
-        self._sender.send(ArmMeasurement, **{name: [*map(float, v)] for name, v in measured.items()})
+        stamp = {} if stamp_ns is None else {"sent_ns": stamp_ns}
+        self._sender.send(ArmMeasurement, **{name: [*map(float, v)] for name, v in measured.items()}, **stamp)
 
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, N m per joint; None if the arm must brake.

@@ -6,7 +6,7 @@ reply or an error that names the member without one.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 
 from ..errors import ScenarioError, SessionError, UsageError, WireError
@@ -16,8 +16,8 @@ from .clock import Clock
 from .connection import Connection, default_endpoint, default_endpoints, open_bus
 from .known_sites import find_known_places
 from .membership import MemberQuery, liveliness_token
-from .messages import Info
-from .requests import ChangeReply, ChangeRequest
+from .messages import Event, Info
+from .requests import BACKFILL_MESSAGES, Backfill, BackfillRequest, ChangeReply, ChangeRequest, Request
 from .wire import decode, encode
 
 POLL_NS = 5_000_000
@@ -124,17 +124,38 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
         SessionError: the site does not reply.
     """
     channel = topics.STOP if request.order == "stop" else topics.SET
-    replies = bus.ask(topics.key(session, site, channel), encode(request))
-    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+    reply = _ask_once(bus, clock, topics.key(session, site, channel), request)
+    if reply is None:
+        whose = "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
+        raise SessionError(f"{site} gave no answer; its records show whether it made the change{whose}")
+    try:
+        return decode(reply, ChangeReply)
+    except WireError as error:
+        raise SessionError(f"the answer of {site} cannot be read: {error}") from None
+
+
+def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
+    """Returns the first answer to a request; None if there is none in time."""
+    replies, give_up_ns = bus.ask(key, encode(request)), clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         if (reply := replies.poll()) is not None:
-            try:
-                return decode(reply[1], ChangeReply)
-            except WireError as error:
-                raise SessionError(f"the answer of {site} cannot be read: {error}") from None
-    whose = "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
-    raise SessionError(f"{site} gave no answer; its records show whether it made the change{whose}")
+            return reply[1]
+    return None
+
+
+def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
+    """Yields the events of a site that runs, from its first one on, as far as it keeps them and answers."""
+    first, made = 0, 1
+    with suppress(WireError):  # a stranger's answer
+        while first < made:
+            wanted = BackfillRequest(channel="event", first=first, last=first + BACKFILL_MESSAGES - 1)
+            reply = _ask_once(bus, clock, topics.key(session, site, topics.PAST), wanted)
+            past = None if reply is None else decode(reply, Backfill)
+            if past is None or not past.payloads:
+                return
+            yield from (decode(payload, Event) for payload in past.payloads)
+            first, made = past.first + len(past.payloads), past.made
 
 
 def find_site_info(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:

@@ -105,7 +105,8 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
         n: number of the measurement of that start, from 0.
         tau_x: torque of operator and environment, as a record has it: the torque ON the arm is its negative;
             empty where it is not measured.
-        sent_ns: time of sending, ns of the program's own monotonic clock.
+        sent_ns: time of sending, ns of the program's own monotonic clock, or of measuring, on a clock of the
+            arm's; it is compared with no other clock.
     """
 
     site: str
@@ -113,7 +114,7 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     n: TickNumber
     q: Angles
     qd: Speeds
-    sent_ns: Instant
+    sent_ns: int
     tau_x: Torques = []
 
     def __post_init__(self) -> None:

@@ -18,12 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec
 
 import zenoh
 from zenoh import CongestionControl, Reliability, handlers
 
-from ..errors import UsageError
+from ..errors import TrilatError, UsageError
 from .clock import Clock
 from .zenoh_bus import open_zenoh
 from .zenoh_config import Endpoint
@@ -43,6 +43,7 @@ DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 _NO_HASH = "TypeHashNotSupported"
 """What Humble writes in place of a hash."""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
 
@@ -123,7 +124,7 @@ def name_dds_type(kind: str) -> str:
 
 
 def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
-    """Returns the key of a topic, or of a service; with the hash `*` that of any version of the type."""
+    """Returns the key of a topic, or of a service."""
     return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
 
 
@@ -152,6 +153,17 @@ class GraphPlace(NamedTuple):
 
 def _mangle(name: str) -> str:
     return name.replace("/", "%")
+
+
+def find_misfit(token: str, domain: int, kind: str) -> str:
+    """Returns where a publisher, by its token, differs from a domain and a type; "" if it fits both."""
+    _, its_domain, *_, its_type, its_hash, _ = token.split("/")
+    if its_domain != str(domain):
+        return f"in domain {its_domain}, and this is domain {domain}"
+    if its_type != name_dds_type(kind):
+        return f"as {its_type}, and here it is {name_dds_type(kind)}"
+    known = its_hash in (find_type_hash(kind, "jazzy"), _NO_HASH)
+    return "" if known else f"with another definition of {kind}, {its_hash}"
 
 
 def make_gid(token: str) -> bytes:
@@ -186,22 +198,29 @@ class Refusals:
         if first:
             self._say(f"refused: {reason}")
 
+    def guard(self, topic: str, act: Callable[P, None]) -> Callable[P, None]:
+        """Returns what does as `act`, and counts what it raises as refusals of a topic."""
+
+        def guarded(*args: P.args, **named: P.kwargs) -> None:
+            try:
+                act(*args, **named)
+            except (ValueError, TrilatError) as error:
+                self.add(f"{topic} {error}")
+
+        return guarded
+
 
 class TopicPublisher:
-    """Publishes on a topic.
+    """Publishes on a topic."""
 
-    Attributes:
-        heard: True while somebody listens, or may come later: else a message need not be made.
-    """
-
-    def __init__(self, declared: Any, gid: bytes, clock: Clock, *, heard: bool = False) -> None:
-        self.heard = heard
-        self._declared, self._gid, self._clock = declared, gid, clock
+    def __init__(self, declared: Any, gid: bytes, clock: Clock, *, latched: bool) -> None:
+        self._declared, self._gid, self._clock, self._latched = declared, gid, clock, latched
         self._number = 0
 
-    def match(self, status: Any) -> None:
-        """Learns whether somebody listens, in a thread of Zenoh's."""
-        self.heard = bool(status.matching)
+    @property
+    def heard(self) -> bool:
+        """True while somebody listens, or may come later: else a message need not be made."""
+        return self._latched or bool(self._declared.matching_status.matching)
 
     def put(self, data: bytes) -> None:
         """Publishes a message."""
@@ -223,7 +242,7 @@ class Ros2Graph:
 
     Raises:
         RouterSilent: no router answers, or not yet.
-        UsageError: an endpoint cannot be right.
+        UsageError: an endpoint cannot be right, or is that of a program that forwards nothing.
     """
 
     def __init__(
@@ -237,6 +256,12 @@ class Ros2Graph:
         distro: str = "jazzy",
     ) -> None:
         self._session = open_zenoh([], routers, "client", _OWN, "no router of ROS answers at {}")
+        if not self.connected and self._session.info.peers_zid():
+            self._session.close()
+            raise UsageError(
+                f"{', '.join(map(str, routers))} is no router, and forwards nothing: with --ros name that of "
+                "ROS (ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
+            )
         self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
         self._distro, self._clock, self._endpoints = distro, clock, 0
         self.refusals = refusals
@@ -253,6 +278,11 @@ class Ros2Graph:
         self._kept.clear()
         self._answers.shutdown(cancel_futures=True)
 
+    @property
+    def connected(self) -> bool:
+        """False while the router is gone; it is joined again when it comes back."""
+        return bool(self._session.info.routers_zid())
+
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
         """Returns what publishes messages of a type, in CDR, on a topic."""
         key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
@@ -263,32 +293,34 @@ class Ros2Graph:
         if qos.latched:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
             how |= {"cache": cache, "publisher_detection": True}
-            advanced: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
-            self._kept.append(advanced)  # else who comes later would find nobody
-            return TopicPublisher(advanced, gid, self._clock, heard=True)
-        declared = self._session.declare_publisher(key, **how)
-        made = TopicPublisher(declared, gid, self._clock)
-        self._kept.append(declared.declare_matching_listener(made.match))
-        return made
+            declared: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
+        else:
+            declared = self._session.declare_publisher(key, **how)
+        self._kept.append(declared)  # else who comes later would find nobody
+        return TopicPublisher(declared, gid, self._clock, latched=qos.latched)
 
     def subscribe(self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]) -> None:
-        """Gives the messages of a topic, of any version of its type, to `take`, in a thread of Zenoh's.
+        """Gives the messages of a topic to `take`, in a thread of Zenoh's; what that raises is refused.
 
-        Publishers of another type are refused by their tokens.
+        Publishers of another domain, type or definition are named by their tokens, and not heard.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
-        others = f"@ros2_lv/{self._place.domain}/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
+        guarded = self.refusals.guard(topic, take)
 
         def seen(sample: zenoh.Sample) -> None:
-            other = str(sample.key_expr).split("/")[10]
-            if sample.kind == zenoh.SampleKind.PUT and other != name_dds_type(kind):
-                self.refusals.add(f"{topic} is published as {other}, and here it is {name_dds_type(kind)}")
+            misfit = find_misfit(str(sample.key_expr), self._place.domain, kind)
+            if sample.kind == zenoh.SampleKind.PUT and misfit:
+                self.refusals.add(f"{topic} is published {misfit}")
 
         watcher = handlers.Callback(seen, indirect=False)
-        self._kept.append(self._session.liveliness().declare_subscriber(others, watcher, history=True))
+        everywhere = f"@ros2_lv/*/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
+        self._kept.append(self._session.liveliness().declare_subscriber(everywhere, watcher, history=True))
 
-        key = topic_key(self._place.domain, topic, kind, "*")
-        self._listen(key, topic, lambda sample, attachment: take(sample.payload.to_bytes(), attachment))
+        def heard(sample: zenoh.Sample, attachment: Attachment) -> None:
+            guarded(sample.payload.to_bytes(), attachment)
+
+        for type_hash in (find_type_hash(kind, "jazzy"), _NO_HASH):
+            self._listen(topic_key(self._place.domain, topic, kind, type_hash), topic, heard)
 
     def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
         """Gives the type and the attachment of every message of a topic to `take`, in a thread of Zenoh's.

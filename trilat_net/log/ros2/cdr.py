@@ -246,15 +246,16 @@ class CdrReader:
         """Returns a list of numbers."""
         return self.numbers("d", self.count())
 
-    def header(self) -> str:
-        """Passes over the stamp of a header; returns its frame."""
-        self.numbers("I", 2)
-        return self.text()
+    def header(self) -> tuple[int, str]:
+        """Returns the stamp of a header, ns, on whatever clock, and its frame."""
+        (whole_s,), (rest_ns,) = self.numbers("i"), self.numbers("I")
+        return whole_s * NS_PER_S + rest_ns, self.text()
 
 
 class RosJoints(NamedTuple):
-    """A `JointState`: names, and positions, velocities, efforts, each as long as they, or empty."""
+    """A `JointState`: stamp, ns, names, and positions, velocities, efforts, as many as they, or none."""
 
+    stamp_ns: int
     names: list[str]
     position: tuple[float, ...]
     velocity: tuple[float, ...]
@@ -268,9 +269,9 @@ def read_joint_state(payload: bytes) -> RosJoints:
         ValueError: it cannot be read.
     """
     reader = CdrReader(payload)
-    reader.header()
+    stamp_ns, _ = reader.header()
     names = [reader.text() for _ in range(reader.count())]
-    return RosJoints(names, reader.floats(), reader.floats(), reader.floats())
+    return RosJoints(stamp_ns, names, reader.floats(), reader.floats(), reader.floats())
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
@@ -294,4 +295,4 @@ def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ..
         ValueError: it cannot be read.
     """
     reader = CdrReader(payload)
-    return reader.header(), reader.numbers("d", count)
+    return reader.header()[1], reader.numbers("d", count)
