@@ -103,6 +103,9 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     safe: list[float] = []
 
 
+_ROBOT = RobotTable.__struct_fields__
+
+
 class TopicTable(NamedTuple):
     """The names of all topics, and the robots.
 
@@ -138,7 +141,8 @@ def read_topic_table(asked: str) -> TopicTable:
         with open_regular(Path(asked)) as stream:
             found = tomllib.loads(stream.read().decode())
         tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
-        robots = {site: _take_robot(table) for site, table in tables.items()}
+        own = {site: {key: of.pop(key) for key in _ROBOT if key in of} for site, of in tables.items()}
+        robots = msgspec.convert(own, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
             f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
@@ -157,12 +161,6 @@ def read_topic_table(asked: str) -> TopicTable:
     if len(set(places)) < len(places):
         raise UsageError(f"{asked}: two topics have one name; one that begins with / is for one site")
     return table
-
-
-def _take_robot(table: dict[str, Any]) -> RobotTable:
-    """Takes what is said of a robot out of the table of a site."""
-    own = {key: table.pop(key) for key in RobotTable.__struct_fields__ if key in table}
-    return msgspec.convert(own, RobotTable)
 
 
 class Ends(NamedTuple):
@@ -291,11 +289,7 @@ class OneSender:
         self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
 
     def admit(self, gid: bytes) -> int:
-        """Takes note of a message of a publisher; returns how long nothing had come before it, ns.
-
-        Raises:
-            ValueError: another one was heard a moment ago.
-        """
+        """Returns how long nothing had come before a message, ns; ValueError: two publishers send."""
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._heard_ns
         if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
@@ -377,13 +371,8 @@ class RobotArm:
     """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the site's torque.
 
     It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's controller
-    gets again and again what is safe for it.
-
-    Args:
-        make: returns a client of the site, of whatever start of it.
-        joints: of each joint of the arm, in the scenario's order, the names by which the robot may call it.
-        robot: the order of its controller, and what is safe.
-        commands: publishes to that controller.
+    gets again and again what is safe for it. Of each joint, in the scenario's order, `joints` has the names
+    by which the robot may call it; `make` returns a client of whatever start of the site.
 
     Attributes:
         armed: whether torques are sent, and not only what is safe.
@@ -416,11 +405,7 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_NS
 
     def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's, unless it is of another robot alone.
-
-        Raises:
-            ValueError: it is no measurement of the arm.
-        """
+        """Takes a message, in a thread of Zenoh's, unless it is of another robot; ValueError: it is none."""
         found = cdr.read_joint_state(data)
         if found.names and not any(name in found.names for called in self._joints for name in called):
             return
@@ -437,7 +422,7 @@ class RobotArm:
         if self._client.over:  # the site may come again
             with self._lock:
                 self._client = self._make()
-        torque, record = self._client.torque(), self._client.record
+        record, torque = self._client.record, self._client.torque()  # of that record, or a newer one
         if not self.armed or torque is None or record is None or len(torque) != len(self._order):
             if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
                 self.brake()
@@ -452,11 +437,7 @@ class RobotArm:
 
 
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where the joints of an arm stand in a `JointState`, which has them in any order.
-
-    Args:
-        names: of each joint the names by which it may be called.
-        found: the message; further joints in it are passed over.
+    """Returns where joints, each of which may be called by some names, stand in a message, in any order.
 
     Raises:
         ValueError: it lacks a joint, or has one twice.
@@ -502,11 +483,6 @@ def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[fl
 
 class Bridge:
     """The bridge of a session that runs; its topics and services are there from now on.
-
-    Args:
-        ends: of the bridge.
-        scenario: of the session.
-        epoch_unix_ns: Unix time of its tick 0.
 
     Attributes:
         targets: by topic what holds an arm.
@@ -587,8 +563,12 @@ class Bridge:
     def _diagnose(self) -> None:
         """Publishes the state of every site."""
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
-        newest_ns = max((record.t_ns for record in records), default=0)
-        parts = [_diagnose(self._ends.session, record) for record in records]
+        newest_ns, parts = max((record.t_ns for record in records), default=0), list[cdr.Diagnosis]()
+        for record in records:
+            values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
+            shown = {key: str(value) for key, value in values.items()}
+            level, name = _LEVELS.get(record.mode, _WARNING), f"{self._ends.session}/{record.site}"
+            parts.append(cdr.Diagnosis(level, name, record.mode, shown))
         self._diagnostics.put(cdr.pack_diagnostics(max(0, self._epoch_unix_ns + newest_ns), parts))
 
 
@@ -611,14 +591,6 @@ def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
     """Returns the names of each joint of a site: the one that its topics show, and that of the scenario."""
     pairs = zip(Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
-
-
-def _diagnose(session: str, record: State) -> cdr.Diagnosis:
-    values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
-    level = _LEVELS.get(record.mode, _WARNING)
-    return cdr.Diagnosis(
-        level, f"{session}/{record.site}", record.mode, {key: str(x) for key, x in values.items()}
-    )
 
 
 def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
@@ -744,11 +716,7 @@ def open_robot(
 
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Refuses the robot of a site without an external arm.
-
-    Raises:
-        UsageError: the table has one.
-    """
+    """Raises UsageError if the table has the robot of a site without an external arm."""
     for site, robot in table.robots.items():
         if site not in scenario.external and (robot != RobotTable() or site not in scenario.names):
             able = ", ".join(scenario.external) or "none"
