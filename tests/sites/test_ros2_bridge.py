@@ -457,6 +457,19 @@ def test_two_robots_on_one_topic_measure_nothing_until_one_is_gone() -> None:
     ]
 
 
+@given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
+def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> None:
+    refusals, asked, turned = Refusals(list[str]().append), list[dict[str, float]](), list[list[float]]()
+    shares_ = DominanceTopic(["m1"], asked.append, ManualClock())
+    refusals.guard("a", shares_.take)(data, FIRST)
+    shares_.ask()
+    refusals.guard("b", lambda: turned.append(read_joint_target(NAMES, data)))()
+    assert len(asked) + len(turned) + refusals.counts.total() == 2
+    assert all(
+        map(math.isfinite, [x for one in asked for x in one.values()] + [x for q in turned for x in q])
+    )
+
+
 @given(st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_whatever_a_robot_says_is_taken_passed_over_or_counted(data: bytes) -> None:
     robot = Robot()
