@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.core.ticks import NS_PER_S, DominanceRamp
+from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import ScenarioError, SessionError, TrilatError, UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
@@ -183,28 +183,30 @@ class ShareHistory:
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario, self._site = scenario, site
         planned = [change for change in scenario.timeline if change.dominance == site]
-        self._ramps = {
-            scenario.ramp(site, scenario.dominance[site], -1, 0.0),
-            *(scenario.ramp(site, change.shares, change.start_ns, change.ramp_s) for change in planned),
-        }
+        self._later = [scenario.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in planned]
+        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
+        self._before = self._ramp.alpha
 
     def take(self, change: str) -> None:
         """Takes a change of the site, as its events have it; one of anything else changes nothing."""
         with suppress(ScenarioError):  # a stranger's
-            if (ramp := parse_core_change(self._scenario, self._site, change).ramp) is not None:
-                self._ramps.add(ramp)
+            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:  # else it was shown before
+                self._later.append(ramp)
 
     def at(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the shares at a time since the epoch, ns."""
-        return _find_shares(sorted(self._ramps), t_ns)
+        """Returns the shares at a time since the epoch, ns, which never goes back."""
+        for ramp in sorted(one for one in self._later if one.start_ns <= t_ns):
+            self._before, self._ramp = self._find(ramp.start_ns), ramp
+        self._later = [one for one in self._later if one.start_ns > t_ns]
+        return self._find(t_ns)
 
-
-def _find_shares(ramps: Sequence[DominanceRamp], t_ns: int) -> tuple[float, ...]:
-    *before, last = [ramp for ramp in ramps if ramp.start_ns <= t_ns]
-    if t_ns >= last.end_ns:
-        return last.alpha
-    part, old = (t_ns - last.start_ns) / (last.end_ns - last.start_ns), _find_shares(before, last.start_ns)
-    return tuple(a + part * (b - a) for a, b in zip(old, last.alpha, strict=True))
+    def _find(self, t_ns: int) -> tuple[float, ...]:
+        _, end_ns, after = ramp = self._ramp
+        if t_ns >= end_ns:
+            return after
+        part = (t_ns - ramp.start_ns) / (end_ns - ramp.start_ns)
+        return tuple(a + part * (b - a) for a, b in zip(self._before, after, strict=True))
 
 
 class SiteTopics:

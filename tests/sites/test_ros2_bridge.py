@@ -363,6 +363,15 @@ def test_shares_are_those_that_the_certificate_sees(changes: list[tuple[int, int
         np.testing.assert_allclose([history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9)
 
 
+def test_shares_that_change_ten_times_a_second_are_shown() -> None:
+    history = ShareHistory(load_scenario("paper"), "s")
+    for n in range(3_600):
+        to = {"m1": 0.25, "m2": 0.75} if n % 2 else {"m1": 0.75, "m2": 0.25}
+        history.take(json.dumps({"at_s": n / 10.0, "dominance": "s", "to": to, "ramp_s": 1.0}))
+        assert sum(history.at(n * 10**8)) == pytest.approx(1.0)
+    assert history.at(370 * 10**9) == (0.25, 0.75)
+
+
 class Robot:
     """A robot whose controller has another order than the scenario, its site, and what lies between."""
 
