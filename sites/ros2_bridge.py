@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import ScenarioError, SessionError, TrilatError, UsageError
+from trilat_net.errors import ScenarioError, TrilatError, UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
@@ -103,17 +103,8 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     safe: list[float] = []
 
 
-_ROBOT = RobotTable.__struct_fields__
-
-
 class TopicTable(NamedTuple):
-    """The names of all topics, and the robots.
-
-    Attributes:
-        names: by our name of a topic the one that it has at every site.
-        of_site: the same for single sites, where it differs.
-        robots: by site.
-    """
+    """By our names of topics those that they have at every site, and where a site has others; the robots."""
 
     names: Mapping[str, str]
     of_site: Mapping[str, Mapping[str, str]] = {}
@@ -141,16 +132,15 @@ def read_topic_table(asked: str) -> TopicTable:
         with open_regular(Path(asked)) as stream:
             found = tomllib.loads(stream.read().decode())
         tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
-        own = {site: {key: of.pop(key) for key in _ROBOT if key in of} for site, of in tables.items()}
+        of_robot = RobotTable.__struct_fields__
+        own = {site: {key: of.pop(key) for key in of_robot if key in of} for site, of in tables.items()}
         robots = msgspec.convert(own, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
             f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
         ) from None
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{asked}: sites: {error}") from None
-    except ValueError as error:
-        raise UsageError(f"{asked}: is no TOML: {error}") from None
+    except (ValueError, msgspec.ValidationError) as error:
+        raise UsageError(f"{asked}: is no TOML of names: {error}") from None
     for key, name in [pair for table in (found, *tables.values()) for pair in table.items()]:
         if key not in TOPICS:
             raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(TOPICS))}")
@@ -212,10 +202,7 @@ class ShareHistory:
 class SiteTopics:
     """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count from the epoch.
 
-    Attributes:
-        frame: in which the end effector is: that of the arm's base, or the one that the sites share.
-        shares: of its peers in its reference.
-        newest: the record that was shown last.
+    Its end effector is in `frame`; `newest` is the record that was shown last.
     """
 
     def __init__(
@@ -374,10 +361,8 @@ class RobotArm:
 
     It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's controller
     gets again and again what is safe for it. Of each joint, in the scenario's order, `joints` has the names
-    by which the robot may call it; `make` returns a client of whatever start of the site.
-
-    Attributes:
-        armed: whether torques are sent, and not only what is safe.
+    by which the robot may call it; `make` returns a client of whatever start of the site. Until it is `armed`
+    the robot gets nothing but what is safe.
 
     Raises:
         UsageError: the controller has not one number for each joint.
@@ -439,11 +424,7 @@ class RobotArm:
 
 
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where joints, each of which may be called by some names, stand in a message, in any order.
-
-    Raises:
-        ValueError: it lacks a joint, or has one twice.
-    """
+    """Returns where joints, of some names each, stand in a message; ValueError: not each stands there once."""
     if len(found.names) != len(found.position):
         raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
     at = {name: n for n, name in enumerate(found.names)}
@@ -456,11 +437,7 @@ def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> l
 
 
 def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in the order of an arm's joints, see `find_joint_places`.
-
-    Raises:
-        ValueError: it cannot be read, lacks a joint, or an angle is not finite.
-    """
+    """Returns the angles of a `JointState` in an arm's order; ValueError: it lacks one, or is none."""
     found = cdr.read_joint_state(data)
     return _check_finite([found.position[n] for n in find_joint_places(names, found)])
 
@@ -486,9 +463,7 @@ def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[fl
 class Bridge:
     """The bridge of a session that runs; its topics and services are there from now on.
 
-    Attributes:
-        targets: by topic what holds an arm.
-        dominance: by topic what changes who leads.
+    By their topics, `targets` are what holds an arm, and `dominance` what changes who leads.
     """
 
     def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -681,7 +656,8 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
         for site, robot in ends.table.robots.items():
             if robot.joints:  # as it can begin before any site answers
                 robots[site] = stack.enter_context(open_robot(ends, site, robot))
-        if (met := await_site(ends, stopped, say, running=False)) is None:
+        say(f"waiting for session {ends.session!r} to begin")
+        if (met := await_site(ends, stopped, running=False)) is None:
             return False
         scenario = parse_embedded(met.scenario, ends.session)
         refuse_other_robots(ends.table, scenario)
@@ -690,7 +666,7 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
                 robot, names = ends.table.robots.get(site, RobotTable()), list_joint_names(scenario, site)
                 robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
             robots[site].armed = True
-        if (begun := await_site(ends, stopped, say, running=True)) is None:
+        if (begun := await_site(ends, stopped, running=True)) is None:
             return False
         bridge = Bridge(ends, scenario, begun.epoch_unix_ns)
         for target in bridge.targets.values():
@@ -725,23 +701,7 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
             raise UsageError(f"--names: sites.{site}: there is no external arm; sites with one: {able}")
 
 
-def await_site(
-    ends: Ends, stopped: Callable[[], bool], say: Callable[[str], None], *, running: bool
-) -> Info | None:
-    """Returns what a site answers, of a session that is to be running or not; None if `stopped`.
-
-    It says once what it waits for.
-    """
-    why = f"session {ends.session} has not begun" if running else f"no site of session {ends.session} answers"
-    told = False
-    while not stopped():
-        try:
-            for info in find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=1.0):
-                if info.scenario and (info.running or not running):
-                    return info
-        except SessionError as error:  # of another version of this program
-            why = str(error)
-        if not told:
-            say(f"{why}: waiting")
-        told = True
-    return None
+def await_site(ends: Ends, stopped: Callable[[], bool], *, running: bool) -> Info | None:
+    """Returns what a site answers, of a session that is to be running or not; None if `stopped`."""
+    answers = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
+    return next((info for info in answers if info.scenario and (info.running or not running)), None)
