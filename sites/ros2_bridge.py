@@ -424,7 +424,7 @@ class RobotArm:
 
 
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where joints, of some names each, stand in a message; ValueError: not each stands there once."""
+    """Returns where joints, of some names each, stand in a message; ValueError: one is not there once."""
     if len(found.names) != len(found.position):
         raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
     at = {name: n for n, name in enumerate(found.names)}
