@@ -471,7 +471,7 @@ class Bridge:
         states, events = (topics.key(session, "*", channel) for channel in (topics.STATE, topics.EVENT))
         self._records, self._events = bus.inbox(states, 4096), bus.inbox(events, 4096)
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._present: set[topics.KeyParts] = set()
+        self._present, self._met = set[topics.KeyParts](), False
         self._epoch_unix_ns = epoch_unix_ns
         frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
         self._sites = {
@@ -532,10 +532,11 @@ class Bridge:
         for parts, alive in topics.read_presence(self._presence):
             if parts.member in self._sites:
                 (self._present.add if alive else self._present.discard)(parts)
+                self._met = True
         return anew
 
     def _is_over(self) -> bool:
-        return not self._present and any(shown.newest for shown in self._sites.values())
+        return self._met and not self._present
 
     def _diagnose(self) -> None:
         """Publishes the state of every site."""
