@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.core.ticks import NS_PER_S, DominanceRamp
-from trilat_net.errors import ScenarioError, SessionError, TrilatError, UsageError
+from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import ScenarioError, TrilatError, UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
@@ -104,13 +104,7 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """The names of all topics, and the robots.
-
-    Attributes:
-        names: by our name of a topic the one that it has at every site.
-        of_site: the same for single sites, where it differs.
-        robots: by site.
-    """
+    """By our names of topics those that they have at every site, and where a site has others; the robots."""
 
     names: Mapping[str, str]
     of_site: Mapping[str, Mapping[str, str]] = {}
@@ -138,15 +132,15 @@ def read_topic_table(asked: str) -> TopicTable:
         with open_regular(Path(asked)) as stream:
             found = tomllib.loads(stream.read().decode())
         tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
-        robots = {site: _take_robot(table) for site, table in tables.items()}
+        of_robot = RobotTable.__struct_fields__
+        own = {site: {key: of.pop(key) for key in of_robot if key in of} for site, of in tables.items()}
+        robots = msgspec.convert(own, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
             f"--names is crisp, crtk or a file, and {asked} cannot be read: {error.strerror}"
         ) from None
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{asked}: sites: {error}") from None
-    except ValueError as error:
-        raise UsageError(f"{asked}: is no TOML: {error}") from None
+    except (ValueError, msgspec.ValidationError) as error:
+        raise UsageError(f"{asked}: is no TOML of names: {error}") from None
     for key, name in [pair for table in (found, *tables.values()) for pair in table.items()]:
         if key not in TOPICS:
             raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(TOPICS))}")
@@ -157,12 +151,6 @@ def read_topic_table(asked: str) -> TopicTable:
     if len(set(places)) < len(places):
         raise UsageError(f"{asked}: two topics have one name; one that begins with / is for one site")
     return table
-
-
-def _take_robot(table: dict[str, Any]) -> RobotTable:
-    """Takes what is said of a robot out of the table of a site."""
-    own = {key: table.pop(key) for key in RobotTable.__struct_fields__ if key in table}
-    return msgspec.convert(own, RobotTable)
 
 
 class Ends(NamedTuple):
@@ -185,37 +173,36 @@ class ShareHistory:
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario, self._site = scenario, site
         planned = [change for change in scenario.timeline if change.dominance == site]
-        self._ramps = {
-            scenario.ramp(site, scenario.dominance[site], -1, 0.0),
-            *(scenario.ramp(site, change.shares, change.start_ns, change.ramp_s) for change in planned),
-        }
+        self._later = [scenario.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in planned]
+        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
+        self._before = self._ramp.alpha
 
     def take(self, change: str) -> None:
         """Takes a change of the site, as its events have it; one of anything else changes nothing."""
         with suppress(ScenarioError):  # a stranger's
-            if (ramp := parse_core_change(self._scenario, self._site, change).ramp) is not None:
-                self._ramps.add(ramp)
+            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:  # else it was shown before
+                self._later.append(ramp)
 
     def at(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the shares at a time since the epoch, ns."""
-        return _find_shares(sorted(self._ramps), t_ns)
+        """Returns the shares at a time since the epoch, ns, which never goes back."""
+        for ramp in sorted(one for one in self._later if one.start_ns <= t_ns):
+            self._before, self._ramp = self._find(ramp.start_ns), ramp
+        self._later = [one for one in self._later if one.start_ns > t_ns]
+        return self._find(t_ns)
 
-
-def _find_shares(ramps: Sequence[DominanceRamp], t_ns: int) -> tuple[float, ...]:
-    *before, last = [ramp for ramp in ramps if ramp.start_ns <= t_ns]
-    if t_ns >= last.end_ns:
-        return last.alpha
-    part, old = (t_ns - last.start_ns) / (last.end_ns - last.start_ns), _find_shares(before, last.start_ns)
-    return tuple(a + part * (b - a) for a, b in zip(old, last.alpha, strict=True))
+    def _find(self, t_ns: int) -> tuple[float, ...]:
+        _, end_ns, after = ramp = self._ramp
+        if t_ns >= end_ns:
+            return after
+        part = (t_ns - ramp.start_ns) / (end_ns - ramp.start_ns)
+        return tuple(a + part * (b - a) for a, b in zip(self._before, after, strict=True))
 
 
 class SiteTopics:
     """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count from the epoch.
 
-    Attributes:
-        frame: in which the end effector is: that of the arm's base, or the one that the sites share.
-        shares: of its peers in its reference.
-        newest: the record that was shown last.
+    Its end effector is in `frame`; `newest` is the record that was shown last.
     """
 
     def __init__(
@@ -291,11 +278,7 @@ class OneSender:
         self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
 
     def admit(self, gid: bytes) -> int:
-        """Takes note of a message of a publisher; returns how long nothing had come before it, ns.
-
-        Raises:
-            ValueError: another one was heard a moment ago.
-        """
+        """Returns how long nothing had come before a message, ns; ValueError: two publishers send."""
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._heard_ns
         if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
@@ -377,16 +360,9 @@ class RobotArm:
     """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the site's torque.
 
     It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's controller
-    gets again and again what is safe for it.
-
-    Args:
-        make: returns a client of the site, of whatever start of it.
-        joints: of each joint of the arm, in the scenario's order, the names by which the robot may call it.
-        robot: the order of its controller, and what is safe.
-        commands: publishes to that controller.
-
-    Attributes:
-        armed: whether torques are sent, and not only what is safe.
+    gets again and again what is safe for it. Of each joint, in the scenario's order, `joints` has the names
+    by which the robot may call it; `make` returns a client of whatever start of the site. Until it is `armed`
+    the robot gets nothing but what is safe.
 
     Raises:
         UsageError: the controller has not one number for each joint.
@@ -416,11 +392,7 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_NS
 
     def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's, unless it is of another robot alone.
-
-        Raises:
-            ValueError: it is no measurement of the arm.
-        """
+        """Takes a message, in a thread of Zenoh's, unless it is of another robot; ValueError: it is none."""
         found = cdr.read_joint_state(data)
         if found.names and not any(name in found.names for called in self._joints for name in called):
             return
@@ -437,7 +409,7 @@ class RobotArm:
         if self._client.over:  # the site may come again
             with self._lock:
                 self._client = self._make()
-        torque, record = self._client.torque(), self._client.record
+        record, torque = self._client.record, self._client.torque()  # of that record, or a newer one
         if not self.armed or torque is None or record is None or len(torque) != len(self._order):
             if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
                 self.brake()
@@ -452,15 +424,7 @@ class RobotArm:
 
 
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where the joints of an arm stand in a `JointState`, which has them in any order.
-
-    Args:
-        names: of each joint the names by which it may be called.
-        found: the message; further joints in it are passed over.
-
-    Raises:
-        ValueError: it lacks a joint, or has one twice.
-    """
+    """Returns where joints, of some names each, stand in a message; ValueError: one is not there once."""
     if len(found.names) != len(found.position):
         raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
     at = {name: n for n, name in enumerate(found.names)}
@@ -473,11 +437,7 @@ def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> l
 
 
 def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in the order of an arm's joints, see `find_joint_places`.
-
-    Raises:
-        ValueError: it cannot be read, lacks a joint, or an angle is not finite.
-    """
+    """Returns the angles of a `JointState` in an arm's order; ValueError: it lacks one, or is none."""
     found = cdr.read_joint_state(data)
     return _check_finite([found.position[n] for n in find_joint_places(names, found)])
 
@@ -503,14 +463,7 @@ def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[fl
 class Bridge:
     """The bridge of a session that runs; its topics and services are there from now on.
 
-    Args:
-        ends: of the bridge.
-        scenario: of the session.
-        epoch_unix_ns: Unix time of its tick 0.
-
-    Attributes:
-        targets: by topic what holds an arm.
-        dominance: by topic what changes who leads.
+    By their topics, `targets` are what holds an arm, and `dominance` what changes who leads.
     """
 
     def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -518,7 +471,7 @@ class Bridge:
         states, events = (topics.key(session, "*", channel) for channel in (topics.STATE, topics.EVENT))
         self._records, self._events = bus.inbox(states, 4096), bus.inbox(events, 4096)
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._present: set[topics.KeyParts] = set()
+        self._present, self._met = set[topics.KeyParts](), False
         self._epoch_unix_ns = epoch_unix_ns
         frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
         self._sites = {
@@ -579,16 +532,21 @@ class Bridge:
         for parts, alive in topics.read_presence(self._presence):
             if parts.member in self._sites:
                 (self._present.add if alive else self._present.discard)(parts)
+                self._met = True
         return anew
 
     def _is_over(self) -> bool:
-        return not self._present and any(shown.newest for shown in self._sites.values())
+        return self._met and not self._present
 
     def _diagnose(self) -> None:
         """Publishes the state of every site."""
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
-        newest_ns = max((record.t_ns for record in records), default=0)
-        parts = [_diagnose(self._ends.session, record) for record in records]
+        newest_ns, parts = max((record.t_ns for record in records), default=0), list[cdr.Diagnosis]()
+        for record in records:
+            values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
+            shown = {key: str(value) for key, value in values.items()}
+            level, name = _LEVELS.get(record.mode, _WARNING), f"{self._ends.session}/{record.site}"
+            parts.append(cdr.Diagnosis(level, name, record.mode, shown))
         self._diagnostics.put(cdr.pack_diagnostics(max(0, self._epoch_unix_ns + newest_ns), parts))
 
 
@@ -611,14 +569,6 @@ def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
     """Returns the names of each joint of a site: the one that its topics show, and that of the scenario."""
     pairs = zip(Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
-
-
-def _diagnose(session: str, record: State) -> cdr.Diagnosis:
-    values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
-    level = _LEVELS.get(record.mode, _WARNING)
-    return cdr.Diagnosis(
-        level, f"{session}/{record.site}", record.mode, {key: str(x) for key, x in values.items()}
-    )
 
 
 def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
@@ -707,7 +657,8 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
         for site, robot in ends.table.robots.items():
             if robot.joints:  # as it can begin before any site answers
                 robots[site] = stack.enter_context(open_robot(ends, site, robot))
-        if (met := await_site(ends, stopped, say, running=False)) is None:
+        say(f"waiting for session {ends.session!r} to begin")
+        if (met := await_site(ends, stopped, running=False)) is None:
             return False
         scenario = parse_embedded(met.scenario, ends.session)
         refuse_other_robots(ends.table, scenario)
@@ -716,7 +667,7 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
                 robot, names = ends.table.robots.get(site, RobotTable()), list_joint_names(scenario, site)
                 robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
             robots[site].armed = True
-        if (begun := await_site(ends, stopped, say, running=True)) is None:
+        if (begun := await_site(ends, stopped, running=True)) is None:
             return False
         bridge = Bridge(ends, scenario, begun.epoch_unix_ns)
         for target in bridge.targets.values():
@@ -744,34 +695,14 @@ def open_robot(
 
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Refuses the robot of a site without an external arm.
-
-    Raises:
-        UsageError: the table has one.
-    """
+    """Raises UsageError if the table has the robot of a site without an external arm."""
     for site, robot in table.robots.items():
         if site not in scenario.external and (robot != RobotTable() or site not in scenario.names):
             able = ", ".join(scenario.external) or "none"
             raise UsageError(f"--names: sites.{site}: there is no external arm; sites with one: {able}")
 
 
-def await_site(
-    ends: Ends, stopped: Callable[[], bool], say: Callable[[str], None], *, running: bool
-) -> Info | None:
-    """Returns what a site answers, of a session that is to be running or not; None if `stopped`.
-
-    It says once what it waits for.
-    """
-    why = f"session {ends.session} has not begun" if running else f"no site of session {ends.session} answers"
-    told = False
-    while not stopped():
-        try:
-            for info in find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=1.0):
-                if info.scenario and (info.running or not running):
-                    return info
-        except SessionError as error:  # of another version of this program
-            why = str(error)
-        if not told:
-            say(f"{why}: waiting")
-        told = True
-    return None
+def await_site(ends: Ends, stopped: Callable[[], bool], *, running: bool) -> Info | None:
+    """Returns what a site answers, of a session that is to be running or not; None if `stopped`."""
+    answers = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
+    return next((info for info in answers if info.scenario and (info.running or not running)), None)

@@ -186,7 +186,7 @@ def test_joint_states_of_others_are_read(stamp_ns: int, frame: str, names: list[
         effort=np.zeros(0),
     )
     found = cdr.read_joint_state(serialized(cdr.JOINT_STATE, message))
-    assert found == (names, tuple(range(len(names))), tuple(speeds), ())
+    assert found == (stamp_ns, names, tuple(range(len(names))), tuple(speeds), ())
 
 
 @given(

@@ -181,6 +181,11 @@ def test_a_publisher_that_does_not_fit_is_named(domain: int, kind: str, type_has
     assert find_misfit(sent, 0, STRING) == misfit
 
 
+@given(st.lists(st.text(max_size=9).filter(lambda part: "/" not in part), min_size=10, max_size=15))
+def test_a_token_of_strangers_has_a_misfit_and_raises_nothing(parts: list[str]) -> None:
+    assert find_misfit("/".join(parts), 0, STRING)
+
+
 class Wire:
     """A router, a graph of ours at it, and a stranger who speaks Zenoh alone."""
 

@@ -206,8 +206,8 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
         ("joint_states = 'a'\nreference = 'a'", "two topics have one name"),
         ("robot_commands = '/commands'", "one that begins with / is for one site"),
         ("[sites.s]\nmode = '/a'\n[sites.m]\nmode = '/a'", "two topics have one name"),
-        ("sites = 1", "sites: Expected `object`"),
-        ("[sites.s]\nsafe = ['a']", "sites: Expected `float`, got `str`"),
+        ("sites = 1", "is no TOML of names: Expected `object`"),
+        ("[sites.s]\nsafe = ['a']", "is no TOML of names: Expected `float`, got `str`"),
         ("[sites.s]\njoint = ['a']", "no topic 'joint'"),
         (None, "--names is crisp, crtk or a file, and .* cannot be read: No such file"),
     ],
@@ -363,6 +363,15 @@ def test_shares_are_those_that_the_certificate_sees(changes: list[tuple[int, int
         np.testing.assert_allclose([history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9)
 
 
+def test_shares_that_change_ten_times_a_second_are_shown() -> None:
+    history = ShareHistory(load_scenario("paper"), "s")
+    for n in range(3_600):
+        to = {"m1": 0.25, "m2": 0.75} if n % 2 else {"m1": 0.75, "m2": 0.25}
+        history.take(json.dumps({"at_s": n / 10.0, "dominance": "s", "to": to, "ramp_s": 1.0}))
+        assert sum(history.at(n * 10**8)) == pytest.approx(1.0)
+    assert history.at(370 * 10**9) == (0.25, 0.75)
+
+
 class Robot:
     """A robot whose controller has another order than the scenario, its site, and what lies between."""
 
@@ -455,6 +464,19 @@ def test_two_robots_on_one_topic_measure_nothing_until_one_is_gone() -> None:
     assert robot.said == [
         "refused: joint_states has two publishers: neither moves the arm until the other is gone"
     ]
+
+
+@given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
+def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> None:
+    refusals, asked, turned = Refusals(list[str]().append), list[dict[str, float]](), list[list[float]]()
+    shares_ = DominanceTopic(["m1"], asked.append, ManualClock())
+    refusals.guard("a", shares_.take)(data, FIRST)
+    shares_.ask()
+    refusals.guard("b", lambda: turned.append(read_joint_target(NAMES, data)))()
+    assert len(asked) + len(turned) + refusals.counts.total() == 2
+    assert all(
+        map(math.isfinite, [x for one in asked for x in one.values()] + [x for q in turned for x in q])
+    )
 
 
 @given(st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
@@ -564,7 +586,8 @@ def test_a_session_that_begins_anew_is_shown_with_its_own_epoch() -> None:
     with sites.shown():
         assert sites.seconds() == {2 * 10**9}
     assert sites.anew == [True, False]
-    assert len(sites.said) == 2
+    told = ["waiting for session 't' to begin", "session t is in the graph of ROS 2: /t/..."]
+    assert sites.said == told * 2
 
 
 def test_shares_that_were_changed_before_are_shown() -> None:

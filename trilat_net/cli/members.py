@@ -500,12 +500,7 @@ def ros2_command(
         ),
     ] = 100.0,
     names: Annotated[
-        str,
-        value(
-            "--names",
-            "crisp|crtk|FILE",
-            "Names of the topics, or a TOML file of them and of robots.",
-        ),
+        str, value("--names", "crisp|crtk|FILE", "Names of topics, or a TOML file of them and of robots.")
     ] = "crisp",
     timeout: options.AnswerOption = 10.0,
     *,
