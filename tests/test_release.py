@@ -58,13 +58,14 @@ def test_what_the_workflows_run_is_there() -> None:
 def test_it_is_built_once_installed_everywhere_and_then_published_without_a_secret() -> None:
     jobs = RELEASE["jobs"]
     assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
-    assert [jobs[name].get("needs") for name in ("build", "install", "publish")] == [None, "build", "install"]
+    assert [jobs[name].get("needs") for name in jobs] == [None, "build", "compile", "install"]
     assert jobs["publish"]["environment"]["name"] == "pypi"
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
     assert [name for name in jobs if "permissions" in jobs[name]] == ["publish"]
     assert not any("checkout" in step.get("uses", "") for step in jobs["publish"]["steps"])
     stated = [one.rpartition(" ")[2] for one in PROJECT["project"]["classifiers"] if ":: 3." in one]
-    assert jobs["install"]["strategy"]["matrix"]["python"] == stated
+    for name in ("compile", "install"):
+        assert jobs[name]["strategy"]["matrix"]["python"] == stated
     assert PROJECT["project"]["requires-python"] == f">={stated[0]}"
 
 
