@@ -11,7 +11,7 @@ help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
 	@echo "make play    take hold of three arms on a page in the browser, and look at what you made"
 	@echo "             OPTIONS='--duration 5' gives options to either"
-	@echo "make setup   make the virtual environment .venv from locked dependencies, nothing more"
+	@echo "make setup   make the virtual environment .venv from locked dependencies, and compile what the demo needs"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
@@ -24,7 +24,7 @@ demo: setup
 play: setup
 	@$(BIN)/trilat live play $(OPTIONS)
 
-setup: $(VENV)/runtime.stamp
+setup: $(VENV)/compiled.stamp
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -37,6 +37,10 @@ $(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/bin/py
 	@echo "installing locked dependencies into $(VENV)"
 	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/runtime.lock
 	@$(PIP) --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+$(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*.py)
+	@$(BIN)/python -m tests.compile_core paper
 	@touch $@
 
 $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp

@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
-from trilat_net.core.jit import COMPILING, compiling_notice, is_core_cached
+from trilat_net.core.jit import compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_results_folder
@@ -140,8 +140,7 @@ def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interr
     layouts = {arm.counts: name for name, arm in scenario.arms.items()}
     chains = any(arm.chain is not None for arm in scenario.arms.values())
     if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
-        display.say(COMPILING)
-        compiling_notice.said = True
+        compiling_notice.say = display.say
         with interrupt.raising():
             for name in layouts.values():
                 warm_up(scenario, name)

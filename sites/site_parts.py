@@ -9,7 +9,15 @@ from dataclasses import dataclass
 
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, CoreChange, PlantState, TickInput, TickRecord, tick_ns
+from trilat_net.core.ticks import (
+    Arrival,
+    CoreChange,
+    PlantState,
+    TickInput,
+    TickRecord,
+    first_tick_at,
+    tick_ns,
+)
 from trilat_net.errors import LawFailed
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
@@ -196,6 +204,8 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
+    site.begin_at(first_tick_at(0, site.rate_hz))
+    site.release_tick(0, 0)  # as a site does that joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(WARM_UP_TICKS):

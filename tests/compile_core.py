@@ -1,38 +1,78 @@
-"""Compiles the core for the layouts that tests of a push run, a process each: `python -m tests.compile_core`.
+"""Compiles the core on all processors, a process for each part: `python -m tests.compile_core [PART...]`.
 
-Else every worker of a test run that begins without compiled code compiles all of them by itself.
+Without names for the layouts that tests of a push run: else every worker of a test run that begins without
+compiled code compiles all of them by itself. `make setup` names what the first demo and its report need. With
+`--into FOLDER` the layouts of the scenarios that ship are compiled for the generic processor of the platform,
+into a folder for a wheel (`.ci/compile-wheel`).
 """
 
-import multiprocessing
+import os
+import shutil
 import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import as_completed
+from pathlib import Path
 
 import trilat_net
+from sites.site_parts import warm_up
 from tests.chains import six_joints
 from tests.task_arms import planar_task
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.execution.fused import FusedRun
-from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.process import Interrupt, count_cores, worker_pool
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 
-TEXTS = {"paper": "", "six joints": six_joints(0.05), "task space": planar_task(0.05)}
+OF_TESTS = ("paper", "six joints", "task space")
+SHIPPED = ("paper", "six_joints", "seven_joints", "unlike_arms")
 
 
-def compile_layout(name: str) -> None:
+def read_part(name: str) -> Scenario:
+    """The scenario of a part, of a moment."""
+    texts = {"six joints": six_joints, "task space": planar_task}
+    if name in texts:
+        return parse_scenario(texts[name](0.05))
+    return load_scenario(name, {"duration_s": 0.05})
+
+
+def compile_part(part: str) -> str:
     """Runs a scenario for a moment, tick by tick and fused, and looks at its log."""
-    text = TEXTS[name]
-    scenario = parse_scenario(text) if text else load_scenario(name, {"duration_s": 0.05})
-    certify(trilat_net.simulate(scenario))
+    scenario = read_part(part)
+    with tempfile.TemporaryDirectory() as folder:
+        file = trilat_net.simulate(scenario).save(Path(folder) / "run.mcap")
+        certify(trilat_net.open_log(file))
+        if part in SHIPPED:
+            for site in scenario.names:
+                warm_up(scenario, site)
+            trilat_net.verify(file, virtual=True, resume_every=20)
+            trilat_net.report(file, Path(folder) / "report")
     FusedRun(scenario).advance_watching(scenario.duration_s)
+    return part
 
 
-def main() -> int:
-    """Compiles all of them; the exit code is 1 if one failed, which its tests will say better."""
-    processes = [multiprocessing.Process(target=compile_layout, args=(name,)) for name in TEXTS]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-    return int(any(process.exitcode for process in processes))
+def compile_parts(parts: Sequence[str], cores: int) -> None:
+    """Compiles parts beside each other, and says how far it is."""
+    print(
+        f"compiling {len(parts)} parts of the core on {cores} processors, half a minute each ...", flush=True
+    )
+    with Interrupt() as interrupt, interrupt.raising(), worker_pool(cores) as pool:
+        running = [pool.submit(compile_part, part) for part in parts]
+        for done, one in enumerate(as_completed(running), 1):
+            print(f"compiled {done} of {len(parts)}: {one.result()}", flush=True)
+
+
+def main(words: Sequence[str]) -> None:
+    """Compiles what is named."""
+    if words[:1] != ["--into"]:
+        parts = words or OF_TESTS
+        compile_parts(parts, min(count_cores(), len(parts)))
+        return
+    with tempfile.TemporaryDirectory() as cache:  # workers see this environment
+        os.environ.update(NUMBA_CPU_NAME="generic", XDG_CACHE_HOME=cache)
+        compile_parts(words[2:] or SHIPPED, 1)  # two at once may overwrite what an index says
+        within = shutil.ignore_patterns("*-within*")
+        shutil.copytree(Path(cache) / "trilat-net", words[1], ignore=within, dirs_exist_ok=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main(sys.argv[1:])

@@ -1,6 +1,7 @@
 """Commands that get no disk, no memory, no help texts, or a signal as they compile: each says so plainly."""
 
 import os
+import random
 import resource
 import signal
 import subprocess
@@ -132,6 +133,34 @@ def test_cold_start_says_that_it_compiles_and_ends_at_once(
         started.kill()
         started.wait()
         started.stderr.close()
+
+
+AT_AN_INSTANT = """
+import os, sys, threading, time
+instant_s, number = float(sys.argv[1]), int(sys.argv[2])
+def end() -> None:
+    pause = threading.Event()
+    while time.process_time() < instant_s:
+        pause.wait(0.01)
+    os.kill(os.getpid(), number)
+threading.Thread(target=end, daemon=True).start()
+from trilat_net.__main__ import main
+sys.argv[:] = ["trilat", *sys.argv[3:]]
+main()
+"""
+"""A command that gets a signal when it has used so much of a processor, s."""
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 16))])
+def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) -> None:
+    """As it is imported, read, compiled or kept: whatever Python makes of the signal there."""
+    draw = random.Random(seed)
+    number, instant_s = draw.choice(ENDING_SIGNALS), draw.uniform(0.2, 8.0)
+    words = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
+    command = [sys.executable, "-c", AT_AN_INSTANT, f"{instant_s:.3f}", str(int(number)), *words]
+    cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(command, cwd=tmp_path, env=cold, capture_output=True, text=True, timeout=300)
+    assert done.returncode in (-number, 128 + number), done.stderr
 
 
 def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:

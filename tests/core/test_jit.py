@@ -1,5 +1,7 @@
 """Machine code of the cache: what one process has compiled another may load, beside that of a third."""
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -54,3 +56,48 @@ def test_equal_closures_of_two_processes_are_told_apart(
         for factors in ("2", "3", "23")
     ]
     assert [said.split() for said in run] == [["2.0", "0"], ["3.0", "0"], ["2.0", "1", "3.0", "1"]]
+
+
+LEAVES = """
+import sys
+import numpy as np
+from numba.core import event
+from pathlib import Path
+from trilat_net.core import jit
+jit._SHIPPED = Path(sys.argv[1], jit._SHIPPED.name)
+jit._ships = jit._SHIPPED.is_dir()
+
+class Count(event.Listener):
+    number = 0
+    def on_start(self, _): self.number += 1
+    def on_end(self, _): pass
+
+event.register("numba:compile", count := Count())
+from trilat_net.core import hyperbolic, philox, sincos
+for k in range(50):
+    print(*(float(one).hex() for one in (
+        philox.standard_gamma(np.uint64(5), k, 3, 1.5 + k), *sincos.sincos(0.3 * k), hyperbolic.tanh(0.1 * k)
+    )))
+print(count.number)
+"""
+
+
+def run_leaves(folder: Path, cache: Path, **more: str) -> tuple[str, int]:
+    """What leaves compute with a wheel's folder and a user's cache, and how many were compiled for it."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache), **more}
+    program = [sys.executable, "-c", LEAVES, folder]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
+    *said, number = done.stdout.splitlines()
+    return "\n".join(said), int(number)
+
+
+def test_with_a_wheels_code_nothing_is_compiled_and_bits_are_the_hosts(tmp_path: Path) -> None:
+    host, compiled = run_leaves(tmp_path / "none", tmp_path / "host")
+    generic, _ = run_leaves(tmp_path / "none", tmp_path / "generic", NUMBA_CPU_NAME="generic")
+    within = shutil.ignore_patterns("*-within*")
+    shutil.copytree(tmp_path / "generic/trilat-net", tmp_path / "shipped", ignore=within)
+    assert compiled > 0
+    assert run_leaves(tmp_path / "shipped", tmp_path / "empty") == (host, 0)
+    assert generic == host
+    (tmp_path / "file").touch()  # no cache can be made there
+    assert run_leaves(tmp_path / "shipped", tmp_path / "file") == (host, 0)

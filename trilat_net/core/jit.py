@@ -1,9 +1,11 @@
+# mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """The one typed wrapper around Numba.
 
-Invariant: a leaf is compiled for float64 without reordering (no fastmath), so compiled and plain Python
+Invariants: a leaf is compiled for float64 without reordering (no fastmath), so compiled and plain Python
 runs give the same bits. Machine code is cached in the user's cache directory, in a folder named after a
 hash of all sources of the core: Numba alone notices a change of the file that holds a leaf, not of the
-leaves it calls.
+leaves it calls. A wheel brings such a folder with code for the generic processor of its platform, which is
+used where the user's has none for this processor. Nobody else's code is compiled or looked for otherwise.
 """
 
 import hashlib
@@ -11,12 +13,20 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
-from numba.core import event
-from numba.core.caching import FunctionCache
+from llvmlite.binding import parse_bitcode
+from numba.core import event, types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, compile_result
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 
 from ..process import let_signals_kill
 
@@ -58,14 +68,19 @@ def _writable_cache() -> Path | None:
 
 _config: Any = numba.config  # made at import from the environment; its stubs name no options
 _CACHE = None if _config.DISABLE_JIT else _writable_cache()
+_SHIPPED = Path(__file__).parent / "compiled" / _core_digest()
+_ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """True if the cache holds a whole tick of this version of the core, which is compiled last."""
-    return _CACHE is not None and next(_CACHE.rglob("kernel.site_tick-*.nbc"), None) is not None
+    """True if there is machine code of a whole tick of this version of the core, which is compiled last."""
+    folders = (folder for folder in (_CACHE, _SHIPPED if _ships else None) if folder is not None)
+    return any(next(folder.rglob("kernel.site_tick-*.nbc"), None) for folder in folders)
 
 
-COMPILING = "compiling, once for this machine and each number of joints ..."
+COMPILING = (
+    "compiling, once for this machine and each number of joints: half a minute, or minutes of a busy one ..."
+)
 
 
 class _CompilingNotice(event.Listener):
@@ -73,6 +88,7 @@ class _CompilingNotice(event.Listener):
 
     def __init__(self) -> None:
         self.said = False
+        self.say: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
         self._restore: list[Callable[[], None]] = []  # of compilations inside one another
 
     def on_start(self, begun: Any) -> None:
@@ -80,7 +96,7 @@ class _CompilingNotice(event.Listener):
         self._restore.append(let_signals_kill())
         if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(__package__):
             self.said = True
-            print(COMPILING, file=sys.stderr, flush=True)
+            self.say(COMPILING)
 
     def on_end(self, _: Any) -> None:
         """Says nothing."""
@@ -92,7 +108,7 @@ _register: Any = event.register
 _register("numba:compile", compiling_notice)
 
 
-def _mangle_record(record: numba.types.Record) -> tuple[str, tuple[str]]:
+def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
     """Names a record in the symbols of machine code by its fields.
 
     Numba numbers records in the order in which a process meets them. Leaves that two processes compiled for
@@ -101,11 +117,199 @@ def _mangle_record(record: numba.types.Record) -> tuple[str, tuple[str]]:
     return "Record", (f"r{hashlib.sha256(record.name.encode()).hexdigest()[:16]}",)
 
 
-_record: Any = numba.types.Record
+_record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
 """No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
+
+
+_WITHIN = "within"  # another leaf, compiled as a part of it
+
+
+class _Place:
+    """Where the machine code of a function is kept, as Numba asks for it; its source counts by content."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._line, self._py_file = function.__code__.co_firstlineno, Path(file)
+
+    from_function = classmethod(lambda cls, function, file: cls(function, file))
+
+    def get_cache_path(self) -> str:
+        return str((_CACHE or _SHIPPED) / self._py_file.parent.name)
+
+    def get_source_stamp(self) -> str:
+        return hashlib.sha256(self._py_file.read_bytes()).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    def ensure_cache_path(self) -> None:
+        Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
+
+
+class _Placed(CompileResultCacheImpl):
+    """How the machine code of a leaf is kept; of one within others it is what LLVM optimises later."""
+
+    _locator_classes = cast(Any, [_Place])
+
+    def rebuild(self, context: Any, kept: Any) -> Any:
+        """Returns what was compiled."""
+        name, kind, code = kept[0]
+        if kind != _WITHIN:
+            return super().rebuild(context, kept)
+        library = _LeafLibrary(context.codegen(), name)
+        library.within, library._finalized, library._final_module = True, True, parse_bitcode(code)
+        names = ("fndesc", "environment", "signature", "objectmode", "lifted", "type_annotation")
+        fields = dict(zip((*names, "reload_init", "referenced_envs"), kept[1:], strict=True))
+        contexts = {"target_context": context, "typing_context": context.typing_context}
+        return _within(compile_result(library=library, **contexts, **fields))
+
+
+class _CodeFiles(IndexDataCacheFile):
+    """The files of one function; Numba numbers them, and two processes may write other code into one."""
+
+    def save(self, key: Any, code: Any) -> None:
+        """Keeps code in a file that has its name of the key."""
+        names = self._load_index()
+        first, _, last = self._data_name(0).rpartition(".0.")
+        names[key] = f"{first}.{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}.{last}"
+        self._save_index(names)
+        self._save_data(names[key], code)
+
+
+class _LeafCache(FunctionCache):
+    """Machine code of a leaf: the user's, for this processor, else what came with the wheel."""
+
+    _impl_class = _Placed
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        place = Path(self._cache_path)
+        self._cache_file, self._shipped = self._files(place), self._files(_SHIPPED / place.name)
+        self._within = self._files(place, "-within")
+
+    def _files(self, folder: Path, kind: str = "") -> Any:
+        impl: Any = self._impl
+        return cast(Any, _CodeFiles)(str(folder), impl.filename_base + kind, impl.locator.get_source_stamp())
+
+    def _load_overload(self, signature: Any, context: Any) -> Any:
+        found = super()._load_overload(signature, context)
+        if found is None and _ships:
+            triple = context.codegen().magic_tuple()[0]
+            generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
+            kept = self._shipped.load(self._index_key(signature, generic))
+            found = None if kept is None else self._impl.rebuild(context, kept)
+        return found
+
+    def _save_overload(self, signature: Any, made: Any) -> None:
+        if _CACHE is not None:
+            super()._save_overload(signature, made)
+
+    def load_within(self, kinds: Any, context: Any) -> Any:
+        """Returns what other leaves have of this one; None: it is to be compiled."""
+        kept = self._within.load(self._index_key(kinds, context.codegen()))
+        return None if kept is None else self._impl.rebuild(context, kept)
+
+    def save_within(self, kinds: Any, made: Any) -> None:
+        """Keeps what other leaves have of this one."""
+        if _CACHE is not None:
+            self._impl.locator.ensure_cache_path()
+            self._within.save(self._index_key(kinds, made.codegen), self._impl.reduce(made))
+
+
+class _LeafLibrary(JITCodeLibrary):
+    """The code of a leaf; that of one within another is neither optimised nor made executable by itself.
+
+    It is optimised as a part of whatever calls it, once. Numba does so at every leaf between as well, and has
+    wrappers for calls from Python at each: half of the time to compile.
+    """
+
+    within = False
+
+    def serialize_using_object_code(self) -> tuple[str, str, Any]:
+        """Returns what is kept of it."""
+        if not self.within:
+            return super().serialize_using_object_code()
+        return self.name, _WITHIN, self._get_module_for_linking().as_bitcode()
+
+    def _optimize_final_module(self) -> None:
+        if not self.within:
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        if self.within:
+            self._finalized = True
+        else:
+            super()._finalize_final_module()
+
+
+def _within(made: Any) -> Any:
+    """Returns a leaf within others as they find it: by an object in place of what Python would call."""
+    made = made._replace(entry_point=object())
+    made.target_context.insert_user_function(made.entry_point, made.fndesc, [made.library])
+    return made
+
+
+class _LeafCompiler(Compiler):
+    """Compiles a leaf, within another one or for calls from Python."""
+
+    depth = 0
+
+    def compile_extra(self, function: Any) -> Any:
+        """Returns what Numba's own would."""
+        state, within = self.state, _LeafCompiler.depth > 0
+        state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
+        state.library.enable_object_caching()
+        state.library.within = within
+        if within:
+            state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
+        _LeafCompiler.depth += 1
+        try:
+            made = super().compile_extra(function)
+        finally:
+            _LeafCompiler.depth -= 1
+        if within:
+            return _within(made)
+        for environment in made._find_referenced_environments():  # of leaves within it
+            made.library.codegen.set_env(environment.env_name, environment)
+        return made
+
+
+class _Leaf(CPUDispatcher):
+    """A leaf, compiled anew for calls from Python where so far it was within others only."""
+
+    _cache: Any
+    _compiler: Any
+
+    def get_call_template(self, arguments: Any, named: Any) -> Any:
+        """Returns what a caller is to know: not one leaf for every constant that somebody passes."""
+        plain = {name: types.unliteral(one) for name, one in named.items()}
+        return super().get_call_template(tuple(map(types.unliteral, arguments)), plain)
+
+    def add_overload(self, made: Any) -> None:
+        """Takes in what was compiled; Python is not to call what is within a leaf."""
+        if getattr(made.library, "within", False):
+            self.overloads[tuple(made.signature.args)] = made
+        else:
+            super().add_overload(made)
+
+    def compile(self, signature: Any) -> Any:
+        """Returns what is to be called for arguments of these types."""
+        with global_compiler_lock:
+            kinds, result = normalize_signature(signature)
+            known: Any = self.overloads.get(kinds)
+            if _LeafCompiler.depth == 0:
+                if known is not None and getattr(known.library, "within", False):
+                    del self.overloads[kinds]
+                return super().compile(signature)
+            known = known or self._cache.load_within(kinds, self.targetctx)
+            if known is None:
+                with event.trigger_event("numba:compile", data={"dispatcher": self, "args": kinds}):
+                    known = self._compiler.compile(kinds, result)
+                self._cache.save_within(kinds, known)
+            self.add_overload(known)
+            return known.entry_point
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
@@ -116,24 +320,17 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
     return cast(Callable[P, R], compiled.compile(tuple(map(numba.typeof, arguments))))
 
 
-def _at_cache(make: Callable[[], R]) -> R:
-    """Makes something of Numba's whose machine code is kept in the directory for compiled leaves."""
-    before = _config.CACHE_DIR
-    _config.CACHE_DIR = str(_CACHE)
-    try:
-        return make()
-    finally:
-        _config.CACHE_DIR = before
-
-
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
-    if _CACHE is None:
-        return cast(Callable[P, R], numba.njit(**_OPTIONS)(function))
-    return _at_cache(lambda: cast(Callable[P, R], numba.njit(cache=True, **_OPTIONS)(function)))
+    if _config.DISABLE_JIT:
+        return function
+    options = {"nopython": True, "boundscheck": None, **_OPTIONS}
+    made = cast(Any, _Leaf)(function, targetoptions=options, pipeline_class=_LeafCompiler)
+    made._cache = cast(Any, _LeafCache)(function)
+    return cast(Callable[P, R], made)
 
 
-class _NamedCache(FunctionCache):
+class _NamedCache(_LeafCache):
     """Machine code of a function whose name tells all that it is made of, what it closes over too."""
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
@@ -147,7 +344,6 @@ def compile_named(function: Callable[..., None], name: str, signature: Any, **op
     """
     function.__qualname__ = name
     dispatcher = numba.njit(**options)(function)
-    if _CACHE is not None:
-        dispatcher._cache = _at_cache(lambda: cast(Any, _NamedCache)(function))
+    dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)
     return dispatcher
