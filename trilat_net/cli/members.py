@@ -166,7 +166,7 @@ def record_command(
     """
     from recorder.record_process import record_session
 
-    from ..files import refuse_existing
+    from ..files import refuse_existing, require_libraries
     from ..log.log_layout import find_parts, parse_channel_filter
     from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
@@ -175,6 +175,8 @@ def record_command(
 
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
+    if concluded:
+        require_libraries()
     path = _choose_path(output, session, concluded=concluded)
     place = LogStorage(
         path,
