@@ -67,13 +67,14 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 def _find_turns(turn: Array, reference: Array) -> Array:
-    """Returns the turns from orientations to others, all as rotation vectors, by the product of quaternions."""
+    """Returns the turns from references to orientations, all as rotation vectors, by their quaternions."""
     (a, u), (b, v) = map(_make_quaternions, (turn, reference))
     w, p = a * b + np.sum(u * v, axis=1, keepdims=True), b * u - a * v - np.cross(u, v)
     p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
     sine = np.linalg.norm(p, axis=1, keepdims=True)
     by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
-    return by_sine * p
+    turns: Array = by_sine * p
+    return turns
 
 
 def _make_quaternions(turns: Array) -> tuple[Array, Array]:

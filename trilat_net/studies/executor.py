@@ -17,8 +17,8 @@ from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from ..errors import RunFailed, UsageError
-from ..net.clock import SystemClock
 from ..files import require_libraries
+from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
 from ..scenario.imported_law import LawConsents, allowed_laws
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
