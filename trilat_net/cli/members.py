@@ -166,7 +166,7 @@ def record_command(
     """
     from recorder.record_process import record_session
 
-    from ..files import refuse_existing, require_libraries
+    from ..files import refuse_existing
     from ..log.log_layout import find_parts, parse_channel_filter
     from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
@@ -175,8 +175,6 @@ def record_command(
 
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
-    if concluded:
-        require_libraries()
     path = _choose_path(output, session, concluded=concluded)
     place = LogStorage(
         path,
@@ -207,10 +205,11 @@ def record_command(
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     """Returns where the log goes; the folder of a log with a report is made."""
-    from ..files import make_folder, make_results_folder
+    from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")
+    require_libraries()
     if output is None:
         return make_results_folder(None, session, force=False) / "run.mcap"
     make_folder(output.parent)

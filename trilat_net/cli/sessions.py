@@ -41,7 +41,7 @@ def run_and_report(
 
     from ..files import make_results_folder, require_libraries
 
-    require_libraries()  # before arms move
+    require_libraries()
     results = make_results_folder(run.folder, chosen.name, force=run.force)
     with terminal.lines_aside(run.as_json):
         terminal.print_text(chosen.title or chosen.name)

@@ -73,8 +73,7 @@ def _find_turns(turn: Array, reference: Array) -> Array:
     p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
     sine = np.linalg.norm(p, axis=1, keepdims=True)
     by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
-    turns: Array = by_sine * p
-    return turns
+    return np.asarray(by_sine * p)
 
 
 def _make_quaternions(turns: Array) -> tuple[Array, Array]:
