@@ -22,6 +22,7 @@ import numpy as np
 
 from trilat_net.core.vectors import Array
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
+from trilat_net.files import require_libraries
 from trilat_net.net import topics
 from trilat_net.net.access_rules import ROLES, ROUTER
 from trilat_net.net.bus import Bus, StampedInbox
@@ -38,7 +39,6 @@ from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
-from trilat_net.theory.linear_analysis import analyse_linear_loop
 
 SESSION = "benchmark"
 NEAR, FAR = "near", "far"
@@ -238,8 +238,11 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
     rates = [site.rate_hz for site in scenario.sites.values()]
     instead = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
     try:
+        require_libraries("scipy")
+        from trilat_net.theory.linear_analysis import analyse_linear_loop  # SciPy: no need of a far end
+
         found = analyse_linear_loop(load_scenario(scenario, instead))
-    except (ScenarioError, RunFailed) as error:
+    except (ScenarioError, RunFailed, UsageError) as error:
         theory: tuple[Any, ...] = (None, None, f"theory does not know its delay margin: {error}")
     else:
         stable = [[1e3 * one.low_s, 1e3 * one.high_s] for one in found.margin.intervals]

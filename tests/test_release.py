@@ -8,14 +8,17 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from importlib.metadata import entry_points
+from importlib.metadata import Distribution, distribution, entry_points
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 from tests.cli.running import parses
+from trilat_net.files import STUDY_LIBRARIES
+from trilat_net.net.connection import find_free_endpoints
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -131,62 +134,116 @@ def run(*words: object, cwd: Path, **more: str) -> str:
     return done.stdout + done.stderr
 
 
+CORE, WHOLE = "trilat-net-core", "trilat-net"
+
+
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The sdist of what git tracks, and the wheel that is made of that sdist."""
-    folder = tmp_path_factory.mktemp("built")
-    source = folder / "source"
-    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True).stdout
-    for name in filter(None, tracked.decode().split("\0")):
-        (source / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, source / name)
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of what each distribution is built from."""
+    folder = tmp_path_factory.mktemp("sources")
+    run(sys.executable, ROOT / ".ci" / "distributions", folder / "made", cwd=folder)
+    return folder / "made"
+
+
+@pytest.fixture(scope="module")
+def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
+    """By distribution its sdist, and the wheel that is made of that sdist."""
     build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
-    run(sys.executable, "-c", build, "build_sdist", folder, cwd=source)
-    (sdist,) = folder.glob("*.tar.gz")
-    with tarfile.open(sdist) as archive:
-        archive.extractall(folder / "unpacked", filter="data")
-    (unpacked,) = (folder / "unpacked").iterdir()
-    run(sys.executable, "-c", build, "build_wheel", folder, cwd=unpacked)
-    (wheel,) = folder.glob("*.whl")
-    return [sdist, wheel]
+    made = {}
+    for name in (CORE, WHOLE):
+        folder = tmp_path_factory.mktemp("built")
+        run(sys.executable, "-c", build, "build_sdist", folder, cwd=sources / name)
+        (sdist,) = folder.glob("*.tar.gz")
+        with tarfile.open(sdist) as archive:
+            archive.extractall(folder / "unpacked", filter="data")
+        (unpacked,) = (folder / "unpacked").iterdir()
+        run(sys.executable, "-c", build, "build_wheel", folder, cwd=unpacked)
+        made[name] = [sdist, *folder.glob("*.whl")]
+    return made
 
 
+def test_both_distributions_are_one_program_of_one_version(sources: Path) -> None:
+    """One has every file, the other the remaining libraries; nothing is installed twice."""
+    core, whole = (
+        tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        for name in (CORE, WHOLE)
+    )
+    assert (core["name"], core["version"], whole["name"], whole["version"]) == (CORE, VERSION, WHOLE, VERSION)
+    first, *added = whole["dependencies"]
+    assert first == f"{CORE}=={VERSION}"
+    assert names_of(added) == set(STUDY_LIBRARIES)
+    assert sorted([*core["dependencies"], *added]) == sorted(PROJECT["project"]["dependencies"])
+    assert {**core["scripts"], **whole["scripts"]} == PROJECT["project"]["scripts"]
+    assert not core["scripts"].keys() & whole["scripts"].keys()
+    assert whole["optional-dependencies"] == PROJECT["project"]["optional-dependencies"]
+    assert {path.name for path in (sources / WHOLE).iterdir()} == {"pyproject.toml", "README.md", "LICENSE"}
+
+
+def needed(names: set[str]) -> dict[str, Distribution]:
+    """These distributions of this environment, and all that they need."""
+    found: dict[str, Distribution] = {}
+    left = set(names)
+    while left:
+        one = found[name] = distribution(name := left.pop())
+        stated = map(Requirement, one.requires or [])
+        left |= {r.name for r in stated if not r.marker or r.marker.evaluate({"extra": ""})} - found.keys()
+    return found
+
+
+def install(clean: Path, wheel: Path, libraries: set[str]) -> Path:
+    """Installs a wheel into an environment, and libraries from this one; returns its `site-packages`."""
+    onto = ["-m", "pip", "--python", clean / "bin" / "python", "install", "--no-deps", "--no-index", wheel]
+    run(sys.executable, *onto, cwd=clean)
+    (packages,) = (clean / "lib").glob("python3*/site-packages")
+    for one in needed(libraries).values():
+        for top in {file.parts[0] for file in one.files or [] if file.parts[0] not in ("..", "__pycache__")}:
+            (packages / top).exists() or (packages / top).symlink_to(one.locate_file(top))
+    return packages
+
+
+@pytest.mark.live
 @pytest.mark.long
-def test_the_wheel_of_the_sdist_is_whole_and_its_first_command_runs(
-    built: list[Path], tmp_path: Path
-) -> None:
-    """Without a network: what the program needs is of this environment, the program the wheel's alone."""
-    wheel = built[1]
-    with zipfile.ZipFile(wheel) as archive:
+def test_a_robot_runs_trilat_net_core_alone(built: dict[str, list[Path]], tmp_path: Path) -> None:
+    """Without a network: libraries are of this environment, the program is the wheel's; then both wheels'."""
+    with zipfile.ZipFile(built[CORE][1]) as archive:
         names = set(archive.namelist())
     packages = ("trilat_net", "sites", "recorder", "live")
     code = {str(one.relative_to(ROOT)) for name in packages for one in (ROOT / name).rglob("*.py")}
     assert code <= names
     assert {name.split("/")[0] for name in names if "." not in name.split("/")[0]} == set(packages)
-    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "clean", cwd=tmp_path)
-    clean = tmp_path / "clean" / "bin"
-    install = ["-m", "pip", "--python", clean / "python", "install", "--no-deps", "--no-index", wheel]
-    run(sys.executable, *install, cwd=tmp_path)
-    (packages_of,) = (tmp_path / "clean" / "lib").glob("python3*/site-packages")
-    own = next(Path(path) for path in sys.path if path.endswith("site-packages"))
-    for entry in own.iterdir():  # all that is installed here but the program
-        if "trilat" not in entry.name and entry.suffix != ".pth":
-            (packages_of / entry.name).exists() or (packages_of / entry.name).symlink_to(entry)
-    where = run(clean / "python", "-c", "import trilat_net; print(trilat_net.__file__)", cwd=tmp_path)
-    assert where.startswith(str(packages_of))
+    clean = tmp_path / "clean"
+    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
+    stated = names_of(PROJECT["project"]["dependencies"])
+    where = install(clean, built[CORE][1], stated - set(STUDY_LIBRARIES))
+    heavy = "matplotlib", "scipy", "loky", "pandas", "polars", "pydantic"
+    assert not [name for name in heavy if (where / name).exists()]
+    trilat = clean / "bin" / "trilat"
+    run(trilat, "keys", "new", "keys", "m", "s", "recorder", cwd=tmp_path)
+    run(trilat, "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)  # compiles
+    ends = find_free_endpoints(3)
+    ways = [["--listen", own, *(f"--connect={one}" for one in ends[:n])] for n, own in enumerate(ends)]
+    members = [["site", name, "--scenario", "two_sites", "--set", "duration_s=2"] for name in ("m", "s")]
+    members.append(["record", "-o", "run.mcap"])
+    started = [
+        subprocess.Popen([trilat, *words, "--session", "t", "--keys", f"keys/{name}", *way], cwd=tmp_path)
+        for words, way, name in zip(members, ways, ("m", "s", "recorder"), strict=True)
+    ]
+    assert [process.wait(timeout=120) for process in started] == [0, 0, 0]
+    assert "4000/4000 records identical" in run(trilat, "verify", "run.mcap", cwd=tmp_path)
+    install(clean, built[WHOLE][1], stated)
     for name in PROJECT["project"]["scripts"]:
-        assert run(clean / name, "--version", cwd=tmp_path) == f"trilat-net {VERSION}\n"
-    run(clean / "trilat-net", "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)
-    assert "2000/2000 records identical" in run(clean / "trilat", "verify", "first.mcap", cwd=tmp_path)
+        assert run(clean / "bin" / name, "--version", cwd=tmp_path) == f"trilat-net {VERSION}\n"
+    run(clean / "bin" / "trilat-net", "report", "run.mcap", "-o", "report", cwd=tmp_path)
+    assert (tmp_path / "report" / "report.html").is_file()
 
 
 @pytest.mark.long
-def test_the_packagers_find_nothing(built: list[Path]) -> None:
+def test_the_packagers_find_nothing(built: dict[str, list[Path]]) -> None:
     tools = {name: shutil.which(name) for name in ("check-wheel-contents", "twine")}
     if missing := [name for name, path in tools.items() if path is None]:
         pytest.skip(f"there is no {', '.join(missing)} here; the release workflow has them")
-    run(tools["check-wheel-contents"], built[1], cwd=ROOT)
-    run(tools["twine"], "check", "--strict", *built, cwd=ROOT)
+    run(tools["check-wheel-contents"], built[CORE][1], cwd=ROOT)
+    run(tools["twine"], "check", "--strict", *built[CORE], *built[WHOLE], cwd=ROOT)
 
 
 def test_to_import_the_package_imports_none_of_what_takes_time() -> None:

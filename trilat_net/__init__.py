@@ -96,9 +96,9 @@ __all__ = sorted(["__version__", *_MODULES])
 def __getattr__(name: str) -> _Any:
     """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
     if name == "__version__":
-        from importlib.metadata import version
+        from .files import find_version
 
-        return version("trilat-net")
+        return find_version()
     if name in _MODULES:
         return getattr(_import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,8 +1,8 @@
 """Output files and folders: refused where something exists, replaced only by force, written whole.
 
 Invariant: nothing that exists is replaced unless the caller forces it, and an output bears its name only once
-it is complete. An optional package is imported where it is used; if it is missing, the error names the pip
-extra that installs it.
+it is complete. An optional package is imported where it is used; if it is missing, the error names what
+installs it.
 """
 
 import errno
@@ -15,13 +15,29 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from importlib import import_module
+from importlib import import_module, metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from .errors import LogRefused, UsageError
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+
+
+STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
+"""What `trilat-net` installs, and `trilat-net-core` does without (pyproject.toml)."""
+
+
+def require_libraries(*names: str) -> None:
+    """Refuses what needs these libraries, or all of `STUDY_LIBRARIES`, before any of it is done.
+
+    Raises:
+        UsageError: one of them is not installed.
+    """
+    if missing := [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]:
+        text = f"this needs {', '.join(missing)}, which trilat-net-core does without"
+        raise UsageError(f"{text}: pip install trilat-net")
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
@@ -35,6 +51,14 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     except ImportError:
         package = module.partition(".")[0]
         raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{extra}]'") from None
+
+
+def find_version() -> str:
+    """Returns the version of this program, whichever of its distributions has its files."""
+    for name in ("trilat-net-core", "trilat-net"):
+        with suppress(metadata.PackageNotFoundError):
+            return metadata.version(name)
+    return "unknown"
 
 
 def find_page(name: str) -> Path:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pandas
 
+from .files import import_extra
+
 _REPR_LENGTH = 200
 
 
@@ -32,10 +34,12 @@ class Result:
         return str(_texts().summarize(self))
 
     def to_frame(self) -> "pandas.DataFrame":
-        """Returns a pandas data frame."""
-        from pandas import DataFrame
+        """Returns a pandas data frame.
 
-        return DataFrame(list(self.to_rows()))
+        Raises:
+            UsageError: pandas is not installed.
+        """
+        return import_extra("pandas", "frames", "data frames").DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
         """Returns the result in one line."""

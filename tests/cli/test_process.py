@@ -13,6 +13,7 @@ import pytest
 from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
 from trilat_net import __main__, cli
+from trilat_net.files import STUDY_LIBRARIES
 from trilat_net.scenario.scenario_reader import read_template
 
 from .running import PLAIN, started, trilat
@@ -140,6 +141,66 @@ def test_a_closed_pipe_and_a_bad_name_with_the_functions_of_windows_replaced(
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == code
+
+
+ALONE = """
+import sys
+from importlib import import_module
+from pkgutil import walk_packages
+for name in {blocked!r}:
+    sys.modules[name] = None
+from trilat_net.cli import main
+for top in {rooms!r}:
+    for found in walk_packages(import_module(top).__path__, top + "."):
+        import_module(found.name)
+for arguments in {commands!r}:
+    sys.argv = ["trilat", *arguments]
+    try:
+        main()
+    except SystemExit as end:
+        print("ended with", end.code or 0, *arguments)
+"""
+ROOMS = ("analysis", "cli", "core", "execution", "laws", "log", "net", "scenario")
+NEED_STUDIES = (
+    ("certify", "run.mcap"),
+    ("report", "run.mcap"),
+    ("figure", "run.mcap"),
+    ("demo", "two_sites"),
+    ("record", "--session", "x", "--conclude"),
+    ("test", "two_sites", "--jobs", "1"),
+    ("linear", "two_sites"),
+)
+
+
+def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
+    """All that it runs is imported without them; what needs one is refused before anything is done."""
+    alone = [
+        ("--help",),
+        ("keys", "new", "keys", "m", "s"),
+        ("sim", "two_sites", "--duration", "0.2", "-o", "run.mcap"),
+        ("verify", "run.mcap"),
+        ("metrics", "run.mcap"),
+        ("log", "check", "run.mcap"),
+    ]
+    program = ALONE.format(
+        blocked=[*STUDY_LIBRARIES, "pandas", "polars"],
+        rooms=["sites", "recorder", "live", *(f"trilat_net.{room}" for room in ROOMS)],
+        commands=[*alone, *NEED_STUDIES],
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=PLAIN, capture_output=True, text=True
+    )
+    ended = [line for line in done.stdout.splitlines() if line.startswith("ended with")]
+    assert ended == [
+        *(f"ended with 0 {' '.join(words)}" for words in alone),
+        *(f"ended with 2 {' '.join(words)}" for words in NEED_STUDIES),
+    ], done.stderr
+    refused = done.stderr.splitlines()
+    assert len(refused) == len(NEED_STUDIES), done.stderr
+    assert all(
+        line.endswith("which trilat-net-core does without: pip install trilat-net") for line in refused
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"keys", "run.mcap"}
 
 
 def test_help_imports_nothing_heavy(tmp_path: Path) -> None:

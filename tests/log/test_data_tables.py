@@ -2,7 +2,9 @@
 
 import re
 import sys
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -184,10 +186,20 @@ def test_a_frame_is_its_table(name: str, kind: str) -> None:
         assert frame[column.name].to_list() == column.rows(0, len(table))
 
 
-def test_without_polars_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "polars", None)
-    with pytest.raises(UsageError, match=r"data frames need polars: pip install 'trilat-net\[frames\]'"):
-        opened(recorded("paper")).frame("m1")
+@pytest.mark.parametrize(
+    ("library", "frame"),
+    [
+        ("polars", lambda log: log.frame("m1")),
+        ("pandas", lambda log: log.to_frame("m1")),
+        ("pandas", lambda log: log.to_frame()),
+    ],
+)
+def test_without_a_library_of_frames_one_is_told_what_to_install(
+    library: str, frame: Callable[[Log], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(UsageError, match=rf"data frames need {library}: pip install 'trilat-net\[frames\]'"):
+        frame(opened(recorded("paper")))
 
 
 ENDINGS = {"us": "us", "ns": "ns", "ppb": "ns/s", "bytes": "byte"}

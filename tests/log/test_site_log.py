@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from trilat_net.core.site_setup import Layout
 from trilat_net.log import site_log
-from trilat_net.log.site_log import LazyRecords, RecordsByTick
+from trilat_net.log.site_log import LazyRecords, RecordsByTick, find_task_errors
 from trilat_net.net.messages import State
 
 STATE_VECTORS = Layout().lengths()
@@ -81,3 +82,18 @@ def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
     assert [by_tick.get(tick) for tick in range(-1, 22)] == [
         {s.tick: s for s in states}.get(tick) for tick in range(-1, 22)
     ]
+
+
+def test_errors_of_orientations_are_turns_as_scipy_has_them() -> None:
+    rng = np.random.default_rng(5)
+    x, x_des = rng.normal(size=(2, 400, 6))
+    x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(size=(100, 3))
+    x_des[100:110, 3:], x[110:120, 3:] = x[100:110, 3:], 0.0
+    x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)  # half a turn
+    there, here = (Rotation.from_rotvec(one[:, 3:]) for one in (x_des, x))
+    e = find_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+    assert np.abs(e[:, 3:] - (here * there.inv()).as_rotvec()).max() <= 1e-14
+    assert not e[100:110, 3:].any()
+    assert np.array_equal(e[:, :2], x[:, :2] - x_des[:, :2])
+    assert not e[:, 2].any()
+    assert find_task_errors(x[:0], x_des[:0], [1.0] * 6).shape == (0, 6)

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from ..errors import LogRefused, TrilatError
-from ..files import DISK_ERRNOS
+from ..files import DISK_ERRNOS, STUDY_LIBRARIES, find_version, require_libraries
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
 from . import options, sessions
@@ -60,9 +60,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
-
-        print_line(f"trilat-net {version('trilat-net')}")
+        print_line(f"trilat-net {find_version()}")
         raise typer.Exit
 
 
@@ -125,11 +123,21 @@ _WITHOUT_MEMORY = ("failed to map segment", "libllvmlite", "start new thread", "
 """What Python, Numba and threads say who get none."""
 
 
+def _run() -> None:
+    """Runs `trilat`; a library that `trilat-net-core` does without, and that is missing, is named."""
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        if (name := (error.name or "").partition(".")[0]) in STUDY_LIBRARIES:
+            require_libraries(name)
+        raise
+
+
 def main() -> None:
     """Runs `trilat`; errors become one sentence and an exit code."""
     TrilatError.in_command = True
     try:
-        app()
+        _run()
     except TrilatError as error:
         print_error(error)
         sys.exit(error.exit_code)

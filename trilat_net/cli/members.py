@@ -205,10 +205,11 @@ def record_command(
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
     """Returns where the log goes; the folder of a log with a report is made."""
-    from ..files import make_folder, make_results_folder
+    from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")
+    require_libraries()
     if output is None:
         return make_results_folder(None, session, force=False) / "run.mcap"
     make_folder(output.parent)

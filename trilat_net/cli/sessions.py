@@ -39,8 +39,9 @@ def run_and_report(
     """Runs a scenario live, then verifies and reports; what `attend` yields may end it as planned."""
     from sites.demo_session import run_demo
 
-    from ..files import make_results_folder
+    from ..files import make_results_folder, require_libraries
 
+    require_libraries()
     results = make_results_folder(run.folder, chosen.name, force=run.force)
     with terminal.lines_aside(run.as_json):
         terminal.print_text(chosen.title or chosen.name)

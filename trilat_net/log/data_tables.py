@@ -366,11 +366,13 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
 
 
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers."""
-    from pandas import DataFrame
+    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers.
 
-    columns = table.columns
-    return DataFrame({c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in columns})
+    Raises:
+        UsageError: pandas is not installed.
+    """
+    columns = {c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in table.columns}
+    return import_extra("pandas", "frames", "data frames").DataFrame(columns)
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":

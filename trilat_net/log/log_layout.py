@@ -18,6 +18,7 @@ import msgspec
 
 from ..core.fingerprint import compute_fingerprint
 from ..errors import UsageError
+from ..files import find_version
 from ..net import topics
 from ..net.bus import matches_key
 from ..net.messages import Event, LinkStats, RecorderStats, State
@@ -101,7 +102,7 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
     return ChannelFilter(*(tuple(text.strip("/") for text in texts) for texts in (include, exclude)))
 
 
-_PACKAGES = ("trilat-net", "numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
+_PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
 
 
 def _git(*arguments: str) -> str | None:
@@ -128,6 +129,7 @@ def collect_provenance() -> dict[str, str]:
         "fingerprint": compute_fingerprint(),
         "platform": f"{platform.system()} {platform.machine()}",
         "python": f"{platform.python_implementation()} {platform.python_version()}",
+        "version_trilat-net": find_version(),
     }
     for package in _PACKAGES:
         try:

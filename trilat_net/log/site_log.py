@@ -60,13 +60,25 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
     """
     e: Array = x - x_des
-    if e.shape[1] > _PLACE and len(e):
-        from scipy.spatial.transform import Rotation  # a fifth of a second, which few logs need
-
-        here, there = (Rotation.from_rotvec(v[:, _PLACE:].copy()) for v in (x, x_des))
-        e[:, _PLACE:] = (here * there.inv()).as_rotvec()
+    if e.shape[1] > _PLACE:
+        e[:, _PLACE:] = _find_turns(x[:, _PLACE:], x_des[:, _PLACE:])
     e *= np.array(axes)
     return e
+
+
+def _find_turns(turn: Array, reference: Array) -> Array:
+    """Returns the turns from references to orientations, all as rotation vectors, by their quaternions."""
+    (a, u), (b, v) = map(_make_quaternions, (turn, reference))
+    w, p = a * b + np.sum(u * v, axis=1, keepdims=True), b * u - a * v - np.cross(u, v)
+    p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
+    sine = np.linalg.norm(p, axis=1, keepdims=True)
+    by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
+    return np.asarray(by_sine * p)
+
+
+def _make_quaternions(turns: Array) -> tuple[Array, Array]:
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
 
 
 class LazyRecords(Sequence[State]):

@@ -17,6 +17,7 @@ from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from ..errors import RunFailed, UsageError
+from ..files import require_libraries
 from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
 from ..scenario.imported_law import LawConsents, allowed_laws
@@ -271,8 +272,9 @@ def open_worker_pool(
         hint: what a message about a lost worker recommends.
 
     Raises:
-        UsageError: the cluster cannot be reached, or one of its workers is not fit.
+        UsageError: the cluster cannot be reached, one of its workers is not fit, or a library is missing.
     """
+    require_libraries()
     with ExitStack() as stack:
         if isinstance(on, str):
             cluster = stack.enter_context(DaskCluster(on))
