@@ -18,9 +18,9 @@ from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
 from trilat_net.net.messages import Event
-from trilat_net.reporting.palette import order_palette
+from trilat_net.reporting.appearance import order_palette
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .session_view import SessionView, SiteView, Tail
 

@@ -35,7 +35,7 @@ from trilat_net.scenario import (
     parse_embedded,
     scheduled_link_tables,
 )
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""

@@ -35,9 +35,8 @@ from trilat_net.net.connection import (
     resolve_member_connection,
     secure_connection,
 )
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
-from trilat_net.net.timing import SiteTiming
+from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario

@@ -16,7 +16,7 @@ from trilat_net.net.bus import Inbox
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import decode
 from trilat_net.scenario.arms import ArmModel
-from trilat_net.scenario.operators import LiveHand
+from trilat_net.scenario.operators.kernel_operators import LiveHand
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""

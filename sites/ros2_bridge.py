@@ -44,7 +44,7 @@ from trilat_net.net.ros2_graph import (
 )
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.scenario import Scenario, parse_embedded
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
 
 from .running_session import RunningSession, open_hand

@@ -33,7 +33,7 @@ from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.arms import ArmModel
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .session_ping import PingReport, ping_session
 

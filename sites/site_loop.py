@@ -19,9 +19,8 @@ from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRec
 from trilat_net.errors import WireError
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import PeerSample
-from trilat_net.net.timing import LinkTimingMonitor, SiteTiming
+from trilat_net.net.timing import LinkTimingMonitor, LoopStats, SiteTiming
 from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
 
 if TYPE_CHECKING:

@@ -23,15 +23,15 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, OffsetLimit
+from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, to_core_change
 from trilat_net.scenario.imported_law import ImportedLaw
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder
 

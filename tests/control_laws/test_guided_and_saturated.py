@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
-from trilat_net.core.hyperbolic import tanh
+from trilat_net.core.elementary import tanh
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario

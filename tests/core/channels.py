@@ -12,7 +12,7 @@ from trilat_net.core.delay import LINK_MODEL_DTYPE, LinkModel
 from trilat_net.core.link import link_dtype
 from trilat_net.core.philox import link_key
 from trilat_net.core.vectors import Points
-from trilat_net.scenario.delay_models.interface import LinkBase
+from trilat_net.scenario.delay_models import LinkBase
 
 Ints = NDArray[np.int64]
 SEEDS = (1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3, 20_240_229, 2**63 - 1)))

@@ -11,7 +11,7 @@ from tests.core.channels import SEEDS, Ints, channel, due, stamps
 from tests.core.compiled import printed
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.channel import LOST
-from trilat_net.scenario.delay_models.interface import LinkBase
+from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, GammaDelay, NoDelay, UniformDelay
 
 COUNT = 1_000_000

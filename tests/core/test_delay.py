@@ -13,7 +13,7 @@ from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
 from tests.core.philox_reference import philox_in_integers
 from trilat_net.core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd, clamp_delay_us, trace_delay_us
 from trilat_net.core.philox import link_key
-from trilat_net.scenario.delay_models.interface import LinkBase
+from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
     CorrelatedDelay,
     GammaDelay,

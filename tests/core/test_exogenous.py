@@ -18,7 +18,7 @@ from trilat_net.core.exogenous import (
     torque_on_arm,
     torque_source_rows,
 )
-from trilat_net.scenario.operators.interface import OwnActor
+from trilat_net.scenario.operators import OwnActor
 from trilat_net.scenario.operators.kernel_operators import Multisine
 
 LENGTHS = np.array([1.0, 0.9])

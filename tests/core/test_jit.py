@@ -73,10 +73,11 @@ class Count(event.Listener):
     def on_end(self, _): pass
 
 event.register("numba:compile", count := Count())
-from trilat_net.core import hyperbolic, philox, sincos
+from trilat_net.core import elementary, philox
 for k in range(50):
     print(*(float(one).hex() for one in (
-        philox.standard_gamma(np.uint64(5), k, 3, 1.5 + k), *sincos.sincos(0.3 * k), hyperbolic.tanh(0.1 * k)
+        philox.standard_gamma(np.uint64(5), k, 3, 1.5 + k),
+        *elementary.sincos(0.3 * k), elementary.tanh(0.1 * k),
     )))
 print(count.number)
 """

@@ -16,7 +16,7 @@ from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 SECONDS = 1.2
 

@@ -16,7 +16,7 @@ from tests.cli.running import COMMAND, PLAIN
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import list_shipped, load_scenario
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
 from .page_client import PageClient, page_client

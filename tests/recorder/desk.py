@@ -18,10 +18,10 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.membership import Epoch, EventPublisher, read_events
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.requests import Backfill, BackfillRequest
+from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
 

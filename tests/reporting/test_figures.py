@@ -12,6 +12,7 @@ from trilat_net.analysis import site_signals
 from trilat_net.analysis.timeline import find_mode_intervals
 from trilat_net.errors import UsageError
 from trilat_net.reporting import style
+from trilat_net.reporting.appearance import SITE_COLOURS, list_site_colours
 from trilat_net.reporting.figures import (
     age_and_lateness,
     arm_poses,
@@ -19,7 +20,6 @@ from trilat_net.reporting.figures import (
     registry,
     run_overview,
 )
-from trilat_net.reporting.palette import SITE_COLOURS, list_site_colours
 from trilat_net.scenario import load_scenario, parse_scenario
 
 BACKGROUND = 0.6

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.theory.analysed_ports import section_of
-from trilat_net.reporting.figure_size import REPORT_SIZE, FigureSize, make_print_size
+from trilat_net.reporting.appearance import REPORT_SIZE, FigureSize, make_print_size
 from trilat_net.reporting.figures.linear_figures import draw_port_impedance, draw_port_passivity
 
 

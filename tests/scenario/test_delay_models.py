@@ -14,8 +14,7 @@ from trilat_net.core.channel import LOST
 from trilat_net.core.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.delay_models import DELAY_MODELS
-from trilat_net.scenario.delay_models.interface import LinkBase
+from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase
 
 
 def link(keys: dict[str, Any]) -> LinkBase:

@@ -14,16 +14,15 @@ from tests.dropped_files import look, put_beside
 from trilat_net.core.exogenous import torque_on_arm, torque_source_rows
 from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.scenario.delay_models.low_orbit import LowOrbit
-from trilat_net.scenario.operators import ENVIRONMENTS, OPERATORS
+from trilat_net.scenario.operators import ENVIRONMENTS, OPERATORS, OwnActor
 from trilat_net.scenario.operators.hunt_crossley import HuntCrossley
-from trilat_net.scenario.operators.interface import OwnActor
 
 OPERATOR = """
 import numpy as np
 
 from trilat_net import fields
-from trilat_net.core.sincos import sincos
-from trilat_net.scenario.operators.interface import OwnActor
+from trilat_net.core.elementary import sincos
+from trilat_net.scenario.operators import OwnActor
 
 
 class Tremor(OwnActor, frozen=True, kw_only=True, tag="tremor"):
@@ -44,7 +43,7 @@ class Tremor(OwnActor, frozen=True, kw_only=True, tag="tremor"):
 """
 DELAY = """
 from trilat_net.core.delay import draw_pair
-from trilat_net.scenario.delay_models.interface import Milliseconds, OwnDelay
+from trilat_net.scenario.delay_models import Milliseconds, OwnDelay
 
 
 class TwoPaths(OwnDelay, frozen=True, kw_only=True, tag="two_paths"):

@@ -23,7 +23,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.operators import find_live_hand
+from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .relay import RelayClock
 from .sessions import SESSION, Session

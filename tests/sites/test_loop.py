@@ -16,9 +16,8 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import LinkStats, PeerSample, State
-from trilat_net.net.timing import SiteTiming
+from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.wire import decode
 from trilat_net.scenario import load_scenario
 

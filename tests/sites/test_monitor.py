@@ -13,8 +13,8 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import TickInput
 from trilat_net.net import topics
-from trilat_net.net.loop_stats import LoopStats
 from trilat_net.net.messages import Event
+from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import encode
 from trilat_net.reporting.terminal_output import TextConsole
 from trilat_net.scenario import load_scenario

@@ -16,7 +16,7 @@ from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..scenario import find_owner
-from ..scenario.delay_models.interface import LinkBase
+from ..scenario.delay_models import LinkBase
 from ..scenario.scenario_types import Change
 
 FOLLOWING_MODES = ("run", "diverged")

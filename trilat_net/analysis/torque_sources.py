@@ -13,7 +13,7 @@ import numpy as np
 from ..core.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.vectors import Array
 from ..scenario import Scenario, SiteSpec
-from ..scenario.operators.interface import ActorBase
+from ..scenario.operators import ActorBase
 from .aligned import AlignedRecords
 from .arm_rows import EndEffectorRows, build_arm_rows
 

@@ -355,8 +355,8 @@ def bench_command(
     from ..studies.bench import plan_bench, prepare_bench_folder
     from ..studies.bench.bench_figures import write_bench
     from ..studies.bench.bench_plan import find_stale
-    from ..studies.commands import format_command
     from ..studies.executor import check_workers
+    from ..studies.study_folder import format_command
 
     check_workers(jobs, on)
     chosen = "small" if small else study

@@ -47,7 +47,7 @@ def _check_modes(given: Sequence[str]) -> Sequence[str]:
 def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
-    from ..reporting.figure_size import COLUMN_IN, make_print_size
+    from ..reporting.appearance import COLUMN_IN, make_print_size
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map, build_sweep_command
 

@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .elementary import sincos
 from .jit import leaf
-from .sincos import sincos
 from .vectors import Array, Row, RowArray, Vector
 
 LINK_PARAMETERS = 10

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chain import Three, dot, place_end_effector, three
+from .elementary import sincos
 from .jit import leaf
 from .plugged import call_at, list_numbers, plug
-from .sincos import sincos
 from .two_link_arm import end_effector_jacobian, forward_kinematics
 from .vectors import Array, Pair, Row, RowArray, Vector
 

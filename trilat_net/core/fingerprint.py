@@ -11,9 +11,9 @@ from functools import cache
 import numpy as np
 
 from .delay import DelayKind, LinkModel
+from .elementary import sincos
 from .exogenous import TorqueKind, TorqueSource
 from .jit import leaf
-from .sincos import sincos
 from .site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup
 from .site_step import Site
 from .ticks import Arrival, TickInput

@@ -9,8 +9,8 @@ D. Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv 1812.
 import math
 
 from .chain import Matrix, Three, add, cross, dot, scale
+from .elementary import sincos
 from .jit import leaf
-from .sincos import sincos
 from .vectors import Array
 
 _SMALL = 1e-8

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .elementary import sincos
 from .jit import leaf
-from .sincos import sincos
 from .vectors import Array, Five, Pair, Vector
 
 JOINTS = 2

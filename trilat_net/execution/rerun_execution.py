@@ -16,8 +16,8 @@ from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
-from ..net.loop_stats import LoopStats
 from ..net.messages import LinkStats
+from ..net.timing import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
 from .difference import RecordDifference, equal_bits, equal_record, find_first_difference

@@ -22,7 +22,7 @@ from ..log.mcap_reader import LogContents, read_contents
 from ..log.mcap_writer import Sink
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..net import topics
-from ..net.loop_stats import LoopStats
+from ..net.timing import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
 from ..scenario.imported_law import ImportedLaw

@@ -20,8 +20,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..core.compiled_law import compiled
+from ..core.elementary import sincos
 from ..core.jit import leaf
-from ..core.sincos import sincos
 from ..core.two_link_arm import regressor
 from ..core.user_law import LawContext, LawInput
 from ..fields import NotNegative, NotNegativeParameters, Parameters, Positive, PositiveJoints

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..core.compiled_law import compiled
-from ..core.hyperbolic import tanh
+from ..core.elementary import tanh
 from ..core.site_setup import Gains, Law
 from ..core.user_law import LawInput
 from ..core.vectors import Array

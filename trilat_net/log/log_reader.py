@@ -37,7 +37,7 @@ from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
 from ..scenario.law_consent import LawFiles, allow_logged_laws
-from ..scenario.operators import find_live_hand
+from ..scenario.operators.kernel_operators import find_live_hand
 from .accounting import LAST, SessionAccounts, parse_counts
 from .data_tables import (
     EVENTS_TABLE,

@@ -21,8 +21,8 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..results import JsonObject
 from . import style
+from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
-from .palette import DARK_SITE_COLOURS, list_site_colours
 
 BUCKET_BUDGET = 48_000
 """Buckets of all columns together: what keeps a page near a megabyte, however many sites there are."""

@@ -27,13 +27,13 @@ from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
 from . import charts
+from .appearance import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 from .certificate_text import describe_certificate, list_energies
 from .figures.age_and_lateness import explain_missing_loop_times
 from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.joint_motion import explain_absent_operator
 from .figures.twin_differences import draw_twins
-from .palette import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 from .style import typeset
 
 _PAGE_DPI = 110

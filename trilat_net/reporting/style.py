@@ -33,8 +33,7 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario.arms import TASK_AXES
-from .figure_size import REPORT_SIZE, FigureSize
-from .palette import SITE_COLOURS, list_site_colours
+from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 
 AxesGrid = NDArray[np.object_]
 LegendEntries = Sequence[tuple[str, dict[str, Any]]]

@@ -19,7 +19,7 @@ from ..core.philox import link_key
 from ..core.vectors import Array
 from ..laws.conditions import LawSituation, StabilityCondition
 from .arms import TASK_AXES, read_arm
-from .delay_models.interface import LinkBase
+from .delay_models import LinkBase
 from .sample_uses import count_silences, draw_uses
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario

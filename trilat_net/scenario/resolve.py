@@ -42,8 +42,7 @@ from .distributions import Draws
 from .expect import Expect, check_window_keys, number_window_joints
 from .imported_law import LAW_PATH_PATTERN, read_law_source
 from .laws import LAWS
-from .operators import ENVIRONMENTS, OPERATORS, resolve_operators
-from .operators.interface import Holding
+from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS
 

@@ -12,7 +12,7 @@ from ..core.site_step import Site
 from ..core.ticks import NS_PER_S
 from ..core.two_link_arm import PARAMETERS
 from ..core.vectors import IntArray
-from .delay_models.interface import LinkBase
+from .delay_models import LinkBase
 
 
 @lru_cache(maxsize=256)

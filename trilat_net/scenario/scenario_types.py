@@ -28,12 +28,12 @@ from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel
 from .arms import Arm, ArmModel, Task, build_arm
-from .delay_models import Link
-from .delay_models.interface import LinkBase
+from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw
-from .operators import Environment, Operator, find_live_hand
+from .operators import Environment, Operator
+from .operators.kernel_operators import find_live_hand
 from .resting_arm import add_credible_box, find_rest_gains
 
 

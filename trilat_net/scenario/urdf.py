@@ -20,7 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
-from ..core.sincos import sincos
+from ..core.elementary import sincos
 from ..errors import ScenarioError
 from ..fields import MAX_QUANTITY, suggest_nearest
 

@@ -21,11 +21,12 @@ from ..files import find_page
 from ..laws.sent_vectors import check_sends
 from . import operators
 from .arms import TASK_AXES
-from .delay_models.interface import LinkBase
+from .delay_models import LinkBase
 from .delay_models.kernel_delays import ConstantDelay, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
 from .imported_law import ImportedLaw
+from .operators import kernel_operators
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
@@ -378,7 +379,7 @@ def _check_actors(actors: Sequence[operators.Operator | operators.Environment], 
 
 def _check_live_hands(site: SiteSpec, path: str) -> None:
     """Refuses a second live hand of an arm, and one of an arm that is outside of the program."""
-    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, operators.LiveHand)]
+    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)]
     if live and site.plant == "external":
         raise ScenarioError(
             "is a live hand, and the arm is outside of the program: who holds that arm is measured "

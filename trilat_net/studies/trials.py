@@ -49,10 +49,10 @@ from ..results import Result
 from ..scenario import Expect, Scenario, load_scenario
 from ..scenario.law_consent import list_imported_laws
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
-from .commands import format_command, format_toml_value, set_options
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
 from .measure_run import Range, RunMetrics, measure_log, measure_virtual_run
+from .study_folder import format_command, format_toml_value, set_options
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):

@@ -25,7 +25,7 @@ from ..errors import ScenarioError
 from ..files import find_page
 from ..laws.linear_form import LinearForm, LinearSituation
 from ..scenario import Scenario
-from ..scenario.delay_models.interface import LinkBase
+from ..scenario.delay_models import LinkBase
 from ..scenario.imported_law import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links

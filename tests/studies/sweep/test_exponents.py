@@ -9,7 +9,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_hex
 
 from trilat_net.errors import UsageError
-from trilat_net.reporting.figure_size import make_print_size
+from trilat_net.reporting.appearance import make_print_size
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.map_page import draw_stability_map, tabulate_edges
 from trilat_net.studies.sweep.stability_map import (

@@ -18,7 +18,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...log.record_columns import Ints
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
+from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _POINTS = 400

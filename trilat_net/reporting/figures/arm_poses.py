@@ -20,7 +20,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario.arms import ArmModel
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
+from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 INSTANTS = 6

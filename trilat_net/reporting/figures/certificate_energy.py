@@ -19,7 +19,7 @@ from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
+from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _PARTS = {

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 from matplotlib.figure import Figure
 
 from ...log.log_reader import Log
-from ..figure_size import FigureSize
+from ..appearance import FigureSize
 
 Draw = Callable[[Log, FigureSize], Figure]
 Absent = Callable[[Log], str]

@@ -41,7 +41,7 @@ from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
 from ...scenario.law_consent import find_user_laws
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
+from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _ROW_IN = 1.2

@@ -20,8 +20,7 @@ from ...theory.linear_analysis import LinearAnalysis
 from ...theory.port_analysis import PortAnalysis
 from ...theory.port_transparency import Transparency
 from .. import style
-from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize
-from ..palette import SITE_COLOURS, list_site_colours
+from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 
 _CLAMPED: tuple[int, tuple[float, float]] = (0, (4.0, 1.6))
 _FAILS: dict[str, Any] = {"color": "#cc3311", "alpha": 0.12, "linewidth": 0.0, "zorder": 0.3}

@@ -20,7 +20,7 @@ from ...errors import UsageError
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
-from ..figure_size import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
+from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
 from ..style import FIGURE_FORMATS, write_figure
 from .figure_entry import FigureEntry, list_figures
 from .joint_motion import draw_operator_displacement

@@ -19,8 +19,7 @@ from ...errors import UsageError
 from ...log.log_reader import Log
 from ...theory.end_pose import certify_run
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
-from ..palette import SITE_COLOURS
+from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws
 
 _HEIGHT_IN, _NARROW_HEIGHT_IN = 3.9, 5.6

@@ -23,7 +23,7 @@ from ...core.vectors import Array
 from ...execution.log_inputs import explain_no_repetition
 from ...execution.twins import SMALLEST, TwinPath
 from .. import style
-from ..figure_size import REPORT_SIZE, FigureSize
+from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 _POINTS = 150

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from ...core.delay import draw_pair
-from .interface import Milliseconds, OwnDelay
+from ..delay_models import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import fields
 from ...core.vectors import Array
-from .interface import OwnActor
+from ..operators import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):

@@ -19,7 +19,7 @@ from ...core.exogenous import TorqueKind, TorqueSource
 from ...core.live_hand import HandRules
 from ...errors import ScenarioError
 from ..distributions import Draws
-from .interface import ActorBase, Holding
+from ..operators import ActorBase, Holding
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]

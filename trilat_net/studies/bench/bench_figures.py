@@ -16,7 +16,7 @@ from ...analysis.run_end import Stability
 from ...core.vectors import Array
 from ...files import write_whole
 from ...reporting import style
-from ...reporting.figure_size import make_print_size
+from ...reporting.appearance import make_print_size
 from ..intervals import MeanInterval
 from .bench_results import BenchPlace, BenchResults, build_bench_page, encode_places, encode_runs, name_law
 

@@ -22,8 +22,8 @@ from ...errors import UsageError
 from ...fields import suggest_nearest
 from ...files import write_whole
 from ...scenario.laws import BUILT_IN
-from ..commands import format_toml_value
 from ..executor import Progress, Workers, ignore_progress
+from ..study_folder import format_toml_value
 from ..tuning.candidate import CandidateClass, TuningScenario, load_tuning_scenario, measure_candidate
 from ..tuning.search_space import SEARCH_SPACES, ModelInformation
 from ..tuning.tuning_plan import CandidateSearch, plan_tuning

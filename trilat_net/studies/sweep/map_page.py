@@ -26,7 +26,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 from ...core.vectors import Array
 from ...files import write_whole
 from ...reporting import style
-from ...reporting.figure_size import COLUMN_IN, FigureSize, make_print_size
+from ...reporting.appearance import COLUMN_IN, FigureSize, make_print_size
 from ...reporting.text_table import TextTable
 from .stability_map import (
     CELL_CLASSES,

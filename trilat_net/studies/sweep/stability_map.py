@@ -30,11 +30,11 @@ from ...laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
 from ...laws.p_d import PD
 from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
-from ...scenario.delay_models.interface import LinkBase
+from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
 from ...theory import GrowthColumn, compute_growth_column
-from ..commands import format_command, set_options
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ..study_folder import format_command, set_options
 from .sweep_cell import CellClass
 from .sweep_plan import SweepPlan
 from .sweep_run import SweepResults

@@ -24,7 +24,7 @@ from ...scenario.imported_law import name_law_classes
 from ...scenario.law_consent import allow_own_laws
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
-from ..commands import format_toml_value
+from ..study_folder import format_toml_value
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")

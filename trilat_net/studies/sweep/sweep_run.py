@@ -36,9 +36,15 @@ from ...scenario.law_consent import list_imported_laws
 from ...scenario.laws import identify_law
 from ...scenario.scenario_reader import read_source
 from .. import executor
-from ..commands import format_command, set_options
 from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
+from ..study_folder import (
+    RunJournal,
+    StudyFolder,
+    build_resume_hint,
+    describe_program,
+    format_command,
+    set_options,
+)
 from . import sweep_cell
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json

@@ -42,9 +42,9 @@ from ...scenario.expect import END_WINDOW_S
 from ...scenario.operators.kernel_operators import JointSpring, Wall
 from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ...scenario.validate import refuse_live_only
-from ..commands import format_command, format_toml_value, set_options
 from ..intervals import mean_interval
 from ..record_batches import RecordBatch, run_whole
+from ..study_folder import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 
 from ...files import write_whole
 from ...reporting import style
-from ...reporting.palette import SITE_COLOURS
+from ...reporting.appearance import SITE_COLOURS
 from ...reporting.result_text import Block
 from ...reporting.text_table import TextTable
 from ..intervals import MeanInterval
