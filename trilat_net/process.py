@@ -148,20 +148,47 @@ class Interrupt:
 def let_signals_kill() -> Callable[[], None]:
     """Lets signals end the process at once where they may break off work; the function returned ends that.
 
-    Python sees a signal between two of its instructions: one call of a compiler takes minutes.
+    Python sees a signal between two of its instructions: one call of a compiler takes minutes. The first
+    process of a container is not ended by what it leaves to the kernel: there a thread ends it.
     """
     if threading.current_thread() is not threading.main_thread():
         return lambda: None
     handlers = ((name, signal.getsignal(name)) for name in ENDING_SIGNALS)
     taken = {name: one for name, one in handlers if _breaks_off(getattr(one, "__self__", None))}
+    first = bool(taken) and os.getpid() == 1
     for name in taken:
-        signal.signal(name, signal.SIG_DFL)
+        signal.signal(name, _exit_at if first else signal.SIG_DFL)
+    unwatch = _watch_signals() if first else lambda: None
 
     def restore() -> None:
+        unwatch()
         for name, handler in taken.items():
             signal.signal(name, handler)
 
     return restore
+
+
+def _exit_at(number: int, _: FrameType | None) -> None:
+    os._exit(128 + number)
+
+
+def _watch_signals() -> Callable[[], None]:
+    """Ends the process at a signal, from a thread, until the function returned is called."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    before = signal.set_wakeup_fd(writer)
+
+    def wait() -> None:
+        with open(reader, "rb", buffering=0) as arrived:  # noqa: PTH123 - a pipe
+            if number := arrived.read(1):
+                _exit_at(number[0], None)
+
+    def unwatch() -> None:
+        signal.set_wakeup_fd(before)
+        os.close(writer)
+
+    threading.Thread(target=wait, daemon=True).start()
+    return unwatch
 
 
 def _breaks_off(owner: object) -> bool:

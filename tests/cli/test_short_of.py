@@ -3,6 +3,7 @@
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -161,6 +162,18 @@ def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) ->
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     done = subprocess.run(command, cwd=tmp_path, env=cold, capture_output=True, text=True, timeout=300)
     assert done.returncode in (-number, 128 + number), done.stderr
+
+
+def test_a_signal_ends_the_first_process_of_a_container_as_it_compiles(tmp_path: Path) -> None:
+    """The kernel lets no signal end such a process that it did not ask for."""
+    first = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
+    if shutil.which("unshare") is None or subprocess.run([*first, "true"], capture_output=True).returncode:
+        pytest.skip("no process can be the first of a namespace here")
+    instant_s, number = "4.0", signal.SIGTERM
+    command = [*first, sys.executable, "-c", AT_AN_INSTANT, instant_s, str(int(number))]
+    cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run([*command, "sim", "paper", "-o", "x.mcap"], cwd=tmp_path, env=cold, timeout=300)
+    assert done.returncode == 128 + number
 
 
 def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
