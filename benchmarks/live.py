@@ -58,7 +58,7 @@ def _run(waker: str) -> tuple[Log, float]:
         session.all()
         session.begun()
         priority = FIFO_PRIORITY * all("SCHED_FIFO" in session.processes[name].text() for name in SITES)
-        measure = _cyclictest_us if waker == "cyclictest" else _thread_us
+        measure = cyclictest_us if waker == "cyclictest" else thread_us
         beside_us = measure(priority, DURATION_S - 2)
         session.codes()
         log = open_log(session.log)
@@ -71,7 +71,7 @@ def _sent_after_us(log: Log, site: str) -> np.ndarray:
     return np.array([(state.sent_ns - state.t_ns) / 1000 for state in log[site].states])
 
 
-def _cyclictest_us(priority: int, duration_s: int) -> float:
+def cyclictest_us(priority: int, duration_s: int) -> float:
     """Returns the 99th percentile of cyclictest's latencies, us."""
     every_ms = ["cyclictest", "-q", "-m", "-i", "1000", "-h", "10000", "-D", str(duration_s)]
     policy = ["-p", str(priority)] if priority else ["--policy=other"]
@@ -81,7 +81,7 @@ def _cyclictest_us(priority: int, duration_s: int) -> float:
     return float(rows[np.searchsorted(counts, 0.99 * counts[-1]), 0])
 
 
-def _thread_us(priority: int, duration_s: int) -> float:
+def thread_us(priority: int, duration_s: int) -> float:
     """Returns the same of a thread that sleeps until each millisecond."""
     late_ns: list[int] = []
 

@@ -21,7 +21,7 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
-from .inbound_queue import InboundMessage, InboundQueue
+from .inbound_queue import InboundQueue
 from .site_reception import SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
@@ -132,10 +132,11 @@ class Recording:
         for arrived in queue.drain(until_ns):
             try:
                 if arrived.key not in self._blocks:
-                    self._take(arrived)
+                    take = self._take_own if arrived.key in self._own else self._take
+                    take(*arrived)
                     continue
                 for payload in split_states(arrived.payload):  # one that is none drops those after it
-                    self._take(arrived._replace(payload=payload))
+                    self._take(arrived.key, payload, arrived.mono_ns)
             except WireError as error:
                 self.dropped[error.reason] += 1
 
@@ -196,38 +197,34 @@ class Recording:
             site, channel = self._channels[key]
             return site, site.read(channel, payload)
 
-    def _take(self, arrived: InboundMessage) -> None:
-        since_ns = arrived.mono_ns - self.epoch.mono_ns
-        log_time_ns = self.epoch.unix_ns + since_ns
-        if arrived.key in self._own:
-            self._take_own(arrived, since_ns, log_time_ns)
-            return
-        if arrived.key not in self._channels:
-            raise WireError("stranger", arrived.key)
-        self._channels[arrived.key][0].since_ns = since_ns
-        site, message = self._read(arrived.key, arrived.payload)
-        channel = self._channels[arrived.key][1]
-        self._note_admission(message.content)
-        if site.take(channel, message, arrived.mono_ns):
+    def _take(self, key: str, payload: bytes, mono_ns: int) -> None:
+        since_ns = mono_ns - self.epoch.mono_ns
+        if key not in self._channels:
+            raise WireError("stranger", key)
+        self._channels[key][0].since_ns = since_ns
+        site, message = self._read(key, payload)
+        channel = self._channels[key][1]
+        if channel == topics.EVENT:
+            self._note_admission(message.content)
+        if site.take(channel, message, mono_ns):
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
-            self._writer.add(
-                arrived.key, arrived.payload, t_ns, log_time_ns, message.sequence, message.content
-            )
+            log_time_ns = self.epoch.unix_ns + since_ns
+            self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
 
-    def _take_own(self, arrived: InboundMessage, since_ns: int, log_time_ns: int) -> None:
-        account = self._own[arrived.key]
-        if arrived.key.endswith(topics.STATS):
-            stats = decode(arrived.payload, RecorderStats)
+    def _take_own(self, key: str, payload: bytes, mono_ns: int) -> None:
+        account, since_ns = self._own[key], mono_ns - self.epoch.mono_ns
+        if key.endswith(topics.STATS):
+            stats = decode(payload, RecorderStats)
             boot, number, content = stats.boot, account.expected, None
         else:
-            event = decode(arrived.payload, Event)
+            event = decode(payload, Event)
             if event.member != topics.RECORDER:
-                raise WireError("stranger", arrived.key)
+                raise WireError("stranger", key)
             boot, number, content = event.boot, event.n, event
         if boot != self.publisher.info.boot:
-            raise WireError("another recorder", arrived.key)
-        if number >= 0 and account.take(number, arrived.mono_ns):
-            self._writer.add(arrived.key, arrived.payload, since_ns, log_time_ns, number, content)
+            raise WireError("another recorder", key)
+        if number >= 0 and account.take(number, mono_ns):
+            self._writer.add(key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content)
 
     def presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account, StartGap
-from trilat_net.log.log_layout import SITE_CHANNELS
+from trilat_net.log.log_layout import CHANNEL_TYPES, SITE_CHANNELS
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.topics import count_messages, count_under_way, number_message, skipped_numbers
-from trilat_net.net.wire import decode
+from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
 
@@ -77,7 +77,8 @@ class SiteReception:
         self.heard_ns: int | None = None
         self.since_ns: float = math.inf if before is None else before.since_ns
         self._boot = boot
-        self._rate_hz, self._layout = scenario.sites[name].rate_hz, scenario.layout(name)
+        self._rate_hz, layout = scenario.sites[name].rate_hz, scenario.layout(name)
+        self._decoders = {name: make_decoder(CHANNEL_TYPES[name], layout=layout) for name in SITE_CHANNELS}
         self.period_ns = 1_000_000_000 // self._rate_hz
         self._gaps = {
             channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
@@ -96,16 +97,15 @@ class SiteReception:
             WireError: it is no message of this site's channel.
         """
         if channel == topics.EVENT:
-            event = decode(payload, Event)
+            event = self._decoders[channel](payload)
             message = SiteMessage(event.n, event.n, event.t_ns, event)
             sender = event.member
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError("out of range", f"{self.name} says it made {event.ticks} ticks")
         else:
-            kind: type[State | LinkStats] = State if channel == topics.STATE else LinkStats
-            tick = decode(payload, kind, layout=self._layout)
+            tick = self._decoders[channel](payload)
             number = number_message(channel, tick.tick, self._rate_hz)
-            t_ns = tick.sent_ns if isinstance(tick, State) else tick.t_ns
+            t_ns = tick.sent_ns if channel == topics.STATE else tick.t_ns
             message = SiteMessage(number, tick.tick, t_ns, tick)
             sender = tick.site
         if sender != self.name or message.content.boot != self._boot:
@@ -166,7 +166,7 @@ class SiteReception:
 
     def _imply(self, content: State | LinkStats | Event) -> None:
         """Counts the messages that must exist because this one does, and those that never did."""
-        if isinstance(content, State) and (skipped := count_skipped_ticks(content.cmd)):
+        if isinstance(content, State) and content.cmd and (skipped := count_skipped_ticks(content.cmd)):
             for channel in (topics.STATE, topics.LINK):
                 left_out = skipped_numbers(channel, content.tick, skipped, self._rate_hz)
                 self.accounts[channel].begin_anew(*left_out)

@@ -77,11 +77,11 @@ class ChangeServer:
         if self._stop_tick is not None:
             self.stopped = k + 1 >= self._stop_tick
         changes: list[CoreChange] = []
-        first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
         ordered = False
         while (query := self._poll()) is not None:
             try:
                 request = decode(query.payload, ChangeRequest)
+                first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
                 if ordered and request.order in _NEEDED_MODES:
                     self._held_up = query
                     break

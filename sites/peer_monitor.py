@@ -26,6 +26,7 @@ class PeerMonitor:
         ended_by: text of the event with which a member ended the run for all; "" while none has.
         ended_member: that member.
         away: the sites that have left, by name: when, ns since the epoch, and a sentence.
+        changed: True once a peer has taken in a change.
         admitted: what sites said that were admitted and that the loop has still to take in.
     """
 
@@ -38,6 +39,7 @@ class PeerMonitor:
         self.ended_by = self.ended_member = ""
         self.away: dict[str, tuple[int, str]] = {}
         self.admitted: list[Event] = []
+        self.changed = False
         self._site, self._admits = site, admits
         self._events = {peer: bus.inbox(topics.key(session, peer, topics.EVENT), 256) for peer in peers}
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
@@ -92,6 +94,8 @@ class PeerMonitor:
                 yield event
             elif event.boot != self.boots.get(event.member):
                 continue
+            elif event.kind == "change":
+                self.changed = True
             elif event.kind in ("diverged", "failed"):
                 self.ended_by, self.ended_member = event.text, event.member
             elif event.kind == "end":

@@ -9,8 +9,10 @@ arrive, before their tick, and carry the instants of their arrival, not of their
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from trilat_net.core.delay import DelayKind
 from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.site_setup import LinkSetup, SiteSetup
@@ -22,6 +24,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, LoopStats, SiteTiming
 from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
+from trilat_net.scenario import Scenario
 
 if TYPE_CHECKING:
     from .site_process import RunningSite
@@ -133,6 +136,20 @@ class PeerInbox:
 
 BLOCKS_PER_S = 100
 """Recorders get the records of 10 ms together."""
+HELD_PER_S, HELD_DELAY_US = 200, 100_000
+"""Peers on the same machine get the samples of 5 ms together where none is due sooner after its stamp."""
+
+
+def may_hold_samples(scenario: Scenario, name: str) -> bool:
+    """True if all links from a site delay its samples so much, and it hears of changes of these links."""
+    return all(
+        site in scenario.peers(name)
+        and max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT)) >= HELD_DELAY_US
+        for site in scenario.names
+        for link in scenario.setup(site).links
+        for model in link.models
+        if link.peer == name
+    )
 
 
 class StateBlock:
@@ -144,6 +161,9 @@ class StateBlock:
         send: publishes the payloads of some records.
         turn: the site's place among those of the scenario, so that sites of one processor take turns.
         single: True if every record is sent with its tick, for the program of an external arm.
+
+    Attributes:
+        holds_samples: True if samples wait for others too, so that peers are woken up once for some.
     """
 
     def __init__(
@@ -158,22 +178,34 @@ class StateBlock:
         self._site, self._boot, self._send = site, boot, send
         self._ticks = 1 if single else max(1, site.rate_hz // BLOCKS_PER_S)
         self._turn = 3 * turn % self._ticks
+        self._held = max(1, site.rate_hz // HELD_PER_S)
+        self.holds_samples = False
+        self._unsent: list[tuple[Any, ...]] = []
         self._records: list[tuple[Any, ...]] = []
 
-    def add(self, output: TickRecord, *stamps: Any) -> bool:
-        """Adds a record, with the further arguments of `encode_state`; true if a block is sent after it.
+    def add(self, output: TickRecord, *facts: Any) -> bool:
+        """Adds a record, with the arguments of `encode_state` up to the stamps; true if its block is due.
 
         Whoever holds the arm gets every record at once.
         """
-        self._records.append((output, *stamps))
+        self._unsent.append((output, *facts))
         held = bool(output.hand) and HandInForce.read(output.hand).source > 0
         return held or (output.tick + 1) % self._ticks == self._turn
 
-    def flush(self) -> None:
-        """Sends the records so far."""
-        site, records = self._site, self._records
+    def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
+        """Sends the samples so far if peers get them after tick k; `send` returns the stamps of one."""
+        if not self.holds_samples or (k + 1 - self._turn) % self._held == 0:
+            self._add_stamps(send)
+
+    def _add_stamps(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
+        self._records += [(*record, *send(record[0])) for record in self._unsent]
+        self._unsent.clear()
+
+    def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
+        """Sends the samples and the records so far."""
+        self._add_stamps(send)
+        site, records, self._records = self._site, self._records, []
         if records:
-            self._records = []
             self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
 
 
@@ -186,6 +218,14 @@ def _find_newest_tick(timing: SiteTiming, k: int, now_ns: int) -> int:
         middle = (first + after) // 2
         first, after = (middle, after) if timing.schedule.deadline(middle) <= now_ns else (first, middle)
     return first
+
+
+def _send_sample(
+    name: str, boot: int, clock: Clock, timing: SiteTiming, io: "RunningSite", output: TickRecord
+) -> tuple[Any, ...]:
+    stamps = timing.sent(output.tick, clock.monotonic_ns()), timing.echo()
+    io.publish_sample(encode_sample(name, boot, output, *stamps))
+    return stamps
 
 
 def run_loop(
@@ -203,6 +243,7 @@ def run_loop(
     catches_up: bool = True,
 ) -> TickRecord | None:
     """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
+    send = partial(_send_sample, site.name, boot, clock, timing, io)
     quarter_ns, deadline_ns = NS_PER_S // (4 * site.rate_hz), timing.schedule.deadline(first)
     busy_us, mode, last, asked, k = 0, Mode.RUN, None, False, first
     while k < ticks:
@@ -221,13 +262,12 @@ def run_loop(
         if output is None:  # there is no record of this tick
             break
         last = output
-        sent_ns, echo = timing.sent(k, clock.monotonic_ns()), timing.echo()
-        io.publish_sample(encode_sample(site.name, boot, output, sent_ns, echo))
-        block_due = states.add(output, arrivals, late_us, busy_us, sent_ns, echo)
+        block_due = states.add(output, arrivals, late_us, busy_us)
+        states.send_samples(k, send)
         stats.tick(late_us, busy_us, skipped)
         stats_due = stats.due(k, skipped)
         if block_due or stats_due:  # statistics say that these records exist
-            states.flush()
+            states.flush(send)
         if stats_due:
             io.publish_link(encode(stats.take(output, timing.measured(woke_ns))))
             io.attend(k, output.t_ns)
@@ -241,5 +281,5 @@ def run_loop(
         if (block_due or asked) and deadline_ns - clock.monotonic_ns() > quarter_ns:
             asked = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000
-    states.flush()
+    states.flush(send)
     return last

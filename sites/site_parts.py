@@ -41,7 +41,7 @@ from .hand_server import MESSAGES_KEPT, HandServer
 from .law_watchdog import LawWatchdog
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
-from .site_loop import StateBlock, make_sample_readers
+from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +125,7 @@ class SiteParts:
         single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
         send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
         self.states = StateBlock(self.site, self.boot, send_states, turn, single=single)
+        self.states.holds_samples = not single and may_hold_samples(scenario, name)
         self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1

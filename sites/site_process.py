@@ -37,6 +37,7 @@ from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
 from trilat_net.net.wire import encode
+from trilat_net.net.zenoh_bus import share_one_thread
 from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
@@ -75,6 +76,7 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         RunFailed: the run diverged, its user law failed, or its arm fell silent.
     """
     check_outside_arms(scenario)
+    share_one_thread()
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
         named, timeout_s = (lambda text: say(f"{name}: {text}")), options.join_timeout_s
@@ -195,6 +197,7 @@ class RunningSite:
     def run(self) -> None:
         """Runs every tick, or until the run ends."""
         parts = self._parts
+        parts.states.holds_samples &= all(meter.peer.estimator is None for meter in self._timing.meters)
         self._publish_setup()
         order, name = encode(ChangeRequest(order="stop")), parts.name
         here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
@@ -306,6 +309,8 @@ class RunningSite:
         """Takes in who has come, and gives up where somebody has been away for too long."""
         parts, monitor = self._parts, self._parts.monitor
         monitor.watch(self._publisher, t_ns)
+        if monitor.changed:  # 100 ms ago at most: no sample so far is due sooner than before
+            parts.states.holds_samples = False
         for meter in self._timing.meters if monitor.away else ():
             if meter.is_heard(parts.clock.monotonic_ns()):
                 monitor.meet_again(meter.peer.name, t_ns)

@@ -7,10 +7,12 @@ import pytest
 
 from tests.chains import six_joints
 from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.messages import PeerSample, State
-from trilat_net.net.wire import decode, split_states
+from trilat_net.net.requests import ChangeRequest
+from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 
@@ -101,3 +103,50 @@ def test_a_lost_block_is_filled_with_its_records(tmp_path: Path) -> None:
     assert verify(log).passed
     refilled = log.recorder_stats()[-1].refilled["s/state"]
     assert refilled == sum(len([*split_states(block)]) for block in lost if block)
+
+
+def ticks_that_hear(log: Log, name: str) -> list[int]:
+    """The ticks of a site in which a sample of a peer came."""
+    return [state.tick for state in log[name].states if state.rx]
+
+
+@pytest.mark.parametrize(("delay_ms", "together"), [(99, 1), (100, 5)])
+def test_samples_of_long_delays_come_together(delay_ms: int, together: int, tmp_path: Path) -> None:
+    scenario = load_scenario("two_sites", {"duration_s": 0.5, "link.delay_ms": delay_ms})
+    log = Session.whole(scenario, tmp_path).run()
+    assert in_log(log) == in_virtual_time(scenario)
+    for name in scenario.names:
+        counts = [len(state.rx) for state in log[name].states if state.rx]
+        assert counts[1:-1].count(together) > 0.8 * len(counts)
+        assert max(counts) == together
+
+
+def test_samples_of_another_clock_are_not_held(tmp_path: Path) -> None:
+    scenario = load_scenario("two_sites", {"duration_s": 0.3})
+    session = Session.whole(scenario, tmp_path, skews={"s": (1_000_000, 0)})
+    log = session.run()
+    assert all(len(ticks_that_hear(log, name)) > 0.9 * scenario.ticks(name) for name in scenario.names)
+
+
+@pytest.mark.parametrize("at_ns", [3_000_000, 41_000_000, 99_000_000])
+def test_a_delay_made_short_finds_no_sample_held(at_ns: int, tmp_path: Path) -> None:
+    scenario = load_scenario("two_sites", {"duration_s": 1.0})
+    session = Session.whole(scenario, tmp_path)
+
+    def shorten(bus: Bus, clock: RelayClock) -> None:
+        running = bus.inbox(topics.key(SESSION, "s", topics.SAMPLE))
+        while running.poll() is None:
+            clock.sleep_until(clock.monotonic_ns() + 1_000_000)
+        clock.sleep_until(clock.monotonic_ns() + 200_000_000 + at_ns)
+        order = ChangeRequest(link="m->s", to={"delay_ms": 1.0})
+        answers = bus.ask(topics.key(SESSION, "s", topics.SET), encode(order))
+        while answers.poll() is None:
+            clock.sleep_until(clock.monotonic_ns() + 1_000_000)
+
+    session.stranger(shorten)
+    log = session.run()
+    (taken,) = (state for state in log["s"].states if state.cmd)
+    assert log.link_stats("s")[-1].late == {"m": 0}
+    assert log["s"].states[-1].used["m"] == scenario.ticks("m") - 2
+    assert ticks_that_hear(log, "s")[-50:] == list(range(scenario.ticks("s") - 50, scenario.ticks("s")))
+    assert taken.tick < 320 + at_ns // 1_000_000

@@ -6,6 +6,7 @@ Invariant: nothing here waits for the network. A publisher drops a message rathe
 
 import ctypes
 import json
+import os
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -22,11 +23,20 @@ from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, S
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 ASK_TIMEOUT_S = 3.0
+ONE_THREAD = "(rx:(worker_threads:1),tx:(handover:rx),acc:(handover:rx),net:(handover:rx),app:(handover:rx))"
 MAX_DEPTH = 100
 """Nesting of a configuration; Zenoh's recursive parser overflows its stack on deep nesting."""
 
 
 T = TypeVar("T")
+
+
+def share_one_thread() -> None:
+    """Puts all of Zenoh into one thread from the first session on, not six, which mostly wake one another.
+
+    Not for a router: it waits for room where it reads, and needs a thread that sends meanwhile.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", ONE_THREAD)
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome

@@ -1,0 +1,138 @@
+"""Processor time of a live session by process and thread: three sites at 1 kHz, a recorder, page and bridge.
+
+It is user and system time, which other programs on the machine change less than any latency. With the
+environment variable `TRILAT_BEFORE`, the folder of another version of the program, sessions of `paper` take
+turns between the two: processor time of sites and recorder, and how late the loops woke up over cyclictest.
+"""
+
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from sites.realtime import FIFO_PRIORITY
+from tests.live.processes import PLAIN, Stage
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.connection import find_free_endpoints
+
+from .live import cyclictest_us, thread_us
+from .page import SocketClient, live_session
+from .sessions import SITES, paper
+
+DURATION_S, WINDOW_S, PAIRS = 20, 14, 7
+COST_RATIO, LATENESS_RATIO = 0.6, 3.0
+MS_PER_TICK = 1000.0 / os.sysconf("SC_CLK_TCK")
+
+Usage = Counter[str]
+"""By thread, its number left out: processor time, ms; under `<thread> switches`: voluntary switches."""
+
+
+def run() -> list[str]:
+    print("a session of play with a page and a bridge, ms of processor time a second:")
+    with tempfile.TemporaryDirectory() as folder, _with_bridge(Path(folder)) as pids:
+        _show(_watch(pids, lambda: time.sleep(WINDOW_S)))
+    here, before = str(Path(__file__).parents[1]), os.environ.get("TRILAT_BEFORE", "")
+    if not before:
+        return ["name another version in TRILAT_BEFORE to compare with it"]
+    pairs = np.array([[_measure_paper(root) for root in (before, here)] for _ in range(PAIRS)])
+    ratios = pairs[:, 1] / pairs[:, 0]
+    (then_ms, then_late), (now_ms, now_late) = np.median(pairs, axis=0)
+    return [
+        f"a site and its share of the recorder, medians of {PAIRS} pairs: {then_ms:.0f} ms a second before, "
+        f"{now_ms:.0f} now: {np.median(ratios[:, 0]):.2f} of it (bar: <= {COST_RATIO:g})",
+        f"lateness p99 over that beside it: {then_late:.1f} before, {now_late:.1f} now "
+        f"(bar: <= {LATENESS_RATIO:g}); better in {np.sum(ratios[:, 1] < 1.0)} of {PAIRS} pairs",
+    ]
+
+
+def _measure_paper(root: str) -> tuple[float, float]:
+    """Runs `paper` with the program in a folder.
+
+    Returns the processor time of a site and its share of the recorder, ms a second, and the worst site's p99
+    of lateness over that of what woke beside it at the same priority.
+    """
+    with mock.patch.dict(PLAIN, PYTHONPATH=root), paper(DURATION_S) as session:
+        session.all()
+        session.begun()
+        pids = {name: process.pid for name, process in session.processes.items()}
+        priority = FIFO_PRIORITY * all("SCHED_FIFO" in session.processes[name].text() for name in SITES)
+        measure = cyclictest_us if shutil.which("cyclictest") else thread_us
+        beside_us: list[float] = []
+        usage = _watch(pids, lambda: beside_us.append(measure(priority, WINDOW_S)))
+        session.ends_well()
+        log = open_log(session.log)
+        late_us = max(float(np.percentile(log[name].late_us, 99)) for name in SITES)
+        assert sum(len(log[name]) for name in SITES) == DURATION_S * 1000 * len(SITES)
+    cost_ms = sum(map(_total, usage.values())) / len(SITES)
+    print(f"  {root}: {cost_ms:.0f} ms; late p99 {late_us:.0f} us, beside {beside_us[0]:.0f} us", flush=True)
+    return cost_ms, late_us / beside_us[0]
+
+
+@contextmanager
+def _with_bridge(folder: Path) -> Iterator[dict[str, int]]:
+    """A session of `play` with a page that a client watches, and a bridge to ROS 2: ids of its processes."""
+    (router,) = find_free_endpoints(1)
+    stage = Stage(folder)
+    with live_session(folder / "run") as (address, page), closing(SocketClient(address).socket):
+        try:
+            stage.start("router", "router", "--listen", router)
+            bridge = stage.start("bridge", "ros2", "--ros", router, "--session", "play")
+            bridge.prints("is in the graph of ROS 2")
+            members = {}
+            for pid in map(int, Path(f"/proc/{page}/task/{page}/children").read_text("ascii").split()):
+                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+                if named := {"site", "record"} & set(words):
+                    members[words[words.index("site") + 1] if "site" in named else "recorder"] = pid
+            yield {**members, "page": page, "bridge": bridge.pid}
+        finally:
+            stage.clear()
+
+
+def _total(usage: Usage) -> float:
+    return sum(spent for thread, spent in usage.items() if not thread.endswith("switches"))
+
+
+def _show(usage: Mapping[str, Usage]) -> None:
+    for name, threads in usage.items():
+        parts = ", ".join(
+            f"{thread} {spent:.0f} ({threads[f'{thread} switches']:.0f} switches)"
+            for thread, spent in threads.most_common()
+            if not thread.endswith("switches") and spent >= 1.0
+        )
+        print(f"  {name}: {_total(threads):.0f}: {parts}", flush=True)
+
+
+def _watch(pids: Mapping[str, int], meanwhile: Callable[[], object]) -> dict[str, Usage]:
+    """Returns what the threads of processes use meanwhile, per second."""
+    begun, before = time.monotonic(), {name: _read_threads(pid) for name, pid in pids.items()}
+    meanwhile()
+    passed_s = time.monotonic() - begun
+    usage = {name: Usage() for name in pids}
+    for name, pid in pids.items():
+        for task, (thread, *spent) in _read_threads(pid).items():
+            earlier = before[name].get(task, (thread, 0.0, 0.0))[1:]
+            for key, now, then in zip((thread, f"{thread} switches"), spent, earlier, strict=True):
+                usage[name][key] += (now - then) / passed_s  # type: ignore[assignment]
+    return usage
+
+
+def _read_threads(pid: int) -> dict[int, tuple[str, float, float]]:
+    """Returns a process's threads: name, processor time so far, ms, and voluntary switches."""
+    threads = {}
+    for folder in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            fields = (folder / "stat").read_text("ascii").rpartition(")")[2].split()
+            comm = re.sub(r"-?\d+$", "", (folder / "comm").read_text("utf-8").strip())
+            status = (folder / "status").read_text("utf-8")
+            switches = float(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+            name = "main" if int(folder.name) == pid else comm
+            threads[int(folder.name)] = name, (int(fields[11]) + int(fields[12])) * MS_PER_TICK, switches
+    return threads
