@@ -19,7 +19,7 @@ from ...scenario import SiteSpec
 from ..aligned import AlignedRecords, align_records
 from ..arm_rows import EndEffectorRows, build_arm_rows
 from ..torque_sources import list_walls, wall_depth, wall_force
-from .premises import Premise, rise_above_minimum
+from .energy_balance import rise_above_minimum
 
 
 class WallEnergy(NamedTuple):
@@ -38,30 +38,13 @@ class WallEnergy(NamedTuple):
     damping_n_s_m: float
 
 
-def check_sampled_walls(log: Log) -> list[Premise]:
-    """Returns the premise on sampled walls: none of them gives energy; [] if no wall is sampled."""
-    if not any(_list_sampled_walls(spec) for spec in log.scenario.sites.values()):
-        return []
-    walls = find_wall_energies(log)
-    if not walls:
-        return [Premise("walls", True, "no sampled wall was touched")]
-    giving = [wall for wall in walls if wall.damping_n_s_m <= wall.needed_n_s_m]
-    texts = [
-        f"{wall.site}: K h / 2 + B is {wall.needed_n_s_m:.3g} N s/m, the arm's own damping "
-        f"{wall.damping_n_s_m:.3g}; gave {wall.gave_j:.3g} J with respect to qd"
-        for wall in giving or walls
-    ]
-    kind = "a sampled wall gives energy in contact" if giving else "every sampled wall is passive"
-    return [Premise("walls", not giving, f"{kind}: {'; '.join(texts)}")]
-
-
 def find_wall_energies(log: Log) -> list[WallEnergy]:
     """Returns the sampled walls that were touched, in scenario order."""
     found = []
     for site, records in align_records(log).items():
         spec = log.scenario.sites[site]
         end_effector = build_arm_rows(log.scenario, site).place_end_effector(records.q, records.qd)
-        for wall in _list_sampled_walls(spec):
+        for wall in list_sampled_walls(spec):
             force = wall_force(wall, records.nominal_s, end_effector)
             if (force > 0.0).any():
                 needed = 0.5 * wall.K[0] * records.h_s + wall.B[0]
@@ -72,7 +55,8 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
     return found
 
 
-def _list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
+def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
+    """Returns the walls of a site that are held over a tick, and that push back."""
     return [wall for wall in list_walls(spec) if wall.sampled and any(wall.K)]
 
 
