@@ -2,12 +2,13 @@
 
     python -m tests.reading_walk
 
-He begins in `certify` and, as that is what decides, in `Certificate.passed`. He follows the calls of a body in
-the order in which they stand, depth first, into the rooms `analysis` and `theory`, and reads everything once.
+He begins in `certify` and, as that decides the exit code, in `Certificate.accepts`. He follows the calls of a
+body in the order in which they stand, depth first, into the rooms `analysis` and `theory`, and reads
+everything once.
 
 - He goes by what measures: a function or property whose annotated result is numbers alone (arrays, floats,
-  whole numbers, or records and mappings of these with names), for its docstring says what it is, and in
-  which unit. What measures calls nothing that judges.
+  whole numbers, what a scenario or a log states, or records and mappings of these with names), for its
+  docstring says what it is, and in which unit. What it calls he follows all the same.
 - He STAYS in every other function, method or property: one that gives a truth value, a word, a sentence, or
   what holds such.
 - He RETURNS from a stay if the body that brought him there decides on the answer: the call, or a name that
@@ -120,6 +121,8 @@ def _is_numbers(path: Path, name: str) -> bool:
     places = [] if name in NUMBERS else _resolve(path, name)
     for place in places:
         node = _definition(place)
+        if not _in_rooms(place):
+            continue
         if not isinstance(node, ast.ClassDef) or not _fields(node):
             return False
         for field in _fields(node):
@@ -256,16 +259,18 @@ def _in_order(node: ast.AST) -> Iterator[ast.AST]:
 
 def walk(*starts: Place) -> Walk:
     """Returns the walk from some functions."""
-    stays, returns = list(starts), []
+    seen, stays, returns = set(starts), list(starts), []
 
     def read(place: Place) -> None:
         body = _Body(place)
         decided = _decided(body.function)
         for node in (inner for statement in body.function.body for inner in _in_order(statement)):
-            new = [one for one in body.called(node) if one not in stays and not _measures(one)]
-            stays.extend(new)
+            new = [one for one in body.called(node) if one not in seen]
+            seen.update(new)
+            judging = [one for one in new if not _measures(one)]
+            stays.extend(judging)
             table = len(new) > 1 and isinstance(node, ast.Name)
-            returns.extend(new[:1] if table else new if node in decided else [])
+            returns.extend(judging[:1] if table else judging if node in decided else [])
             for one in new:
                 read(one)
 
@@ -276,7 +281,7 @@ def walk(*starts: Place) -> Walk:
 
 def walk_to_judgement() -> Walk:
     """Returns the walk from a log to what decides the exit code of `trilat certify`."""
-    return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.passed"))
+    return walk(Place(CERTIFICATE, "certify"), Place(CERTIFICATE, "Certificate.accepts"))
 
 
 if __name__ == "__main__":

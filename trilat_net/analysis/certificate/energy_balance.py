@@ -148,7 +148,7 @@ def derive_site_energies(
             dominance(site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
             split_torque(own, scenario),
-            Scheme[scenario.scheme.upper()] is Scheme.DIGITAL,
+            Scheme[scenario.scheme.upper()],
             common,
         )
         energies[site] = SiteEnergy(

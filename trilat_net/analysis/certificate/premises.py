@@ -31,7 +31,7 @@ from .energy_balance import (
     find_dominance_matrices,
     rise_above_minimum,
 )
-from .energy_terms import SiteConstants, derive_site_constants, explain_missing_functional
+from .energy_terms import SiteConstants, derive_site_constants
 from .wall_energy import find_wall_energies, list_sampled_walls
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
@@ -52,6 +52,7 @@ MAX_LISTED_NAMES = 4
 
 NO_COMMON_TIME = "there is no time of which every site has records"
 NO_PERIOD = "there is no period of which all records are there"
+_OF_ORIENTATIONS = "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
 
 
 class Premise(NamedTuple):
@@ -69,10 +70,15 @@ class Premise(NamedTuple):
 
 def explain_no_functional(scenario: Scenario) -> str:
     """Returns the reasons why sites have no functional; "" if each has one."""
-    sites: dict[str, list[str]] = {}
+    lacking: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
-        sites.setdefault(explain_missing_functional(spec), []).append(site)
-    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in sites.items() if reason)
+        if not spec.arm.known:
+            lacking.setdefault("nobody knows the arm's theta, and V is made of it", []).append(site)
+        elif not spec.control.has_functional:
+            lacking.setdefault(f"law {spec.control.tag}, for which there is no such V", []).append(site)
+        elif spec.task.space == "pose":
+            lacking.setdefault(_OF_ORIENTATIONS, []).append(site)
+    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in lacking.items())
 
 
 class AbsentSpan(NamedTuple):
@@ -171,7 +177,7 @@ def _check_parameters(run: RunFacts) -> Premise:
         first = np.clip(run.log.scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high)
         if (~c.adapts & (first != c.theta)).any():
             faults.append(f"{site}: a parameter is not learnt, and not known either")
-        if c.unknown_friction:
+        if c.unknown_friction.any():
             faults.append(f"{site}: its law does not compensate all friction of the joints")
     text = "every parameter is learnt or known, and no box shuts it out"
     return Premise("parameters", not faults, _list(faults) or text)
@@ -345,7 +351,7 @@ def _check_operators(run: FunctionalFacts) -> Premise:
         for site, energy in energies.items()
     }
     sites = [site for site, t_s in pushed_s.items() if len(t_s)]
-    outside = [site for site, c in run.constants.items() if c.outside]
+    outside = run.log.scenario.external
     if outside and not sites:
         return Premise("hands", None, f"no record says who pushes the arm of {_list(outside)}")
     if not sites:
@@ -452,7 +458,7 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
 
 
-def _list(words: list[str]) -> str:
+def _list(words: Sequence[str]) -> str:
     more = f" and {len(words) - MAX_LISTED_NAMES} more" if len(words) > MAX_LISTED_NAMES else ""
     return ", ".join(words[:MAX_LISTED_NAMES]) + more
 

@@ -29,7 +29,7 @@ from .energy_balance import (
     compute_energy_balance,
     rise_above_minimum,
 )
-from .observed_energy import ObservedEnergy, observe_energies
+from .observed_energy import ObservedEnergy, ObservedFinding, observe_energies
 from .premises import (
     Evidence,
     FunctionalFacts,
@@ -54,6 +54,9 @@ FALSE_RECORDS_TEXT = "these records were not made by the equations that the log 
 _PERIOD_OR_FALSE = (
     f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
 )
+
+
+_REFUTES = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 
 class StabilityFinding(StrEnum):
@@ -165,20 +168,15 @@ class Certificate(Result):
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
-        if self.roots is not None and self.roots.verdict == "unstable" and not self._roots_refuted:
-            found.append(self.roots.text)
-        if self.observed is not None and self.observed.refuted:
+        roots, twins = self.roots, self.twins
+        if roots is not None and roots.verdict == "unstable":
+            doubt = None if roots.exact else roots.rate_per_s
+            if doubt is None or twins is None or doubt <= twins.excluded_rate_per_s:
+                found.append(roots.text)  # roots that are no proof give way to pushes in the run's own ticks
+        if self.observed is not None and self.observed.finding in _REFUTES:
             found.append(self.observed.text)
         told = self._by_twins.reason
         return (*self.end.reasons, *([told] if told else []), *found, *self.evidence.reasons)
-
-    @property
-    def _roots_refuted(self) -> bool:
-        """True if roots that are no proof are unstable, and pushes die away in the very ticks of the run."""
-        roots, twins = self.roots, self.twins
-        if roots is None or roots.exact or twins is None or roots.rate_per_s is None:
-            return False
-        return twins.excludes(roots.rate_per_s)
 
     @property
     def _by_twins(self) -> TwinVerdict:
@@ -238,10 +236,13 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
         LogError: a record cannot be read, or names a change that is none.
     """
     run = gather_facts(log)
-    premises, known = check_premises(run), run.functional
-    verdict = _say(StabilityFinding.NOT_JUDGED, run.unknown)
+    known = run.functional
+    premises = check_premises(run)
+    verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if known is not None:
         verdict = judge_functional(known, premises)
+    if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
+        verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
     end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
     found = Certificate(premises, verdict, end, collect_evidence(run, min_coverage), observed=observed)
     if known is None or known.groups:
@@ -252,17 +253,13 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
 
 
 def judge_functional(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict on V: the first of the `DOUBTS` that applies, else its course."""
-    doubts = (verdict for doubt in DOUBTS if (verdict := doubt(run)) is not None)
-    found = next(doubts, None) or _judge_course(run, premises)
+    """Returns the verdict on V: of the first of the `JUDGEMENTS` that applies."""
+    verdicts = (judge(run, premises) for judge in JUDGEMENTS)
+    found = next(verdict for verdict in verdicts if verdict is not None)
     return found if run.groups else found._replace(tolerance=run.tolerance)
 
 
-def _say(finding: StabilityFinding, why: str) -> StabilityVerdict:
-    return StabilityVerdict(finding, f"{finding}: {why}")
-
-
-def _judge_site_balances(run: FunctionalFacts) -> StabilityVerdict | None:
+def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """A site's balance does not close; each site counts by itself.
 
     An arm outside of the program need not follow its theta, nor are its angles and velocities measured at
@@ -277,7 +274,7 @@ def _judge_site_balances(run: FunctionalFacts) -> StabilityVerdict | None:
     wrong = [site for site in energies if worst[site] > allow(site)]
     if not wrong:
         return None
-    outside = [site for site, c in run.constants.items() if c.outside]
+    outside = run.log.scenario.external
     ours = [site for site in wrong if not {*outside} & {site, *energies[site].followed}]
     site = max(ours or wrong, key=worst.__getitem__)
     energy = energies[site]
@@ -286,14 +283,14 @@ def _judge_site_balances(run: FunctionalFacts) -> StabilityVerdict | None:
     text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
     if not ours:
         why = f"the arm of {', '.join(outside)}, outside of the program, does not move as its theta says"
-        return _say(StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it")
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it")
     clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
     certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
-    return _say(StabilityFinding.BROKEN, f"{text}: {why}")
+    return StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {why}")
 
 
-def _judge_torques(run: FunctionalFacts) -> StabilityVerdict | None:
+def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Recorded torques are not those of Eq. (13)."""
     for site, energy in run.energies.items():
         error, records = energy_terms.measure_torque_error(energy.motion), energy.motion.records
@@ -301,23 +298,27 @@ def _judge_torques(run: FunctionalFacts) -> StabilityVerdict | None:
         if wrong.any():
             off = f"{error.max():.3g} N m, from {records.t_s[int(np.argmax(wrong))]:.4g} s on"
             text = f"the torque of {site} is not that of Eq. (13), by up to {off}: {FALSE_RECORDS_TEXT}"
-            return _say(StabilityFinding.BROKEN, text)
+            return StabilityVerdict(StabilityFinding.BROKEN, text)
     return None
 
 
-def _judge_weights(run: FunctionalFacts) -> StabilityVerdict | None:
+def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """There is no unique beta."""
-    return _say(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups)) if run.groups else None
+    return (
+        StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
+        if run.groups
+        else None
+    )
 
 
-def _judge_precision(run: FunctionalFacts) -> StabilityVerdict | None:
+def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """The energies are known too badly."""
     scale, tolerance = run.balance.scale, run.tolerance
     if tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
     known = f"its energies are known only to {tolerance:.3g} J of {scale:.4g} J"
     why = f"the period is too long for these gains, so that {known}"
-    return _say(StabilityFinding.NOT_JUDGED, why)
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, why)
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
@@ -344,8 +345,8 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
 
 
-DOUBTS = (_judge_site_balances, _judge_torques, _judge_weights, _judge_precision)
-"""What keeps V from being judged, or refutes the log, in this order."""
+JUDGEMENTS = (_judge_site_balances, _judge_torques, _judge_weights, _judge_precision, _judge_course)
+"""What refutes the log, what keeps V from being judged, and what V did: the first that applies decides."""
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
