@@ -475,7 +475,10 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))
-    away = [_distance_rad(end, [q for q in starts if len(q) == len(end)]) for end in ends]
+    away = []  # of each site the joint that is furthest from where any start pose of such an arm has it
+    for end in ends:
+        alike = np.array([q for q in starts if len(q) == len(end)])
+        away.append(float(np.maximum(alike.min(axis=0) - end, end - alike.max(axis=0)).max()))
     n = int(np.argmax(away))
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
@@ -492,11 +495,6 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
         for name, q in ends.items()
         if arms[name].hanging_angle(q) < HANGING_RAD <= arms[name].hanging_angle(starts[name])
     ]
-
-
-def _distance_rad(q: Array, starts: Sequence[Array]) -> float:
-    """Returns by how much the joint that is furthest from where any start pose has it is."""
-    return float(np.maximum(np.min(starts, axis=0) - q, q - np.max(starts, axis=0)).max())
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:

@@ -5,7 +5,7 @@ import pytest
 
 import trilat_net
 from trilat_net.analysis.certificate.premises import Premise, check_premises, gather_facts
-from trilat_net.analysis.certificate.wall_energy import find_wall_energies
+from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario

@@ -31,6 +31,11 @@ from ..dominance_history import DominanceHistory
 from ..following import Following, follow_rows
 from ..torque_sources import TorqueSplit
 
+RATE_TOLERANCE = 1e-12
+"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
+JUMP_TOLERANCE = 1e-12
+"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
+
 
 class SiteConstants(NamedTuple):
     """Constants of a site; vectors per joint have shape (n,), per parameter (P,).
@@ -200,9 +205,7 @@ class SiteMotion:
         low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
         high = -low
         if np.any(np.isfinite(c.tau_rate)):
-            before = np.vstack(
-                [np.zeros(at.tau.shape[1]), at.tau[:-1]]
-            )  # before the first tick there is none
+            before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])  # the first tick has none before it
             most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
             most[0] = most[0] if at.first == 0 else np.inf
             low, high = np.maximum(low, before - most), np.minimum(high, before + most)
@@ -212,10 +215,8 @@ class SiteMotion:
     def cut(self) -> Bools:
         """True for each torque at its limit, or as far from the one before as it may be, shape (K, n)."""
         low, high = self.nearest_torques
-        near = (
-            RATE_TOLERANCE * self.constants.tau_limit if np.any(np.isfinite(self.constants.tau_rate)) else 0.0
-        )
-        tau = self.records.tau
+        c, tau = self.constants, self.records.tau
+        near = RATE_TOLERANCE * c.tau_limit if np.any(np.isfinite(c.tau_rate)) else 0.0
         found: Bools = (tau <= low + near) | (tau >= high - near)
         return found & ~self.rests[:, np.newaxis]
 
@@ -459,16 +460,11 @@ def singular_pose_work(site: SiteMotion) -> Increment:
     Both are zero where J J+ = I.
     """
     at, c, ends = site.records, site.constants, site.ends
-    ends_of_e = (
-        (at.e[:-1], slice(0, -1), ends.qd_des_left),
-        (
-            2.0 * ends.e_middle - at.e[1:],
-            slice(1, None),
-            ends.qd_des_right,
-        ),
-    )
     powers = []
-    for (e, rows, qd_des), r in zip(ends_of_e, (ends.r_left, ends.r_right), strict=True):
+    for e, rows, qd_des, r in (
+        (at.e[:-1], slice(0, -1), ends.qd_des_left, ends.r_left),
+        (2.0 * ends.e_middle - at.e[1:], slice(1, None), ends.qd_des_right, ends.r_right),
+    ):
         missed, a_missed = site.follows.miss(rows, e)
         ed = at.shared_rate[rows] - qd_des
         power = -(missed * c.Kd * ed).sum(axis=1)
@@ -507,12 +503,6 @@ def estimate_work(site: SiteMotion) -> Increment:
         amount = np.where(at_edge, 0.5 * (off[:-1] + off[1:]) * held / c.Gamma, 0.0).sum(axis=1)
     power = np.where(wrong, site.Yr * off, 0.0).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:], amount)
-
-
-RATE_TOLERANCE = 1e-12
-"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
-JUMP_TOLERANCE = 1e-12
-"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:

@@ -22,6 +22,7 @@ from ..dominance_history import list_losses
 from ..following import TaskFollowing
 from ..lyapunov_weights import compute_lyapunov_weights, find_closed_groups, find_kd_scales
 from ..timeline import find_mode_intervals, recorded_end_s
+from ..torque_sources import find_wall_energies, list_sampled_walls
 from .energy_balance import (
     ZERO_ENERGY_J,
     EnergyBalance,
@@ -32,7 +33,6 @@ from .energy_balance import (
     rise_above_minimum,
 )
 from .energy_terms import SiteConstants, derive_site_constants
-from .wall_energy import find_wall_energies, list_sampled_walls
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages that differ by no more are one: stamps are whole nanoseconds."""
@@ -94,8 +94,7 @@ class FunctionalFacts(NamedTuple):
 
     Attributes:
         log: of the run.
-        constants, energies: of every site.
-        balance: of all sites.
+        energies, balance: of every site, and of all together.
         groups: the closed groups for which there is at some time no unique beta; () if there is one.
         absent: when sites were away.
         unjudged: the times between which records are missing though all sites were there, s.
@@ -103,7 +102,6 @@ class FunctionalFacts(NamedTuple):
     """
 
     log: Log
-    constants: dict[str, SiteConstants]
     energies: dict[str, SiteEnergy]
     balance: EnergyBalance
     groups: tuple[tuple[str, ...], ...]
@@ -143,16 +141,16 @@ def gather_facts(log: Log) -> RunFacts:
     if not balance.judged.any():
         return RunFacts(log, constants, unknown=NO_PERIOD)
     closed = map(find_closed_groups, find_dominance_matrices(energies))
-    several = next((groups for groups in closed if len(groups) > 1), ())
-    groups = tuple(tuple(log.sites[n] for n in group) for group in several)
-    sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
-    tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
-    unjudged = [
+    groups = next((groups for groups in closed if len(groups) > 1), ())
+    named = tuple(tuple(log.sites[n] for n in group) for group in groups)
+    there = [
         (from_s, to_s)
         for from_s, to_s in find_unjudged_spans(balance)
         if not any(away.from_s < to_s and from_s < away.to_s for away in absent)
     ]
-    known = FunctionalFacts(log, constants, energies, balance, groups, absent, unjudged, tolerance)
+    sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
+    tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
+    known = FunctionalFacts(log, energies, balance, named, absent, there, tolerance)
     return RunFacts(log, constants, known)
 
 
@@ -222,7 +220,7 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         lost = list_losses(run.log)
         why = f": {_list(lost)}; those that are left follow each other" if lost else ""
         return Premise("shares", False, f"the shares of {_list(changing)} change{why}")
-    Kd = np.array([c.weighing_Kd for c in run.constants.values()])
+    Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
     groups = [tuple(names[n] for n in group) for group in weights.groups]
     if len(groups) > 1:
@@ -364,7 +362,7 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     if gave <= 1e-9 * balance.scale + ZERO_ENERGY_J:
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(pushed_s[site][-1] for site in sites)
-    r = "qd - v" if any(c.axes for c in run.constants.values()) else "qd + Lambda e"
+    r = "qd - v" if any(energy.motion.constants.axes for energy in energies.values()) else "qd + Lambda e"
     text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
     ages_s = [energy.largest_age_s for energy in energies.values()]
     free_s, least_s = float(balance.t_s[-1] - let_go_s), max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))

@@ -245,8 +245,10 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
     end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
     found = Certificate(premises, verdict, end, collect_evidence(run, min_coverage), observed=observed)
-    if known is None or known.groups:
-        return found if known is None else replace(found, groups=known.groups, energies=known.energies)
+    if known is None:
+        return found
+    if known.groups:
+        return replace(found, groups=known.groups, energies=known.energies)
     alike = np.allclose(known.balance.beta, 1.0)
     ones = None if alike else compute_energy_balance(known.energies, ones=True)
     return replace(found, balance=known.balance, ones=ones, energies=known.energies)
