@@ -131,7 +131,7 @@ STATED: list[tuple[str, str, float, float]] = [
         certificates.BROKEN_BALANCE_SHARE,
     ),
     ("certificate.md", "less than 1e-3 is unexplained", 1e-3, certificates.CLEAR_BREAK_SHARE),
-    ("certificate.md", "up to 1e-4 of the largest energy", 1e-4, certificates.SAMPLING_RISE_SHARE),
+    ("certificate.md", "up to 1e-4 of the largest energy", 1e-4, premises.SAMPLING_RISE_SHARE),
     ("certificate.md", "more than 1e-2 of the largest energy", 1e-2, certificates.COARSE_TOLERANCE_SHARE),
     ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
     ("certificate.md", "`--min-coverage` (0.999)", 0.999, accounting.MIN_COVERAGE),

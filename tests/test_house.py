@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
-from . import house
+from . import house, reading_walk
 
 ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
 PLUG_INS = {"main", *set.intersection(*(house.definitions(house.ROOT / path) for path in ARM_STAGES))}
@@ -34,6 +34,13 @@ def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
     assert len(lines) <= 316
     assert sum(lines) <= 70_600  # 69 300, and 1 300 of the 2 000 that issue 28 allows
+
+
+def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
+    """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
+    found = reading_walk.walk_to_judgement()
+    assert len(found.stays) <= 60
+    assert len(found.returns) <= 19
 
 
 def test_no_test_imports_another() -> None:

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend, fit_envelope
+from trilat_net.analysis.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,10 @@ rates = st.floats(0.02, 0.6)
 scales = st.floats(1e-3, 1e3)
 quick = st.floats(3.0, 40.0)  # rad/s: a peak in every window
 phases = st.floats(0.0, 2.0 * math.pi)
+
+
+def fit_envelope(t_s: np.ndarray, envelope: np.ndarray) -> EnvelopeFit:
+    return fit_envelopes(t_s, envelope[:, np.newaxis])[0]
 
 
 def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.0) -> Array:

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import trilat_net
-from trilat_net.analysis.certificate.energy_terms import explain_missing_functional
-from trilat_net.analysis.certificate.premises import Evidence
+from trilat_net.analysis.certificate.premises import Evidence, explain_no_functional
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
     StabilityFinding,
@@ -593,7 +592,7 @@ def say_of_run(scenario: Scenario) -> str:
     V, if the law has one, takes all records, and so do ages that vary.
     """
     varies = not all(map(is_constant_link, scenario.links.values()))
-    if varies or not any(map(explain_missing_functional, scenario.sites.values())):
+    if varies or not explain_no_functional(scenario):
         return say_of(trilat_net.simulate(scenario))
     run = RunInMemory(scenario)
     no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")

@@ -154,11 +154,9 @@ class PlanarArmRows(NamedTuple):
         """Returns the end effector in the plane."""
         return compute_end_effector(self.lengths_m, q, qd)
 
-    def hangs(self, q: Array) -> bool:
-        """True if both links hang, in one pose, shape (2,)."""
-        return all(
-            abs(math.remainder(angle + math.pi / 2.0, math.tau)) < HANGING_RAD for angle in np.cumsum(q)
-        )
+    def hanging_angle(self, q: Array) -> float:
+        """Returns how far from straight down the link is that hangs least, in one pose, shape (2,), rad."""
+        return max(abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in np.cumsum(q))
 
 
 @leaf
@@ -328,14 +326,17 @@ class ChainArmRows(NamedTuple):
         found: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, later)
         return found.transpose(0, 2, 1)
 
-    def hangs(self, q: Array) -> bool:
-        """True if a pose, shape (n,), stores hardly more energy than any: as a pendulum within `HANGING_RAD`.
+    def hanging_angle(self, q: Array) -> float:
+        """Returns at which angle a pendulum stores as much of its energy as the chain in a pose, (n,), rad.
 
         The least and the largest energy are looked for from this pose on, joint by joint; stops do not count.
+        What has no weight never hangs: infinity.
         """
         low, high = self._find_extreme_energy(q, 1.0), self._find_extreme_energy(q, -1.0)
-        above = float(self.potential_energy(q[np.newaxis])[0]) - low
-        return high - low > _NO_WEIGHT_J and above < 0.5 * (1.0 - math.cos(HANGING_RAD)) * (high - low)
+        if high - low <= _NO_WEIGHT_J:
+            return math.inf
+        share = (float(self.potential_energy(q[np.newaxis])[0]) - low) / (high - low)
+        return math.acos(min(max(1.0 - 2.0 * share, -1.0), 1.0))
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
         """Returns the least energy (sign 1) or the largest (-1), by turns of one revolute joint at a time.

@@ -37,10 +37,6 @@ class DominanceHistory(NamedTuple):
         """True if nothing changes."""
         return bool(np.all(self.alpha == self.alpha[0]) and not self.rate.any())
 
-    def follows(self, peer: int) -> bool:
-        """True if a peer, by its index, ever has a share."""
-        return bool(self.alpha[:, peer].any())
-
 
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     """Returns the dominance factors of a site at ticks in a row, s.

@@ -79,22 +79,14 @@ class EnvelopeFit(NamedTuple):
         return self.text if still else f"{self.rate_per_s:+.3g}/s"
 
 
-def fit_envelope(t_s: Array, error_rad: Array) -> EnvelopeFit:
-    """Returns the trend of an envelope; the module's docstring defines it.
-
-    Times ascend, shape (K,), s; the largest |e| is that at each time, or since the time before.
-    """
-    return fit_envelopes(t_s, error_rad[:, np.newaxis])[0]
-
-
 def fit_envelopes(
     t_s: Array, values: Array, floor: float = FLOOR_RAD, *, falls_first: bool = False
 ) -> list[EnvelopeFit]:
-    """Returns the trends of several envelopes, shape (K, C), see `fit_envelope`.
+    """Returns the trends of several envelopes; the module's docstring defines them.
 
     Args:
-        t_s: ascending times, s.
-        values: the envelopes.
+        t_s: ascending times, shape (K,), s.
+        values: the largest |e| at each time, or since the time before, shape (K, C).
         floor: takes the place of `FLOOR_RAD`.
         falls_first: what rises after a fall grows as well: the fall is known to be that of other modes.
     """

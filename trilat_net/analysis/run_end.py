@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
 from ..core.ticks import BUCKETS_PER_S
@@ -24,8 +25,8 @@ from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
-from .arm_rows import build_arm_rows
-from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelope, fit_envelopes
+from .arm_rows import HANGING_RAD, build_arm_rows
+from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
 from .torque_sources import compute_operator_script
 
@@ -303,8 +304,7 @@ def _find_worst_joint(
             settles = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
             rests = end_speed <= SETTLED_SPEED_RAD_S and (still or (speed.calm and settles))
             behaviour = _classify_joint(error, speed, end_error, end_speed, still=still, rests=rests)
-            if behaviour in _MOVES_ON or (behaviour is EndBehaviour.CONVERGED and not still):
-                behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s)
+            behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s, still=still)
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
             joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
     end_s = float(t_s[-1]) if len(t_s) else 0.0
@@ -390,14 +390,17 @@ def _classify_joint(
     return EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
 
 
-def _name_motion(behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array) -> EndBehaviour:
-    """Returns the class of a joint that moves on, by where it goes in the judged half.
+def _name_motion(
+    behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array, *, still: bool
+) -> EndBehaviour:
+    """Returns the class of a joint, and of one that moves on by where it goes in the judged half.
 
     It drifts if every quarter takes half of its share or more in one way, and its mean speed is at least half
     of the largest: what swings on its way is no drift. A bounded oscillation changes its sign. What is as
     slow as at rest, and goes one way, is undecided before that.
     """
-    if len(t_s) < BUCKETS_PER_S:
+    moves = behaviour in _MOVES_ON or (behaviour is EndBehaviour.CONVERGED and not still)
+    if not moves or len(t_s) < BUCKETS_PER_S:
         return behaviour
     first = int(np.searchsorted(t_s, 0.5 * (t_s[0] + t_s[-1])))
     marks = np.linspace(first, len(t_s) - 1, 5).round().astype(int)
@@ -443,28 +446,29 @@ def _find_disagreement(
         q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)
         joint = int(apart[-1].argmax())
-        nearer = fit_envelope(t_s, apart.max(axis=1)).trend is EnvelopeTrend.DECAYS
+        nearer = fit_envelopes(t_s, apart.max(axis=1, keepdims=True))[0].trend is EnvelopeTrend.DECAYS
         pulled = max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM
         held = pulled and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
-        at = q[[_is_held(scenario, trace, n, joint, float(t_s[-1])) for n in group], -1, joint]
+        at = q[_find_held_sites(scenario, trace, joint, float(t_s[-1]))[group], -1, joint]
         held |= len(at) > 0 and apart[-1, joint] - np.ptp(at) < AGREEMENT_RAD
         if apart[-1, joint] > AGREEMENT_RAD and not (nearer or held):
             ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
             yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
 
 
-def _is_held(scenario: Scenario, trace: RunTrace, n: int, joint: int, end_s: float) -> bool:
-    """Returns if a joint is held at the end, by the stiffness of a hand, or of what it touches.
+def _find_held_sites(scenario: Scenario, trace: RunTrace, joint: int, end_s: float) -> NDArray[np.bool_]:
+    """Returns at which sites a joint is held at the end, by the stiffness of a hand, or of what is touched.
 
     A hand at the place that it wants needs no torque, and holds all the same. An own kind is taken to hold.
     """
-    spec = scenario.sites[scenario.names[n]]
-    touched = spec.environment if np.abs(trace.tau_x[n]).max() > FORCE_NM else ()
-    for actor in (one.actor for one in (*spec.hands, *touched)):
-        stiffness = actor.K[joint : joint + 1] if actor.acts == TorqueKind.HAND else actor.K
-        if actor.start_s <= end_s < actor.end_s and (any(stiffness) or actor.acts in OWN_KINDS):
-            return True
-    return False
+    held = np.zeros(len(scenario.names), dtype=np.bool_)
+    for n, (spec, tau_x) in enumerate(zip(scenario.sites.values(), trace.tau_x, strict=True)):
+        touched = spec.environment if np.abs(tau_x).max() > FORCE_NM else ()
+        for actor in (one.actor for one in (*spec.hands, *touched)):
+            stiffness = actor.K[joint : joint + 1] if actor.acts == TorqueKind.HAND else actor.K
+            stiff = any(stiffness) or actor.acts in OWN_KINDS
+            held[n] |= actor.start_s <= end_s < actor.end_s and stiff
+    return held
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
@@ -472,7 +476,10 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))
-    away = [_distance_rad(end, [q for q in starts if len(q) == len(end)]) for end in ends]
+    away = []  # of each site the joint that is furthest from where any start pose of such an arm has it
+    for end in ends:
+        alike = np.array([q for q in starts if len(q) == len(end)])
+        away.append(float(np.maximum(alike.min(axis=0) - end, end - alike.max(axis=0)).max()))
     n = int(np.argmax(away))
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
@@ -484,12 +491,11 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
     """Returns the sites, of those whose last angles are given, whose arms hang and did not at the start."""
     arms = {name: build_arm_rows(scenario, name) for name in ends}
     starts = {name: np.array(scenario.sites[name].q0_rad) for name in ends}
-    return [name for name, q in ends.items() if arms[name].hangs(q) and not arms[name].hangs(starts[name])]
-
-
-def _distance_rad(q: Array, starts: Sequence[Array]) -> float:
-    """Returns by how much the joint that is furthest from where any start pose has it is."""
-    return float(np.maximum(np.min(starts, axis=0) - q, q - np.max(starts, axis=0)).max())
+    return [
+        name
+        for name, q in ends.items()
+        if arms[name].hanging_angle(q) < HANGING_RAD <= arms[name].hanging_angle(starts[name])
+    ]
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:

@@ -10,7 +10,7 @@ is the slope of log A over the judged part, with the bounds and words of `envelo
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -132,17 +132,16 @@ class TwinGrowth(NamedTuple):
     @property
     def grows(self) -> bool:
         """True if half of the pushes of some sites or more grow; by a factor of two if links are random."""
-        least = DOUBLES if self.random else 1.0
-        return self._find_half(lambda one: one.trend is EnvelopeTrend.GROWS and one.factor >= least)
+        return self.grow_by(DOUBLES if self.random else 1.0, always=True)
 
-    @property
-    def doubles(self) -> bool:
-        """True if half of the pushes of some sites or more double, if not all the time."""
-        return self._find_half(lambda one: one.factor >= DOUBLES)
-
-    def _find_half(self, holds: Callable[[PushGrowth], bool]) -> bool:
-        groups = [[one for one in self.pushes if one.group == place] for place in range(len(self.pushes))]
-        return any(group and 2 * sum(map(holds, group)) >= len(group) for group in groups)
+    def grow_by(self, factor: float, *, always: bool) -> bool:
+        """True if half of the pushes of some sites or more grow by a factor; `always`: all the time."""
+        for place in {one.group for one in self.pushes}:
+            group = [one for one in self.pushes if one.group == place]
+            grown = [one for one in group if one.factor >= factor]
+            if 2 * sum(one.trend is EnvelopeTrend.GROWS or not always for one in grown) >= len(group):
+                return True
+        return False
 
     @property
     def needs_s(self) -> float | None:
@@ -152,10 +151,12 @@ class TwinGrowth(NamedTuple):
             return None
         return self.to_s + 4.0 * math.log(2.0) / -worst.rate_per_s
 
-    def excludes(self, rate_per_s: float) -> bool:
-        """True if every push dies away in a time in which one at this rate had grown by `CLEAR_GROWTH`."""
-        clear = rate_per_s * (self.to_s - self.from_s) > math.log(CLEAR_GROWTH)
-        return clear and self.trend is EnvelopeTrend.DECAYS
+    @property
+    def excluded_rate_per_s(self) -> float:
+        """A push at a larger rate had grown by `CLEAR_GROWTH`, 1/s; infinite unless every push dies away."""
+        judged_s = self.to_s - self.from_s
+        dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
+        return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
         """Returns what is found, ready for JSON."""
@@ -232,7 +233,7 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
     falls = (
         end.speed.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) and end.end_speed_rad_s > FLOOR_RAD
     )
-    grows = (twins.grows or (settles is False and twins.doubles)) and not falls
+    grows = (twins.grows or (settles is False and twins.grow_by(DOUBLES, always=False))) and not falls
     left = twins.left is not None and end.behaviour is not EndBehaviour.COASTS
     if (grows or left) and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)

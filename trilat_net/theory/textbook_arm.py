@@ -18,6 +18,7 @@ which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n'
 M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors.
 """
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,71 +37,20 @@ _INERTIA_PLACES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
 
 
-def inertia_matrix(theta: Numbers, q: Numbers) -> Numbers:
-    """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
-    coupling = theta[2] + theta[1] * np.cos(q[1])
-    inner = theta[0] + 2.0 * theta[1] * np.cos(q[1])
-    return np.array([[inner, coupling], [coupling, theta[2] + 0.0 * coupling]])
-
-
-def coriolis_matrix(theta: Numbers, q: Numbers, qd: Numbers) -> Numbers:
-    """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
-    h = -theta[1] * np.sin(q[1])
-    return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
-
-
-def gravity_torque(theta: Numbers, g: float, q: Numbers) -> Numbers:
-    """Returns G(q), shape (2, ...), N m."""
-    outer = theta[4] * g * np.cos(q[0] + q[1])
-    return np.array([theta[3] * g * np.cos(q[0]) + outer, outer])
-
-
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
     """Returns the product of a matrix, shape (a, b, ...), and a vector, shape (b, ...)."""
     product: Numbers = np.einsum("ab...,b...->a...", matrix, vector)
     return product
 
 
-def required_torque(theta: Numbers, g: float, q: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-    """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
-    torque: Numbers = (
-        multiply_columns(inertia_matrix(theta, q), a)
-        + multiply_columns(coriolis_matrix(theta, q, qd), v)
-        + gravity_torque(theta, g, q)
-    )
-    return torque
+def solve_columns(A: Numbers, b: Numbers) -> Numbers:
+    """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
+    solved = np.linalg.solve(np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis])
+    return np.moveaxis(solved[..., 0], -1, 0)
 
 
-def regressor_matrix(g: float, q: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-    """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque that theta = e_p needs."""
-    units = np.multiply.outer(np.eye(5), np.ones(q.shape[1:]))
-    return np.stack([required_torque(unit, g, q, qd, v, a) for unit in units], axis=1)
-
-
-def joint_acceleration(theta: Numbers, g: float, q: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-    """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
-    at_no_acceleration = required_torque(theta, g, q, qd, qd, np.zeros_like(qd))
-    M = np.moveaxis(inertia_matrix(theta, q), (0, 1), (-2, -1))
-    force = np.moveaxis(torque - at_no_acceleration, 0, -1)[..., np.newaxis]
-    return np.moveaxis(np.linalg.solve(M, force)[..., 0], -1, 0)
-
-
-def end_effector_position(lengths_m: tuple[float, float], q: Numbers) -> Numbers:
-    """Returns the position of the end effector, shape (2, ...), m, from the base."""
-    l1_m, l2_m = lengths_m
-    q12 = q[0] + q[1]
-    return np.array([l1_m * np.cos(q[0]) + l2_m * np.cos(q12), l1_m * np.sin(q[0]) + l2_m * np.sin(q12)])
-
-
-def position_jacobian(lengths_m: tuple[float, float], q: Numbers) -> Numbers:
-    """Returns the Jacobian of the end effector's position, shape (2, 2, ...), m/rad: rows x and y."""
-    l1_m, l2_m = lengths_m
-    q12 = q[0] + q[1]
-    s, c = l2_m * np.sin(q12), l2_m * np.cos(q12)
-    return np.array([[-l1_m * np.sin(q[0]) - s, -s], [l1_m * np.cos(q[0]) + c, c]])
-
-
-class PlacedArm(NamedTuple):
+@dataclass(frozen=True)
+class PlacedArm:
     """The planar arm in the poses q: the same methods as `PlacedChain`.
 
     Attributes:
@@ -113,33 +63,55 @@ class PlacedArm(NamedTuple):
     lengths_m: tuple[float, float]
     q: Numbers
 
-    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12)."""
-        return regressor_matrix(self.g_m_s2, self.q, qd, v, a)
+    def inertia_matrix(self, theta: Numbers) -> Numbers:
+        """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
+        bend = theta[1] * np.cos(self.q[1])
+        coupling = theta[2] + bend
+        return np.array([[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]])
+
+    def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
+        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
+        h = -theta[1] * np.sin(self.q[1])
+        return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
+
+    def gravity_torque(self, theta: Numbers) -> Numbers:
+        """Returns G(q), shape (2, ...), N m."""
+        outer = theta[4] * self.g_m_s2 * np.cos(self.q[0] + self.q[1])
+        return np.array([theta[3] * self.g_m_s2 * np.cos(self.q[0]) + outer, outer])
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m."""
-        return required_torque(theta, self.g_m_s2, self.q, qd, v, a)
+        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
+        moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
+        torque: Numbers = (
+            multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
+        )
+        return torque
+
+    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta = e_p."""
+        units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
+        return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
 
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns zeros: this arm has no friction in its joints."""
         return 0.0 * v
 
-    def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns G(q), shape (2, ...), N m."""
-        return gravity_torque(theta, self.g_m_s2, self.q)
-
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns qdd, shape (2, ...), rad/s^2."""
-        return joint_acceleration(theta, self.g_m_s2, self.q, qd, torque)
+        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
+        at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
+        return solve_columns(self.inertia_matrix(theta), torque - at_no_acceleration)
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector, shape (2, ...), m."""
-        return end_effector_position(self.lengths_m, self.q)
+        """Returns the position of the end effector from the base, shape (2, ...), m."""
+        (l1_m, l2_m), inner, outer = self.lengths_m, self.q[0], self.q[0] + self.q[1]
+        x, y = l1_m * np.cos(inner) + l2_m * np.cos(outer), l1_m * np.sin(inner) + l2_m * np.sin(outer)
+        return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns its Jacobian, shape (2, 2, ...), m/rad."""
-        return position_jacobian(self.lengths_m, self.q)
+        """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
+        x, y = self.end_effector_position()
+        outer = self.q[0] + self.q[1]
+        return np.array([[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]])
 
 
 def build_cross_matrix(a: Numbers) -> Numbers:
@@ -273,9 +245,8 @@ class PlacedChain:
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
         """Returns qdd of M qdd + C qd + G + friction = torque + stops, Eq. (8), shape (n, ...)."""
         at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
-        M = np.moveaxis(self.inertia_matrix(theta), (0, 1), (-2, -1))
-        force = np.moveaxis(torque + self._stop_torque(qd) - at_no_acceleration, 0, -1)[..., np.newaxis]
-        return np.moveaxis(np.linalg.solve(M, force)[..., 0], -1, 0)
+        force = torque + self._stop_torque(qd) - at_no_acceleration
+        return solve_columns(self.inertia_matrix(theta), force)
 
     def _stop_torque(self, qd: Numbers) -> Numbers:
         """Returns the torque of the stops on the joints: springs and dampers that never pull."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..core.site_setup import SiteSetup, TaskSetup
 from ..core.vectors import Array
-from .textbook_arm import Numbers, PlacedChain, build_cross_matrix, multiply_columns
+from .textbook_arm import Numbers, PlacedChain, build_cross_matrix, multiply_columns, solve_columns
 
 PLACE_COORDINATES = 3
 """Coordinates of a task that are a place; those behind it are a rotation vector."""
@@ -141,13 +141,7 @@ class Following(NamedTuple):
         """Returns the force on the coordinates that a torque of the joints amounts to, shape (m, ...)."""
         if self.J is None or self.A is None:
             return torque
-        return _solve(self.A, multiply_columns(self.J, torque))
-
-
-def _solve(A: Numbers, b: Numbers) -> Numbers:
-    """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
-    solved = np.linalg.solve(np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis])
-    return np.moveaxis(solved[..., 0], -1, 0)
+        return solve_columns(self.A, multiply_columns(self.J, torque))
 
 
 def follow_joints(Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_des: Numbers) -> Following:
@@ -190,10 +184,10 @@ def follow_in_task(
     A, least = _damp(task, J)
     posture = np.array(task.posture or site.q0).reshape(-1, *one)
     psi, psi_d = -task.posture_rate * (q - posture), -task.posture_rate * qd
-    y = _solve(A, -Lambda * e - multiply_columns(J, psi))
+    y = solve_columns(A, -Lambda * e - multiply_columns(J, psi))
     v = psi + multiply_columns(J.swapaxes(0, 1), y)
     psi_d = psi_d + multiply_columns(Jd.swapaxes(0, 1), y)
-    y_d = _solve(A, -Lambda * ed - multiply_columns(Jd, v) - multiply_columns(J, psi_d))
+    y_d = solve_columns(A, -Lambda * ed - multiply_columns(Jd, v) - multiply_columns(J, psi_d))
     a = psi_d + multiply_columns(J.swapaxes(0, 1), y_d)
     return Following(x, xd, e, ed, v, a, J, A, least)
 

@@ -79,7 +79,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
     energies = compute_site_energies(rough_log())
     whole = compute_energy_balance(energies)
     assert np.abs(whole.unexplained).max() <= 2e-4 * whole.V.max()
-    assert {"stops", "hands", "walls"} == set(whole.external_sources)
+    assert {"stops", "hands", "walls"} == set(whole.external)
     for site, name in (("s", "friction"), ("m2", "friction"), ("m2", "stops"), ("s", "walls")):
         energy = energies[site]
         kinds = {

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.certificate.premises import Premise
-from trilat_net.analysis.certificate.wall_energy import check_sampled_walls, find_wall_energies
+from trilat_net.analysis.certificate.premises import Premise, check_premises, gather_facts
+from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
@@ -19,7 +19,7 @@ def run(**changes: object) -> Log:
 
 
 def premise(log: Log) -> Premise | None:
-    return next((one for one in check_sampled_walls(log)), None)
+    return next((one for one in check_premises(gather_facts(log)) if one.name == "walls"), None)
 
 
 def damper(b: float, **more: object) -> list[dict[str, object]]:

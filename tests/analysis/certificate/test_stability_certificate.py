@@ -8,13 +8,8 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.certificate.premises import find_unjudged_spans
-from trilat_net.analysis.certificate.stability_certificate import (
-    NO_COMMON_TIME,
-    NO_PERIOD,
-    StabilityFinding,
-    certify,
-)
+from trilat_net.analysis.certificate.premises import NO_COMMON_TIME, NO_PERIOD, find_unjudged_spans
+from trilat_net.analysis.certificate.stability_certificate import StabilityFinding, certify
 from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import LogError
 from trilat_net.log.log_reader import Log

@@ -15,7 +15,7 @@ from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
-from ..aligned import AlignedRecords, Bools, PeerTrajectory, align_records, view_delayed_peer
+from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory, align_records, view_delayed_peer
 from ..dominance_history import DominanceHistory, trace_dominance
 from ..lyapunov_weights import compute_lyapunov_weights
 from ..torque_sources import split_torque
@@ -39,7 +39,6 @@ class SiteEnergy:
         dissipation, work: by kind, and by source.
         transfer: to the sites that follow it, less what it gets from those that it follows.
         sampling: the work of the scheme that samples the continuous law.
-        judged: True if a period follows from records alone, shape (K - 1,).
     """
 
     motion: SiteMotion
@@ -48,7 +47,12 @@ class SiteEnergy:
     transfer: Increment
     work: dict[str, Increment]
     sampling: Increment
-    judged: Bools
+
+    @cached_property
+    def judged(self) -> Bools:
+        """True if a period follows from records alone, shape (K - 1,)."""
+        known = [self.motion.records.known_periods, *(view.known for view in self.followed.values())]
+        return np.asarray(np.logical_and.reduce(known))
 
     @cached_property
     def residual(self) -> Array:
@@ -64,15 +68,21 @@ class SiteEnergy:
         return self.residual - _accumulate(self.sampling.total, self.judged)
 
     @property
-    def followed(self) -> set[str]:
-        """The peers that ever have a share."""
-        return {peer for j, peer in enumerate(self.motion.peers) if self.motion.dominance.follows(j)}
+    def followed(self) -> dict[str, DelayedPeer]:
+        """The peers that ever have a share, as the site sees them."""
+        views = enumerate(self.motion.peers.items())
+        return {peer: view for j, (peer, view) in views if self.motion.dominance.alpha[:, j].any()}
+
+    @property
+    def largest_age_s(self) -> float:
+        """The largest age of a sample in use, s; 0 if none came into use."""
+        ages_s = [self.motion.records.t_s - view.stamp_s for view in self.followed.values()]
+        return max((float(np.nanmax(age_s)) for age_s in ages_s if np.isfinite(age_s).any()), default=0.0)
 
     @property
     def begin_s(self) -> float:
         """The first tick at which everything in transit follows from records, s; infinite without one."""
-        followed = [view for peer, view in self.motion.peers.items() if peer in self.followed]
-        seen = [view.seen.known & view.now.known for view in followed]
+        seen = [view.seen.known & view.now.known for view in self.followed.values()]
         rows = np.flatnonzero(np.logical_and.reduce(seen))
         return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
 
@@ -138,11 +148,9 @@ def derive_site_energies(
             dominance(site, own.t_s),
             {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
             split_torque(own, scenario),
-            Scheme[scenario.scheme.upper()] is Scheme.DIGITAL,
+            Scheme[scenario.scheme.upper()],
             common,
         )
-        views = enumerate(motion.peers.values())
-        known = [own.known_periods, *(v.known for j, v in views if motion.dominance.follows(j))]
         energies[site] = SiteEnergy(
             motion,
             energy_terms.evaluate_functional(motion),
@@ -150,7 +158,6 @@ def derive_site_energies(
             energy_terms.compute_transfer(motion, np.array(common or 1.0)),
             energy_terms.compute_work(motion),
             energy_terms.compute_sampling_work(motion),
-            np.logical_and.reduce(known),
         )
     return energies
 
@@ -221,9 +228,10 @@ class EnergyBalance:
         return _sum({name: self.work[name] for name in EXTERNAL_SOURCES if name in self.work})
 
     @property
-    def external_sources(self) -> list[str]:
-        """The sources of external work: hands, walls and stops, or some of them."""
-        return [name for name in EXTERNAL_SOURCES if name in self.work and self.work[name].any()]
+    def external(self) -> dict[str, Array]:
+        """That work by its sources, of those that did any: hands, walls and stops, shape (T,), J."""
+        names = [name for name in EXTERNAL_SOURCES if name in self.work]
+        return {name: self.work[name] for name in names if self.work[name].any()}
 
     @cached_property
     def scale(self) -> float:
@@ -353,6 +361,11 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
         steps = np.flatnonzero((dominance.alpha[1:] != dominance.before).any(axis=1)) + 1
         times += [t_s[turns], t_s[steps]]
     return _interpolate_dominance(energies, np.concatenate(times))
+
+
+def rise_above_minimum(values: Array) -> Array:
+    """Returns how far a quantity is above the least that it was until then, shape (T,)."""
+    return values - np.minimum.accumulate(values)
 
 
 def _sum(columns: Mapping[str, Array]) -> Array:

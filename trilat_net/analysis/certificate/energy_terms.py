@@ -21,14 +21,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.record_columns import Ints
-from ...scenario import Scenario, SiteSpec
+from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer
 from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
 from ..following import Following, follow_rows
 from ..torque_sources import TorqueSplit
+
+RATE_TOLERANCE = 1e-12
+"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
+JUMP_TOLERANCE = 1e-12
+"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
 
 
 class SiteConstants(NamedTuple):
@@ -40,7 +46,6 @@ class SiteConstants(NamedTuple):
         Gamma: adaptation gain.
         low, high: limits of the estimates.
         tau_limit: largest torque of a joint, N m, shape () or (n,).
-        outside: True if the arm is outside of the program: theta is then what its author states.
         axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and Kd are 0;
             () in joint space.
         rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of that, rad/s.
@@ -56,7 +61,6 @@ class SiteConstants(NamedTuple):
     low: Array
     high: Array
     tau_limit: Array
-    outside: bool = False
     axes: tuple[float, ...] = ()
     rho: Array | float = 0.0
     width: Array | float = 1.0
@@ -79,10 +83,10 @@ class SiteConstants(NamedTuple):
         return torque
 
     @property
-    def unknown_friction(self) -> bool:
-        """True if the joints have friction of which the law does not compensate all."""
-        moving = np.ones((1, len(self.Kp)))
-        return bool(np.any((self.friction != 1.0) & (self.arm.friction(moving) != 0.0)))
+    def unknown_friction(self) -> Array:
+        """The share of friction that the law does not compensate, of joints that have any, shape (n,)."""
+        share: Array = (1.0 - self.friction) * (self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0)
+        return share
 
     @property
     def adapts(self) -> Bools:
@@ -104,21 +108,8 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
         arm=arm,
         axes=() if task is None else task.axes,
         tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
-        outside=spec.plant == "external",
         tau_rate=np.asarray(spec.limits.motion.tau_rate, dtype=np.float64),
     )
-
-
-def explain_missing_functional(spec: SiteSpec) -> str:
-    """Returns the reason why a site has no functional; "" if it has one."""
-    if not spec.arm.known:
-        return "nobody knows the arm's theta, and V is made of it"
-    law = spec.control
-    if not law.has_functional:
-        return f"law {law.tag}, for which there is no such V"
-    if spec.task.space == "pose":
-        return "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
-    return ""
 
 
 class PeriodEnds(NamedTuple):
@@ -154,7 +145,7 @@ class SiteMotion:
     Attributes:
         dominance, peers: its factors for its peers, and these as the site sees them, in the same order.
         torque: ON its arm.
-        digital: True if the scheme holds tau_k, False if it extrapolates the torque.
+        scheme: whether it holds tau_k, or extrapolates the torque.
         common: per coordinate 1 if all sites follow along it, else 0; () if they follow along all.
     """
 
@@ -163,7 +154,7 @@ class SiteMotion:
     dominance: DominanceHistory
     peers: Mapping[str, DelayedPeer]
     torque: TorqueSplit
-    digital: bool = False
+    scheme: Scheme = Scheme.SECOND_ORDER
     common: tuple[float, ...] = ()
 
     @cached_property
@@ -187,7 +178,7 @@ class SiteMotion:
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
-        return self.Yr[:-1] if self.digital else 0.5 * (self.Yr[:-1] + self.Yr[1:])
+        return self.Yr[:-1] if self.scheme is Scheme.DIGITAL else 0.5 * (self.Yr[:-1] + self.Yr[1:])
 
     def law_torque(self, rows: Ints) -> Array:
         """Returns tau of Eq. (13), without its limit, in some rows, shape (K, n), N m."""
@@ -214,9 +205,7 @@ class SiteMotion:
         low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
         high = -low
         if np.any(np.isfinite(c.tau_rate)):
-            before = np.vstack(
-                [np.zeros(at.tau.shape[1]), at.tau[:-1]]
-            )  # before the first tick there is none
+            before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])  # the first tick has none before it
             most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
             most[0] = most[0] if at.first == 0 else np.inf
             low, high = np.maximum(low, before - most), np.minimum(high, before + most)
@@ -226,10 +215,8 @@ class SiteMotion:
     def cut(self) -> Bools:
         """True for each torque at its limit, or as far from the one before as it may be, shape (K, n)."""
         low, high = self.nearest_torques
-        near = (
-            RATE_TOLERANCE * self.constants.tau_limit if np.any(np.isfinite(self.constants.tau_rate)) else 0.0
-        )
-        tau = self.records.tau
+        c, tau = self.constants, self.records.tau
+        near = RATE_TOLERANCE * c.tau_limit if np.any(np.isfinite(c.tau_rate)) else 0.0
         found: Bools = (tau <= low + near) | (tau >= high - near)
         return found & ~self.rests[:, np.newaxis]
 
@@ -384,7 +371,7 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
         "rule": stale_rule_work(site),
         "torque limit": torque_limit_work(site),
         "estimates": estimate_work(site),
-        **({"friction": unknown_friction_work(site)} if site.constants.unknown_friction else {}),
+        **({"friction": unknown_friction_work(site)} if site.constants.unknown_friction.any() else {}),
         **({"singular poses": singular_pose_work(site)} if site.constants.axes else {}),
     }
 
@@ -473,16 +460,11 @@ def singular_pose_work(site: SiteMotion) -> Increment:
     Both are zero where J J+ = I.
     """
     at, c, ends = site.records, site.constants, site.ends
-    ends_of_e = (
-        (at.e[:-1], slice(0, -1), ends.qd_des_left),
-        (
-            2.0 * ends.e_middle - at.e[1:],
-            slice(1, None),
-            ends.qd_des_right,
-        ),
-    )
     powers = []
-    for (e, rows, qd_des), r in zip(ends_of_e, (ends.r_left, ends.r_right), strict=True):
+    for e, rows, qd_des, r in (
+        (at.e[:-1], slice(0, -1), ends.qd_des_left, ends.r_left),
+        (2.0 * ends.e_middle - at.e[1:], slice(1, None), ends.qd_des_right, ends.r_right),
+    ):
         missed, a_missed = site.follows.miss(rows, e)
         ed = at.shared_rate[rows] - qd_des
         power = -(missed * c.Kd * ed).sum(axis=1)
@@ -523,12 +505,6 @@ def estimate_work(site: SiteMotion) -> Increment:
     return _trapezoid(site, power[:-1], power[1:], amount)
 
 
-RATE_TOLERANCE = 1e-12
-"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
-JUMP_TOLERANCE = 1e-12
-"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
-
-
 def compute_sampling_work(site: SiteMotion) -> Increment:
     """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its step of (15).
 
@@ -537,7 +513,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     there. It is no part of the balance: what that leaves without this is unexplained.
     """
     at, c, ends = site.records, site.constants, site.ends
-    u = at.held_torque(c.tau_limit, digital=site.digital)
+    u = at.held_torque(c.tau_limit, digital=site.scheme is Scheme.DIGITAL)
     tau_right, Yr_right = _evaluate_before_jump(site)
     off_law = u - 0.5 * (at.tau[:-1] + tau_right)
     amount = at.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)

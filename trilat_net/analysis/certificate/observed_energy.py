@@ -98,11 +98,6 @@ class ObservedEnergy(NamedTuple):
     sampling_j: float = 0.0
     curves: Sequence[EnergyCurve] = ()
 
-    @property
-    def refuted(self) -> bool:
-        """True if an energy is below zero, or the books of a law do not add up."""
-        return self.finding in (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
-
     def to_json(self) -> JsonObject:
         """Returns it ready for JSON."""
         premises, least = ([one._asdict() for one in rows] for rows in (self.premises, self.least))
@@ -147,18 +142,13 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
             laws |= {name: law} if callable(getattr(law, "energies", None)) else {}
     if not laws:
         return None
-    if problem := _find_obstacle(log, laws):
-        return ObservedEnergy(ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {problem}")
-    return _judge(log, {name: _read_books(log, name, law) for name, law in laws.items()})
-
-
-def _find_obstacle(log: Log, laws: Mapping[str, object]) -> str:
-    """Returns what keeps the energies from being added up; "" for nothing."""
     silent = [name for name in log.sites if name not in laws]
-    if silent:
-        return f"the law of {', '.join(silent)} declares none"
     gaps = [name for name in log.sites if not len(log[name]) or log[name].missing or log[name].tick[0]]
-    return f"records of {', '.join(gaps)} are missing" if gaps else ""
+    if silent or gaps:
+        why = f"the law of {', '.join(silent)} declares none"
+        why = why if silent else f"records of {', '.join(gaps)} are missing"
+        return ObservedEnergy(ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {why}")
+    return _judge(log, {name: _read_books(log, name, law) for name, law in laws.items()})
 
 
 def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:

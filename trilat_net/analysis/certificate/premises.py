@@ -8,12 +8,11 @@ every other, one Kd up to a scalar per site, the adaptive law, and no operator o
 with respect to r.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.vectors import Array
 from ...log.accounting import Coverage
 from ...log.log_reader import Log, judge_integrity
 from ...log.running_digest import Integrity
@@ -21,13 +20,24 @@ from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import list_losses
 from ..following import TaskFollowing
-from ..lyapunov_weights import compute_lyapunov_weights, find_kd_scales
+from ..lyapunov_weights import compute_lyapunov_weights, find_closed_groups, find_kd_scales
 from ..timeline import find_mode_intervals, recorded_end_s
-from .energy_balance import ZERO_ENERGY_J, EnergyBalance, SiteEnergy
-from .energy_terms import SiteConstants, derive_site_constants, explain_missing_functional
+from ..torque_sources import find_wall_energies, list_sampled_walls
+from .energy_balance import (
+    ZERO_ENERGY_J,
+    EnergyBalance,
+    SiteEnergy,
+    compute_energy_balance,
+    compute_site_energies,
+    find_dominance_matrices,
+    rise_above_minimum,
+)
+from .energy_terms import SiteConstants, derive_site_constants
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages that differ by no more are one: stamps are whole nanoseconds."""
+SAMPLING_RISE_SHARE = 1e-4
+"""Rises up to this share of the scale are attributed to sampling if the residual is as large."""
 MIN_FREE_S = 1.0
 """The least free motion at the end of a run of which the theorem speaks, s; and so many times the largest age
 of a sample in use:"""
@@ -38,6 +48,11 @@ LEAST_SPEED_M_S = 1e-9
 """What rounding may leave of the speed along an axis along which an end effector cannot move."""
 MAX_LISTED_NAMES = 4
 """Links or sites that a sentence names."""
+
+
+NO_COMMON_TIME = "there is no time of which every site has records"
+NO_PERIOD = "there is no period of which all records are there"
+_OF_ORIENTATIONS = "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
 
 
 class Premise(NamedTuple):
@@ -53,51 +68,121 @@ class Premise(NamedTuple):
     text: str
 
 
-def check_scenario_premises(scenario: Scenario) -> list[Premise]:
-    """Returns the premises that the scenario alone decides: law, parameters, gains; only law if it fails."""
-    sites: dict[str, list[str]] = {}
+def explain_no_functional(scenario: Scenario) -> str:
+    """Returns the reasons why sites have no functional; "" if each has one."""
+    lacking: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
-        sites.setdefault(explain_missing_functional(spec), []).append(site)
-    lacking = [f"{', '.join(names)}: {reason}" for reason, names in sites.items() if reason]
-    if lacking:
-        return [Premise("law", False, "; ".join(lacking))]
-    law = Premise("law", True, "adaptive at every site, of arms whose theta is known")
-    constants = {site: derive_site_constants(scenario, site) for site in scenario.names}
-    return [law, _check_parameters(scenario, constants), _check_gains(constants)]
+        if not spec.arm.known:
+            lacking.setdefault("nobody knows the arm's theta, and V is made of it", []).append(site)
+        elif not spec.control.has_functional:
+            lacking.setdefault(f"law {spec.control.tag}, for which there is no such V", []).append(site)
+        elif spec.task.space == "pose":
+            lacking.setdefault(_OF_ORIENTATIONS, []).append(site)
+    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in lacking.items())
 
 
-def check_run_premises(log: Log, energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> list[Premise]:
-    """Returns the premises that the run decides: dominance, delays, stale peers, limits, operators, gaps."""
-    return [
-        _check_dominance(log, energies),
-        _check_delays(energies),
-        _check_following(log),
-        _check_torque_limits(log.scenario, energies),
-        *_check_stops(log.scenario, energies),
-        *_check_axes(energies),
-        *_check_singular_poses(energies),
-        _check_operators(energies, balance),
-        _check_records(log, balance),
-        *_check_presence(log, energies),
+class AbsentSpan(NamedTuple):
+    """A time in which a site was away from the session, s."""
+
+    site: str
+    from_s: float
+    to_s: float
+
+
+class FunctionalFacts(NamedTuple):
+    """What is known of V in a run.
+
+    Attributes:
+        log: of the run.
+        energies, balance: of every site, and of all together.
+        groups: the closed groups for which there is at some time no unique beta; () if there is one.
+        absent: when sites were away.
+        unjudged: the times between which records are missing though all sites were there, s.
+        tolerance: the size that a rise of V must exceed, J.
+    """
+
+    log: Log
+    energies: dict[str, SiteEnergy]
+    balance: EnergyBalance
+    groups: tuple[tuple[str, ...], ...]
+    absent: list[AbsentSpan]
+    unjudged: list[tuple[float, float]]
+    tolerance: float
+
+
+class RunFacts(NamedTuple):
+    """What a log shows of a run, each fact once.
+
+    Attributes:
+        log: its log.
+        constants: of every site; {} if some law or arm has no V.
+        functional: what is known of V; None if nothing is.
+        unknown: why that is so; "" of what is known.
+    """
+
+    log: Log
+    constants: dict[str, SiteConstants]
+    functional: FunctionalFacts | None = None
+    unknown: str = ""
+
+
+def gather_facts(log: Log) -> RunFacts:
+    """Returns what a log shows of V.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    if lacking := explain_no_functional(log.scenario):
+        return RunFacts(log, {}, unknown=lacking)
+    constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
+    if not (energies := compute_site_energies(log)):
+        return RunFacts(log, constants, unknown=NO_COMMON_TIME)
+    balance, absent = compute_energy_balance(energies), find_absent_spans(log)
+    if not balance.judged.any():
+        return RunFacts(log, constants, unknown=NO_PERIOD)
+    closed = map(find_closed_groups, find_dominance_matrices(energies))
+    groups = next((groups for groups in closed if len(groups) > 1), ())
+    named = tuple(tuple(log.sites[n] for n in group) for group in groups)
+    there = [
+        (from_s, to_s)
+        for from_s, to_s in find_unjudged_spans(balance)
+        if not any(away.from_s < to_s and from_s < away.to_s for away in absent)
     ]
+    sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
+    tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
+    known = FunctionalFacts(log, energies, balance, named, absent, there, tolerance)
+    return RunFacts(log, constants, known)
 
 
-def _check_parameters(scenario: Scenario, constants: Mapping[str, SiteConstants]) -> Premise:
+def check_premises(run: RunFacts) -> list[Premise]:
+    """Returns the premises of the theorem, and that on sampled walls: what each check finds, in order."""
+    law = "adaptive at every site, of arms whose theta is known" if run.constants else run.unknown
+    found: list[Premise | None] = [Premise("law", bool(run.constants), law)]
+    if run.constants:
+        found += [_check_parameters(run), _check_gains(run)]
+    found.append(_check_walls(run.log))
+    if run.functional is not None:
+        found += [check(run.functional) for check in OF_RUN]
+    return [premise for premise in found if premise is not None]
+
+
+def _check_parameters(run: RunFacts) -> Premise:
     """The truth is in the box, and the estimate is right where nothing is adapted."""
     faults = []
-    for site, c in constants.items():
+    for site, c in run.constants.items():
         if ((c.theta < c.low) | (c.theta > c.high)).any():
             faults.append(f"{site}: theta is outside of the box that its estimates are held in")
-        first = np.clip(scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high)
+        first = np.clip(run.log.scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high)
         if (~c.adapts & (first != c.theta)).any():
             faults.append(f"{site}: a parameter is not learnt, and not known either")
-        if c.unknown_friction:
+        if c.unknown_friction.any():
             faults.append(f"{site}: its law does not compensate all friction of the joints")
     text = "every parameter is learnt or known, and no box shuts it out"
     return Premise("parameters", not faults, _list(faults) or text)
 
 
-def _check_gains(constants: Mapping[str, SiteConstants]) -> Premise:
+def _check_gains(run: RunFacts) -> Premise:
+    constants = run.constants
     Kd = np.array([c.weighing_Kd for c in constants.values()])
     scales = find_kd_scales(Kd)
     if scales is None:
@@ -107,28 +192,47 @@ def _check_gains(constants: Mapping[str, SiteConstants]) -> Premise:
     if not Kd.all():  # NaN counts as positive
         return Premise("Kd", False, "some Kd is zero: the theorem asks for positive ones")
     alike = np.ptp(scales) == 0.0
-    scalars = f"one Kd but for a scalar: {_per_site(constants, scales)}"
+    scalars = f"one Kd but for a scalar: {_per_site(dict(zip(constants, scales, strict=True)))}"
     return Premise("Kd", True, "one Kd for all sites" if alike else scalars)
 
 
-def _check_dominance(log: Log, energies: Mapping[str, SiteEnergy]) -> Premise:
-    names, alpha = log.scenario.names, log.scenario.alpha
+def _check_walls(log: Log) -> Premise | None:
+    """No sampled wall gives energy; None if no wall is sampled."""
+    if not any(map(list_sampled_walls, log.scenario.sites.values())):
+        return None
+    walls = find_wall_energies(log)
+    if not walls:
+        return Premise("walls", True, "no sampled wall was touched")
+    giving = [wall for wall in walls if wall.damping_n_s_m <= wall.needed_n_s_m]
+    texts = [
+        f"{wall.site}: K h / 2 + B is {wall.needed_n_s_m:.3g} N s/m, the arm's own damping "
+        f"{wall.damping_n_s_m:.3g}; gave {wall.gave_j:.3g} J with respect to qd"
+        for wall in giving or walls
+    ]
+    kind = "a sampled wall gives energy in contact" if giving else "every sampled wall is passive"
+    return Premise("walls", not giving, f"{kind}: {'; '.join(texts)}")
+
+
+def _check_dominance(run: FunctionalFacts) -> Premise:
+    names, energies = run.log.scenario.names, run.energies
     changing = [site for site, energy in energies.items() if not energy.motion.dominance.constant]
     if changing:
-        lost = list_losses(log)
+        lost = list_losses(run.log)
         why = f": {_list(lost)}; those that are left follow each other" if lost else ""
         return Premise("shares", False, f"the shares of {_list(changing)} change{why}")
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
-    weights = compute_lyapunov_weights(alpha, Kd)
-    if len(weights.groups) > 1:
-        groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
+    weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
+    groups = [tuple(names[n] for n in group) for group in weights.groups]
+    if len(groups) > 1:
         return Premise("shares", False, describe_closed_groups(groups))
-    outside = [site for n, site in enumerate(names) if n not in weights.groups[0]]
+    outside = [site for site in names if site not in groups[0]]
     if outside:
-        group = ", ".join(names[n] for n in weights.groups[0])
-        why = f"nobody of {group} follows {', '.join(outside)}, whose beta is 0: V tells nothing of it"
-        return Premise("shares", False, f"alpha is reducible, {why}; it follows as in a cascade")
-    beta = "" if weights.scales is None else f"; beta: {_per_site(names, weights.beta)}"
+        why = f"nobody of {', '.join(groups[0])} follows {', '.join(outside)}, whose beta is 0"
+        text = f"alpha is reducible, {why}: V tells nothing of it; it follows as in a cascade"
+        return Premise("shares", False, text)
+    beta = (
+        "" if weights.scales is None else f"; beta: {_per_site(dict(zip(names, weights.beta, strict=True)))}"
+    )
     return Premise("shares", True, f"constant, alpha irreducible{beta}")
 
 
@@ -138,13 +242,13 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     return f"{named} follow nobody outside: beta is not unique, certify each group by itself"
 
 
-def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
+def _check_delays(run: FunctionalFacts) -> Premise:
     varying, constant = [], set()
-    for site, energy in energies.items():
+    for site, energy in run.energies.items():
         records = energy.motion.records
-        for peer, view in energy.motion.peers.items():
+        for peer, view in energy.followed.items():
             used = np.isfinite(view.stamp_s) & records.known
-            if peer not in energy.followed or not used.any():
+            if not used.any():
                 continue
             age_s, first_s = (records.t_s - view.stamp_s)[used], view.stamp_s[used][0]
             late = records.first == 0 and first_s > records.h_s + CONSTANT_DELAY_TOLERANCE_S
@@ -158,7 +262,8 @@ def _check_delays(energies: Mapping[str, SiteEnergy]) -> Premise:
     return Premise("delays", True, text) if constant else Premise("delays", None, "no sample came into use")
 
 
-def _check_following(log: Log) -> Premise:
+def _check_following(run: FunctionalFacts) -> Premise:
+    log = run.log
     found = {site: find_mode_intervals(log[site]) for site in log.sites}
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
     stops = any(one.mode in ("fault", "stopped") for intervals in found.values() for one in intervals)
@@ -171,86 +276,80 @@ def _check_following(log: Log) -> Premise:
     return Premise("following", not away, text)
 
 
-def _check_torque_limits(scenario: Scenario, energies: Mapping[str, SiteEnergy]) -> Premise:
+def _check_torque_limits(run: FunctionalFacts) -> Premise:
     """No torque is cut off; of a chain the joints are named at which one is."""
-    ticks = []
-    for site, energy in energies.items():
-        at_limit = energy.motion.cut
-        if at_limit.any():
-            which = _name_joints(scenario, site, at_limit)
-            ticks.append(f"{site}{which} at {np.count_nonzero(at_limit.any(axis=1))} ticks")
+    cut = {site: energy.motion.cut for site, energy in run.energies.items()}
+    ticks = [
+        f"{site}{_name_joints(run, site, rows)} at {np.count_nonzero(rows.any(axis=1))} ticks"
+        for site, rows in cut.items()
+        if rows.any()
+    ]
     return Premise("torque", not ticks, f"cut off: {_list(ticks)}" if ticks else "never cut off")
 
 
-def _name_joints(scenario: Scenario, site: str, rows: Bools) -> str:
+def _name_joints(run: FunctionalFacts, site: str, rows: Bools) -> str:
     """Returns the joints of a chain for which some row is True, in brackets; "" of the planar arm."""
-    model = scenario.arms[site]
+    model = run.log.scenario.arms[site]
     names = [model.joint_names[n] for n in np.flatnonzero(rows.any(axis=0))]
     return "" if model.chain is None else f" ({_list(names)})"
 
 
-def _check_stops(scenario: Scenario, energies: Mapping[str, SiteEnergy]) -> list[Premise]:
-    """No stop is touched: they are passive with respect to qd, and not to r; [] if no joint has any."""
-    chains = [model.chain for model in scenario.arms.values() if model.chain is not None]
+def _check_stops(run: FunctionalFacts) -> Premise | None:
+    """No stop is touched: they are passive with respect to qd, and not to r; None if no joint has any."""
+    chains = [model.chain for model in run.log.scenario.arms.values() if model.chain is not None]
     if not any(joint.stop_stiffness for chain in chains for joint in chain.joints):
-        return []
+        return None
     touched = []
-    for site, energy in energies.items():
+    for site, energy in run.energies.items():
         records = energy.motion.records
         pushed = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
         if pushed.any():
             first_s = records.t_s[int(np.argmax(pushed.any(axis=1)))]
-            touched.append(f"{site}{_name_joints(scenario, site, pushed)} from {first_s:.4g} s on")
+            touched.append(f"{site}{_name_joints(run, site, pushed)} from {first_s:.4g} s on")
     text = f"the arm runs into stops of its joints: {_list(touched)}" if touched else "no stop is touched"
-    return [Premise("stops", not touched, text)]
+    return Premise("stops", not touched, text)
 
 
-def _check_axes(energies: Mapping[str, SiteEnergy]) -> list[Premise]:
-    """Nobody follows a site along an axis along which it moves and follows nobody; [] in joint space."""
-    motions = {site: energy.motion for site, energy in energies.items() if energy.motion.constants.axes}
-    if not motions:
-        return []
+def _check_axes(run: FunctionalFacts) -> Premise | None:
+    """Nobody follows a site along an axis along which it moves and follows nobody; None in joint space."""
+    motions = {site: energy.motion for site, energy in run.energies.items() if energy.motion.constants.axes}
     faults = []
     for site, motion in motions.items():
         free = np.array(motion.constants.axes) == 0.0
         free &= np.abs(motion.records.xd).max(axis=0) > LEAST_SPEED_M_S
         for follower, other in motions.items():
-            if site in energies[follower].followed and (free & (np.array(other.constants.axes) > 0.0)).any():
+            followed = site in run.energies[follower].followed
+            if followed and (free & (np.array(other.constants.axes) > 0.0)).any():
                 faults.append(f"{follower} follows {site} along an axis that {site} does not follow")
     text = "every site follows along each axis along which it moves and is followed"
-    return [Premise("axes", not faults, _list(faults) or text)]
+    return Premise("axes", not faults, _list(faults) or text) if motions else None
 
 
-def _check_singular_poses(energies: Mapping[str, SiteEnergy]) -> list[Premise]:
-    """No pose is damped: then J J+ = I; [] in joint space."""
-    found = {
-        site: follows
-        for site, energy in energies.items()
-        if isinstance(follows := energy.motion.follows, TaskFollowing)
-    }
-    if not found:
-        return []
+def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
+    """No pose is damped: then J J+ = I; None in joint space."""
+    following = {site: energy.motion.follows for site, energy in run.energies.items()}
+    found = {site: one for site, one in following.items() if isinstance(one, TaskFollowing)}
     near = [
-        f"{site} from {energies[site].motion.records.t_s[int(np.argmax(one.damping > 0.0))]:.4g} s on"
+        f"{site} from {run.energies[site].motion.records.t_s[int(np.argmax(one.damping > 0.0))]:.4g} s on"
         for site, one in found.items()
         if one.damping.any()
     ]
+    bounds = _per_site({site: one.least.min() for site, one in found.items()})
+    text = f"none is near; least singular value at least: {bounds}"
     if near:
-        return [
-            Premise("singular poses", False, f"a pose is so nearly singular that it is damped: {_list(near)}")
-        ]
-    bounds = _per_site(found, np.array([one.least.min() for one in found.values()]))
-    return [Premise("singular poses", True, f"none is near; least singular value at least: {bounds}")]
+        text = f"a pose is so nearly singular that it is damped: {_list(near)}"
+    return Premise("singular poses", not near, text) if found else None
 
 
-def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> Premise:
+def _check_operators(run: FunctionalFacts) -> Premise:
     """Passive with respect to r: they give no more than they took before, up to a constant."""
+    energies, balance = run.energies, run.balance
     pushed_s = {
         site: energy.motion.records.t_s[energy.motion.records.tau_x.any(axis=1)]
         for site, energy in energies.items()
     }
     sites = [site for site, t_s in pushed_s.items() if len(t_s)]
-    outside = [site for site, energy in energies.items() if energy.motion.constants.outside]
+    outside = run.log.scenario.external
     if outside and not sites:
         return Premise("hands", None, f"no record says who pushes the arm of {_list(outside)}")
     if not sites:
@@ -259,13 +358,14 @@ def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance)
     if weightless:
         return Premise("hands", False, f"{_list(weightless)}, of beta 0, is pushed: V tells nothing of that")
     gave = float(rise_above_minimum(balance.external_work).max())
-    who = " and ".join(balance.external_sources)
+    who = " and ".join(balance.external)
     if gave <= 1e-9 * balance.scale + ZERO_ENERGY_J:
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(pushed_s[site][-1] for site in sites)
     r = "qd - v" if any(energy.motion.constants.axes for energy in energies.values()) else "qd + Lambda e"
     text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
-    free_s, least_s = float(balance.t_s[-1] - let_go_s), _least_free_motion_s(energies)
+    ages_s = [energy.largest_age_s for energy in energies.values()]
+    free_s, least_s = float(balance.t_s[-1] - let_go_s), max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
     if free_s >= least_s:
         return Premise("hands", True, f"{text}; nobody pushes after {let_go_s:.3f} s")
     if free_s > 1e-9:
@@ -274,60 +374,57 @@ def _check_operators(energies: Mapping[str, SiteEnergy], balance: EnergyBalance)
     return Premise("hands", False, f"{text}, and push to the end: not passive with respect to r")
 
 
-def _least_free_motion_s(energies: Mapping[str, SiteEnergy]) -> float:
-    ages_s = [
-        float(np.nanmax(energy.motion.records.t_s - view.stamp_s))
-        for energy in energies.values()
-        for peer, view in energy.motion.peers.items()
-        if peer in energy.followed and np.isfinite(view.stamp_s).any()
-    ]
-    return max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s, default=0.0))
-
-
-def _check_records(log: Log, balance: EnergyBalance) -> Premise:
-    spans = [span for span in find_unjudged_spans(balance) if not was_away(log, span)]
-    if not spans:
-        where = "" if balance.judged.all() else " while all sites were there"
+def _check_records(run: FunctionalFacts) -> Premise:
+    if not run.unjudged:
+        where = "" if run.balance.judged.all() else " while all sites were there"
         return Premise("records", True, f"every period of every site rests on records{where}")
-    lost = [f"{a:.4g} to {b:.4g} s" for a, b in spans]
+    lost = [f"{a:.4g} to {b:.4g} s" for a, b in run.unjudged]
     return Premise("records", None, f"not judged: {_list(lost)}: records are missing there")
 
 
-def find_absent_spans(log: Log) -> list[tuple[str, float, float]]:
-    """Returns when sites were away from the session, in order: name, from, to, s."""
-    end_s = recorded_end_s(log)
-    found = []
+def find_absent_spans(log: Log) -> list[AbsentSpan]:
+    """Returns when sites were away from the session, in order."""
+    end_s, found = recorded_end_s(log), []
     for site in log.sites:
         part = log[site]
-        found += [(site, a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())]
+        spans = [(a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())]
         left_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
         if left_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
-            found.append((site, left_s, end_s))
+            spans.append((left_s, end_s))
+        found += [AbsentSpan(site, *span) for span in spans]
     return sorted(found, key=lambda one: one[1:])
 
 
-def was_away(log: Log, span: tuple[float, float]) -> bool:
-    """True if a site was away in a part of a span, s."""
-    return any(from_s < span[1] and span[0] < to_s for _, from_s, to_s in find_absent_spans(log))
-
-
-def _check_presence(log: Log, energies: Mapping[str, SiteEnergy]) -> list[Premise]:
-    """All sites are there all the time; [] if they are. Else what the stretches are by themselves."""
-    away = find_absent_spans(log)
-    if not away:
-        return []
-    begin_s = max(energy.begin_s for energy in energies.values())
-    edges = [(begin_s, begin_s), *((a, b) for _, a, b in away), (recorded_end_s(log),) * 2]
+def _check_presence(run: FunctionalFacts) -> Premise | None:
+    """All sites are there all the time; None if they are. Else what the stretches are by themselves."""
+    if not run.absent:
+        return None
+    after_s = max(energy.begin_s for energy in run.energies.values())
+    edges = [(after_s, after_s), *((a, b) for _, a, b in run.absent), (recorded_end_s(run.log),) * 2]
     stretches = []
-    after_s = begin_s
     for from_s, to_s in edges:
         if from_s - after_s > LEAST_ABSENCE_S:
-            stretches.append(_describe_stretch(energies, after_s, from_s))
+            stretches.append(_describe_stretch(run.energies, after_s, from_s))
         after_s = max(after_s, to_s)
-    who = _list([f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in away])
+    who = _list([f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent])
     text = f"away: {who}, of which the theorem says nothing; by themselves: {'; '.join(stretches)}"
-    return [Premise("presence", False, text)]
+    return Premise("presence", False, text)
+
+
+OF_RUN = (
+    _check_dominance,
+    _check_delays,
+    _check_following,
+    _check_torque_limits,
+    _check_stops,
+    _check_axes,
+    _check_singular_poses,
+    _check_operators,
+    _check_records,
+    _check_presence,
+)
+"""The premises that a run decides of which V is known."""
 
 
 def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
@@ -344,9 +441,9 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
     for site, energy in energies.items():
         records = energy.motion.records
         inside = records.known & (records.t_s >= follow_s) & (records.t_s < to_s)
-        for peer, view in energy.motion.peers.items():
+        for peer, view in energy.followed.items():
             age_s = (records.t_s - view.stamp_s)[inside & np.isfinite(view.stamp_s)]
-            if peer in energy.followed and len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
+            if len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
                 varying.append(f"{peer}->{site}")
     delays = f"ages vary ({_list(varying)})" if varying else "delays are constant"
     return f"{stretch} all follow from {follow_s:.4g} s on, {delays}"
@@ -359,18 +456,13 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
 
 
-def rise_above_minimum(values: Array) -> Array:
-    """Returns how far a quantity is above the least that it was until then, shape (T,)."""
-    return values - np.minimum.accumulate(values)
-
-
-def _list(words: list[str]) -> str:
+def _list(words: Sequence[str]) -> str:
     more = f" and {len(words) - MAX_LISTED_NAMES} more" if len(words) > MAX_LISTED_NAMES else ""
     return ", ".join(words[:MAX_LISTED_NAMES]) + more
 
 
-def _per_site(names: Iterable[str], values: Array) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+def _per_site(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
 class Evidence(NamedTuple):
@@ -420,19 +512,16 @@ class Evidence(NamedTuple):
         }
 
 
-def collect_evidence(log: Log, balance: EnergyBalance | None, min_coverage: float) -> Evidence:
-    """Returns what a certificate of a log rests on, with the energy balance that it found."""
-    share = None if balance is None else _share_judged(log, balance)
+def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
+    """Returns what a certificate of a log rests on: of V the periods in which no site was away."""
+    log, known, share = run.log, run.functional, None
+    if known is not None and not known.groups:
+        t_s, judged = known.balance.t_s, known.balance.judged
+        asked = np.ones(len(judged), dtype=np.bool_)
+        for from_s, to_s in set(find_unjudged_spans(known.balance)) - set(known.unjudged):
+            asked &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
+        share = float(judged[asked].mean()) if asked.any() else 0.0
     unmet = tuple(site for site in log.sites if site not in log.executed_sites)
     there = {site: len(np.unique(log[site].tick)) for site in log.sites}
     coverage = Coverage(there, {site: log.expected_ticks(site) for site in log.sites})
     return Evidence(coverage, share, min_coverage, judge_integrity(log), unmet)
-
-
-def _share_judged(log: Log, balance: EnergyBalance) -> float:
-    """Returns the share of periods of V that rest on records, of those in which no site was away."""
-    asked = np.ones(len(balance.judged), dtype=np.bool_)
-    for from_s, to_s in find_unjudged_spans(balance):
-        if was_away(log, (from_s, to_s)):
-            asked &= (balance.t_s[:-1] < from_s) | (balance.t_s[:-1] >= to_s)
-    return float(balance.judged[asked].mean()) if asked.any() else 0.0

@@ -32,7 +32,7 @@ from .energy_balance import (
     find_common_times,
     find_dominance_matrices,
 )
-from .premises import check_scenario_premises, describe_closed_groups
+from .premises import describe_closed_groups, explain_no_functional
 
 STEP_S = 0.1
 """The least time that is computed at once, s."""
@@ -154,8 +154,7 @@ class RunningEnergy:
     """
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
-        law = check_scenario_premises(scenario)[0]
-        self.reason = "" if law.holds else law.text
+        self.reason = explain_no_functional(scenario)
         if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
             self.reason = self.reason or "shares change when a peer is lost: trilat certify tells V"
         self._scenario, self._windows = scenario, windows

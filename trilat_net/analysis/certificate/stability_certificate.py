@@ -6,11 +6,11 @@ a log cannot decide is stated: without a functional the end of the run alone dec
 their unit, and unknown values are null.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from ...core.vectors import Array
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
-from ..lyapunov_weights import find_closed_groups
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from ..twin_growth import TwinGrowth, TwinVerdict, judge_end_by_twins
 from . import energy_terms
@@ -28,39 +27,36 @@ from .energy_balance import (
     EnergyBalance,
     SiteEnergy,
     compute_energy_balance,
-    compute_site_energies,
-    find_dominance_matrices,
+    rise_above_minimum,
 )
-from .observed_energy import ObservedEnergy, observe_energies
+from .observed_energy import ObservedEnergy, ObservedFinding, observe_energies
 from .premises import (
     Evidence,
+    FunctionalFacts,
     Premise,
-    check_run_premises,
-    check_scenario_premises,
+    check_premises,
     collect_evidence,
     describe_closed_groups,
     find_unjudged_spans,
-    rise_above_minimum,
+    gather_facts,
 )
-from .wall_energy import check_sampled_walls
 
 BROKEN_BALANCE_SHARE = 2e-4
 """Largest unexplained energy as a share of the scale, beyond the uncertainty of the trapezoid rule."""
 CLEAR_BREAK_SHARE = 1e-3
 """With more than this, and no uncertainty of that size, the period is not the cause."""
-SAMPLING_RISE_SHARE = 1e-4
-"""Rises up to this share of the scale are attributed to sampling if the residual is as large."""
 TORQUE_TOLERANCE = 1e-6
 """A recorded torque that differs from Eq. (13) by more, relative to 1 + |tau|, was not made by it."""
 COARSE_TOLERANCE_SHARE = 1e-2
 """A tolerance above this share of the scale decides nothing about a rise."""
 
-NO_COMMON_TIME = "there is no time of which every site has records"
-NO_PERIOD = "there is no period of which all records are there"
 FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
 _PERIOD_OR_FALSE = (
     f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
 )
+
+
+_REFUTES = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 
 class StabilityFinding(StrEnum):
@@ -138,7 +134,7 @@ class Certificate(Result):
     verdict: StabilityVerdict
     end: RunEnd
     evidence: Evidence
-    balance: EnergyBalance | None
+    balance: EnergyBalance | None = None
     ones: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
     energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
@@ -172,20 +168,15 @@ class Certificate(Result):
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
-        if self.roots is not None and self.roots.verdict == "unstable" and not self._roots_refuted:
-            found.append(self.roots.text)
-        if self.observed is not None and self.observed.refuted:
+        roots, twins = self.roots, self.twins
+        if roots is not None and roots.verdict == "unstable":
+            doubt = None if roots.exact else roots.rate_per_s
+            if doubt is None or twins is None or doubt <= twins.excluded_rate_per_s:
+                found.append(roots.text)  # roots that are no proof give way to pushes in the run's own ticks
+        if self.observed is not None and self.observed.finding in _REFUTES:
             found.append(self.observed.text)
         told = self._by_twins.reason
         return (*self.end.reasons, *([told] if told else []), *found, *self.evidence.reasons)
-
-    @property
-    def _roots_refuted(self) -> bool:
-        """True if roots that are no proof are unstable, and pushes die away in the very ticks of the run."""
-        roots, twins = self.roots, self.twins
-        if roots is None or roots.exact or twins is None or roots.rate_per_s is None:
-            return False
-        return twins.excludes(roots.rate_per_s)
 
     @property
     def _by_twins(self) -> TwinVerdict:
@@ -244,116 +235,120 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    premises, end = check_scenario_premises(log.scenario), classify_log_end(log)
-    premises += check_sampled_walls(log)
-    observed = observe_energies(log, own_laws=own_laws)
-
-    def conclude(verdict: StabilityVerdict, balance: EnergyBalance | None = None, **more: Any) -> Certificate:
-        evidence = collect_evidence(log, balance, min_coverage)
-        return Certificate(premises, verdict, end, evidence, balance, observed=observed, **more)
-
-    if not premises[0].holds:
-        return conclude(_undecided(premises[0].text))
-    energies = compute_site_energies(log)
-    if not energies:
-        return conclude(_undecided(NO_COMMON_TIME))
-    balance = compute_energy_balance(energies)
-    if not balance.judged.any():
-        return conclude(_undecided(NO_PERIOD))
-    premises += check_run_premises(log, energies, balance)
-    groups = _ambiguous_groups(energies)
-    if groups:
-        verdict = _judge_balance(energies, balance) or _undecided(describe_closed_groups(groups))
-        return conclude(verdict, energies=energies, groups=groups)
-    verdict = _judge_stability(premises, energies, balance)
-    ones = None if np.allclose(balance.beta, 1.0) else compute_energy_balance(energies, ones=True)
-    return conclude(verdict, balance, energies=energies, ones=ones)
+    run = gather_facts(log)
+    known = run.functional
+    premises = check_premises(run)
+    verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
+    if known is not None:
+        verdict = judge_functional(known, premises)
+    if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
+        verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
+    end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
+    found = Certificate(premises, verdict, end, collect_evidence(run, min_coverage), observed=observed)
+    if known is None:
+        return found
+    if known.groups:
+        return replace(found, groups=known.groups, energies=known.energies)
+    alike = np.allclose(known.balance.beta, 1.0)
+    ones = None if alike else compute_energy_balance(known.energies, ones=True)
+    return replace(found, balance=known.balance, ones=ones, energies=known.energies)
 
 
-def _ambiguous_groups(energies: Mapping[str, SiteEnergy]) -> tuple[tuple[str, ...], ...]:
-    """Returns the closed groups for which there is no unique beta; () if there is one all the time."""
-    names = list(energies)
-    for alpha in find_dominance_matrices(energies):
-        groups = find_closed_groups(alpha)
-        if len(groups) > 1:
-            return tuple(tuple(names[n] for n in group) for group in groups)
-    return ()
+def judge_functional(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
+    """Returns the verdict on V: of the first of the `JUDGEMENTS` that applies."""
+    verdicts = (judge(run, premises) for judge in JUDGEMENTS)
+    found = next(verdict for verdict in verdicts if verdict is not None)
+    return found if run.groups else found._replace(tolerance=run.tolerance)
 
 
-def _undecided(why: str, finding: StabilityFinding = StabilityFinding.NOT_JUDGED) -> StabilityVerdict:
-    return StabilityVerdict(finding, f"{finding}: {why}")
-
-
-def _judge_stability(
-    premises: list[Premise], energies: Mapping[str, SiteEnergy], balance: EnergyBalance
-) -> StabilityVerdict:
-    """Returns the verdict on a group of sites that have functionals."""
-    sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
-    tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
-    broken = _judge_balance(energies, balance)
-    if broken is None and tolerance > COARSE_TOLERANCE_SHARE * balance.scale + 2.0 * ZERO_ENERGY_J:
-        known = f"its energies are known only to {tolerance:.3g} J of {balance.scale:.4g} J"
-        broken = _undecided(f"the period is too long for these gains, so that {known}")
-    if broken is not None:
-        return broken._replace(tolerance=tolerance)
-    rise = _find_largest_rise(balance, tolerance)
-    failed = [premise.name for premise in premises if premise.holds is False]
-    where = f"outside the theorem ({', '.join(failed)})"
-    if rise is not None:
-        held = "though the premises of the theorem hold, which is one of continuous time"
-        text = f"{where if failed else held}: {_describe_rise(rise, balance)}"
-        return StabilityVerdict(StabilityFinding.ROSE, text, rise, tolerance)
-    undecided = [premise.text for premise in premises if premise.holds is None]
-    text = "; ".join([_describe_fall(balance), *undecided])
-    if failed:
-        return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{where}, yet {text}", None, tolerance)
-    covered = f"{StabilityFinding.COVERED}{', as far as the log tells' if undecided else ''}"
-    return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}", None, tolerance)
-
-
-def _judge_balance(energies: Mapping[str, SiteEnergy], balance: EnergyBalance) -> StabilityVerdict | None:
-    """Returns the verdict if a site's balance does not close; None if all do. Each site counts by itself.
+def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+    """A site's balance does not close; each site counts by itself.
 
     An arm outside of the program need not follow its theta, nor are its angles and velocities measured at
     once; the records of any other are not what they claim, unless the period may be the cause.
     """
+    energies, scale = run.energies, run.balance.scale
 
     def allow(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
-        return share * balance.scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
+        return share * scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
 
     worst = {site: _largest(energy.unexplained) for site, energy in energies.items()}
     wrong = [site for site in energies if worst[site] > allow(site)]
-    outside = {site for site, energy in energies.items() if energy.motion.constants.outside}
-    ours = [site for site in wrong if not outside & {site, *energies[site].followed}]
-    site = max(ours or wrong, key=worst.__getitem__, default=None)
-    if site is None:
-        return _find_false_torque(energies)
+    if not wrong:
+        return None
+    outside = run.log.scenario.external
+    ours = [site for site in wrong if not {*outside} & {site, *energies[site].followed}]
+    site = max(ours or wrong, key=worst.__getitem__)
     energy = energies[site]
-    above = np.abs(energy.unexplained) > allow(site)
-    at_s = energy.motion.records.t_s[int(np.argmax(above))]
-    amount = f"{worst[site]:.3g} J of {balance.scale:.4g} J"
+    at_s = energy.motion.records.t_s[int(np.argmax(np.abs(energy.unexplained) > allow(site)))]
+    amount = f"{worst[site]:.3g} J of {scale:.4g} J"
     text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
     if not ours:
-        arms = ", ".join(name for name in energies if name in outside)
-        why = f"the arm of {arms}, outside of the program, does not move as its theta says"
-        return _undecided(f"{text}: {why}, or somebody pushes it")
+        why = f"the arm of {', '.join(outside)}, outside of the program, does not move as its theta says"
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it")
     clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
-    certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * balance.scale
+    certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
-    return StabilityVerdict(StabilityFinding.BROKEN, f"{StabilityFinding.BROKEN}: {text}: {why}")
+    return StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {why}")
 
 
-def _find_false_torque(energies: Mapping[str, SiteEnergy]) -> StabilityVerdict | None:
-    """Returns the verdict if recorded torques are not those of Eq. (13); None if all are."""
-    for site, energy in energies.items():
+def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+    """Recorded torques are not those of Eq. (13)."""
+    for site, energy in run.energies.items():
         error, records = energy_terms.measure_torque_error(energy.motion), energy.motion.records
         wrong = error > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
         if wrong.any():
-            first = int(np.argmax(wrong))
-            off = f"{error.max():.3g} N m, from {records.t_s[first]:.4g} s on"
+            off = f"{error.max():.3g} N m, from {records.t_s[int(np.argmax(wrong))]:.4g} s on"
             text = f"the torque of {site} is not that of Eq. (13), by up to {off}: {FALSE_RECORDS_TEXT}"
-            return StabilityVerdict(StabilityFinding.BROKEN, f"{StabilityFinding.BROKEN}: {text}")
+            return StabilityVerdict(StabilityFinding.BROKEN, text)
     return None
+
+
+def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+    """There is no unique beta."""
+    return (
+        StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
+        if run.groups
+        else None
+    )
+
+
+def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
+    """The energies are known too badly."""
+    scale, tolerance = run.balance.scale, run.tolerance
+    if tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
+        return None
+    known = f"its energies are known only to {tolerance:.3g} J of {scale:.4g} J"
+    why = f"the period is too long for these gains, so that {known}"
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, why)
+
+
+def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
+    """Returns whether V rose beyond what operator and environment gave, in the theorem or outside of it."""
+    balance, sources = run.balance, list(run.balance.external)
+    failed = [premise.name for premise in premises if premise.holds is False]
+    outside = f"outside the theorem ({', '.join(failed)})"
+    rise = _find_largest_rise(balance, run.tolerance)
+    if rise is not None:
+        held = "though the premises of the theorem hold, which is one of continuous time"
+        causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4])
+        who = f"; given by {causes}" if causes else "; nobody gave it"
+        share = f"{100.0 * rise.amount / balance.V.max():.2g} % of its largest value"
+        text = f"V rose by {rise.amount:.3g} J ({share}) from {rise.from_s:.4g} to {rise.at_s:.4g} s{who}"
+        return StabilityVerdict(StabilityFinding.ROSE, f"{outside if failed else held}: {text}", rise)
+    first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
+    fell = f"V rose by no more than the {' and '.join(sources)} gave" if sources else "V did not rise"
+    fell += f": {first:.4g} J at {balance.t_s[0]:.4g} s, {last:.4g} J at {balance.t_s[-1]:.4g} s"
+    undecided = [premise.text for premise in premises if premise.holds is None]
+    text = "; ".join([fell, *undecided])
+    if failed:
+        return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}, yet {text}")
+    covered = f"{StabilityFinding.COVERED}{', as far as the log tells' if undecided else ''}"
+    return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
+
+
+JUDGEMENTS = (_judge_site_balances, _judge_torques, _judge_weights, _judge_precision, _judge_course)
+"""What refutes the log, what keeps V from being judged, and what V did: the first that applies decides."""
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
@@ -394,21 +389,6 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
         from_s = float(balance.t_s[half + lowest])
         found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
     return found
-
-
-def _describe_rise(rise: FunctionalRise, balance: EnergyBalance) -> str:
-    causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4])
-    who = f"; given by {causes}" if causes else "; nobody gave it"
-    share = f"{100.0 * rise.amount / balance.V.max():.2g} % of its largest value"
-    return f"V rose by {rise.amount:.3g} J ({share}) from {rise.from_s:.4g} to {rise.at_s:.4g} s{who}"
-
-
-def _describe_fall(balance: EnergyBalance) -> str:
-    first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
-    ends = f"{first:.4g} J at {balance.t_s[0]:.4g} s, {last:.4g} J at {balance.t_s[-1]:.4g} s"
-    if balance.external_sources:
-        return f"V rose by no more than the {' and '.join(balance.external_sources)} gave: {ends}"
-    return f"V did not rise: {ends}"
 
 
 def certificate_to_json(certificate: Certificate) -> JsonObject:

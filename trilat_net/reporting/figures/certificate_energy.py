@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ...analysis.certificate.energy_balance import EnergyBalance
 from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
-from ...analysis.certificate.premises import check_scenario_premises, find_unjudged_spans
+from ...analysis.certificate.premises import explain_no_functional, find_unjudged_spans
 from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.vectors import Array
 from ...log.log_reader import Log
@@ -70,14 +70,12 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
     return plot.figure
 
 
-def _no_functional(log: Log) -> str:
-    law = check_scenario_premises(log.scenario)[0]
-    return "" if law.holds else law.text
-
-
-draws("certificate", "V, its parts, who changed it, the energy balance", _no_functional, in_report=True)(
-    lambda log, form: draw_functional(log, certify(log), form)
-)
+draws(
+    "certificate",
+    "V, its parts, who changed it, the energy balance",
+    lambda log: explain_no_functional(log.scenario),
+    in_report=True,
+)(lambda log, form: draw_functional(log, certify(log), form))
 
 
 def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:
