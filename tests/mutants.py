@@ -22,7 +22,9 @@ import sys
 import tempfile
 import time
 import tokenize
+from bisect import bisect_left
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -117,6 +119,7 @@ class _Places(ast.NodeVisitor):
             for one in tokens
             if one.string.strip() and one.type != tokenize.COMMENT
         ]
+        self._words = dict(self._tokens)
         self.visit(house.tree(path))
 
     def _add(self, at: tuple[int, int], was: str, now: str) -> None:
@@ -127,7 +130,8 @@ class _Places(ast.NodeVisitor):
         assert before.end_lineno is not None
         assert before.end_col_offset is not None
         first, last = (before.end_lineno, before.end_col_offset), (after.lineno, after.col_offset)
-        words = [(at, word) for at, word in self._tokens if first <= at < last and word not in ("(", ")")]
+        low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
+        words = [one for one in self._tokens[low:high] if one[1] not in ("(", ")")]
         if len(words) == 1 and words[0][1] in OTHERS:  # `is not` and `not in` are two
             self._add(*words[0], OTHERS[words[0][1]])
 
@@ -156,7 +160,7 @@ class _Places(ast.NodeVisitor):
 
     def visit_Constant(self, node: ast.Constant) -> None:
         at = (node.lineno, node.col_offset)
-        was = dict(self._tokens).get(at, "")
+        was = self._words.get(at, "")
         if isinstance(node.value, bool):
             self._add(at, was, OTHERS[was])
         elif isinstance(node.value, int | float):
@@ -193,12 +197,21 @@ class _Places(ast.NodeVisitor):
     visit_JoinedStr = visit_Raise  # type: ignore[assignment]
 
 
+@cache
+def find_mutants(room: str) -> list[Mutant]:
+    """Returns all changes that may be drawn of a room."""
+    return [one for path in ROOMS[room] for one in _Places(path).found]
+
+
 def draw_mutants(seed: int, count: int) -> list[Mutant]:
     """Draws so many changes, a room after the other."""
     rng = random.Random(seed)
-    places = [[one for path in paths for one in _Places(path).found] for paths in ROOMS.values()]
-    shares = [count // len(places) + (n < count % len(places)) for n in range(len(places))]
-    return [one for found, share in zip(places, shares, strict=True) for one in rng.sample(found, share)]
+    shares = [count // len(ROOMS) + (n < count % len(ROOMS)) for n in range(len(ROOMS))]
+    return [
+        one
+        for room, share in zip(ROOMS, shares, strict=True)
+        for one in rng.sample(find_mutants(room), share)
+    ]
 
 
 def order_tests(path: Path) -> Iterator[list[str]]:
