@@ -157,7 +157,7 @@ def let_signals_kill() -> Callable[[], None]:
     taken = {name: one for name, one in handlers if _breaks_off(getattr(one, "__self__", None))}
     first = bool(taken) and os.getpid() == 1
     for name in taken:
-        signal.signal(name, _exit_at if first else signal.SIG_DFL)
+        signal.signal(name, (lambda number, _: os._exit(128 + number)) if first else signal.SIG_DFL)
     unwatch = _watch_signals() if first else lambda: None
 
     def restore() -> None:
@@ -168,10 +168,6 @@ def let_signals_kill() -> Callable[[], None]:
     return restore
 
 
-def _exit_at(number: int, _: FrameType | None) -> None:
-    os._exit(128 + number)
-
-
 def _watch_signals() -> Callable[[], None]:
     """Ends the process at a signal, from a thread, until the function returned is called."""
     reader, writer = os.pipe()
@@ -179,9 +175,10 @@ def _watch_signals() -> Callable[[], None]:
     before = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
-        with open(reader, "rb", buffering=0) as arrived:  # noqa: PTH123 - a pipe
-            if number := arrived.read(1):
-                _exit_at(number[0], None)
+        with os.fdopen(reader, "rb", 0) as arrived:
+            while number := arrived.read(1):
+                if number[0] in ENDING_SIGNALS:
+                    os._exit(128 + number[0])
 
     def unwatch() -> None:
         signal.set_wakeup_fd(before)

@@ -122,8 +122,6 @@ _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
 """No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
-
-
 _WITHIN = "within"  # another leaf, compiled as a part of it
 
 
@@ -154,7 +152,6 @@ class _Placed(CompileResultCacheImpl):
     _locator_classes = cast(Any, [_Place])
 
     def rebuild(self, context: Any, kept: Any) -> Any:
-        """Returns what was compiled."""
         name, kind, code = kept[0]
         if kind != _WITHIN:
             return super().rebuild(context, kept)
@@ -170,7 +167,6 @@ class _CodeFiles(IndexDataCacheFile):
     """The files of one function; Numba numbers them, and two processes may write other code into one."""
 
     def save(self, key: Any, code: Any) -> None:
-        """Keeps code in a file that has its name of the key."""
         names = self._load_index()
         first, _, last = self._data_name(0).rpartition(".0.")
         names[key] = f"{first}.{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}.{last}"
@@ -185,13 +181,11 @@ class _LeafCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        place = Path(self._cache_path)
-        self._cache_file, self._shipped = self._files(place), self._files(_SHIPPED / place.name)
-        self._within = self._files(place, "-within")
-
-    def _files(self, folder: Path, kind: str = "") -> Any:
-        impl: Any = self._impl
-        return cast(Any, _CodeFiles)(str(folder), impl.filename_base + kind, impl.locator.get_source_stamp())
+        base, stamp, place = self._impl.filename_base, self._cache_file._source_stamp, Path(self._cache_path)
+        files = cast(Any, _CodeFiles)
+        self._cache_file = files(str(place), base, stamp)
+        self._shipped = files(str(_SHIPPED / place.name), base, stamp)
+        self._within = files(str(place), f"{base}-within", stamp)
 
     def _load_overload(self, signature: Any, context: Any) -> Any:
         found = super()._load_overload(signature, context)
@@ -207,12 +201,10 @@ class _LeafCache(FunctionCache):
             super()._save_overload(signature, made)
 
     def load_within(self, kinds: Any, context: Any) -> Any:
-        """Returns what other leaves have of this one; None: it is to be compiled."""
         kept = self._within.load(self._index_key(kinds, context.codegen()))
         return None if kept is None else self._impl.rebuild(context, kept)
 
     def save_within(self, kinds: Any, made: Any) -> None:
-        """Keeps what other leaves have of this one."""
         if _CACHE is not None:
             self._impl.locator.ensure_cache_path()
             self._within.save(self._index_key(kinds, made.codegen), self._impl.reduce(made))
@@ -228,7 +220,6 @@ class _LeafLibrary(JITCodeLibrary):
     within = False
 
     def serialize_using_object_code(self) -> tuple[str, str, Any]:
-        """Returns what is kept of it."""
         if not self.within:
             return super().serialize_using_object_code()
         return self.name, _WITHIN, self._get_module_for_linking().as_bitcode()
@@ -257,7 +248,6 @@ class _LeafCompiler(Compiler):
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
-        """Returns what Numba's own would."""
         state, within = self.state, _LeafCompiler.depth > 0
         state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
         state.library.enable_object_caching()
@@ -303,12 +293,13 @@ class _Leaf(CPUDispatcher):
                 if known is not None and getattr(known.library, "within", False):
                     del self.overloads[kinds]
                 return super().compile(signature)
-            known = known or self._cache.load_within(kinds, self.targetctx)
             if known is None:
-                with event.trigger_event("numba:compile", data={"dispatcher": self, "args": kinds}):
-                    known = self._compiler.compile(kinds, result)
-                self._cache.save_within(kinds, known)
-            self.add_overload(known)
+                known = self._cache.load_within(kinds, self.targetctx)
+                if known is None:
+                    with event.trigger_event("numba:compile", data={"dispatcher": self, "args": kinds}):
+                        known = self._compiler.compile(kinds, result)
+                    self._cache.save_within(kinds, known)
+                self.add_overload(known)
             return known.entry_point
 
 
