@@ -66,21 +66,12 @@ def run_and_report(
 def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
-    session: Annotated[
-        str | None, value("--session", "ID", "Show this running session instead of starting one.")
-    ] = None,
+    session: Annotated[str | None, value("--session", "ID")] = None,
     *,
     reach: options.Reach,
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host", help="Address of the page; beyond loopback it needs --insecure and has a token."
-        ),
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
-    insecure: Annotated[
-        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
-    ] = False,
+    insecure: Annotated[bool, flag("--insecure")] = False,
     browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
     run: options.RunOptions,
 ) -> None:
@@ -88,6 +79,11 @@ def live_command(
 
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
+
+    Options:
+        session: Show this running session instead of starting one.
+        host: Address of the page; beyond loopback it needs --insecure and has a token.
+        insecure: Allow --host beyond loopback, without encryption.
     """
     from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
     from live.terminal_watch import watch_session
@@ -126,38 +122,19 @@ def ping_command(
     count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
-        str | None,
-        value(
-            "--benchmark",
-            "SCENARIO",
-            "Measure the network instead, by size, rate and transport, for this scenario.",
-            autocompletion=options.complete_scenarios,
-        ),
+        str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)
     ] = None,
-    ros2: Annotated[
-        str | None, value("--ros2", "TOPIC", "Measure how long messages of this topic of ROS 2 take instead.")
-    ] = None,
+    ros2: Annotated[str | None, value("--ros2", "TOPIC")] = None,
     ros: options.RosRouterOption = None,
     domain: options.RosDomainOption = 0,
     overrides: options.SetOption = None,
     seconds: Annotated[
         float | None,
-        value(
-            "--seconds",
-            "S",
-            "Duration of all cases together, s; default 24. With --answer: time until it ends; with "
-            "--ros2: 5.",
-            callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
-        ),
+        value("--seconds", "S", callback=options.check_range(1.0, 86400.0, "a number of seconds")),
     ] = None,
-    picture: Annotated[
-        Path | None, value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
-    ] = None,
+    picture: Annotated[Path | None, value("--figure", "FILE")] = None,
     force: options.ForceOption = False,
-    answer: Annotated[
-        list[str] | None,
-        value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
-    ] = None,
+    answer: Annotated[list[str] | None, value("--answer", "EP")] = None,
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
     clock_offset: options.ClockOffsetOption = 0.0,
@@ -175,6 +152,14 @@ def ping_command(
 
     With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any type, unseen
     (docs/ros2.md).
+
+    Options:
+        benchmark: Measure the network instead, by size, rate and transport, for this scenario.
+        ros2: Measure how long messages of this topic of ROS 2 take instead.
+        seconds: Duration of all cases together, s; default 24. With --answer: time until it ends; with
+            --ros2: 5.
+        picture: Draw the benchmark: .png, .svg or .pdf.
+        answer: Answer benchmarks from elsewhere, at this endpoint; repeatable.
     """
     ways = {"--benchmark": benchmark is not None, "--ros2": ros2 is not None, "--answer": bool(answer)}
     _refuse_others(context, next((way for way, chosen in ways.items() if chosen), ""))

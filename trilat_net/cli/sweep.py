@@ -207,89 +207,47 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
 def sweep_command(
     context: typer.Context,
     scenario: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[SCENARIO|RESULTS]",
-            help="Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.",
-            autocompletion=options.complete_scenarios,
-        ),
+        str | None, typer.Argument(metavar="[SCENARIO|RESULTS]", autocompletion=options.complete_scenarios)
     ] = None,
-    over: Annotated[
-        list[str] | None,
-        value(
-            "--over",
-            "KEY=VALUES",
-            "An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.",
-        ),
-    ] = None,
-    seeds: Annotated[
-        str | None, value("--seeds", "N|LIST", "How many seeds, or a list, as in 1..20; default: one.")
-    ] = None,
-    law: Annotated[
-        str | None, value("--law", "LAW,LAW...", "Sweep laws as well; default: the scenario's.")
-    ] = None,
+    over: Annotated[list[str] | None, value("--over", "KEY=VALUES")] = None,
+    seeds: Annotated[str | None, value("--seeds", "N|LIST")] = None,
+    law: Annotated[str | None, value("--law", "LAW,LAW...")] = None,
     duration: options.DurationOption = None,
-    longest: Annotated[
-        float | None,
-        value("--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."),
-    ] = None,
-    judge: Annotated[
-        str,
-        value(
-            "--judge",
-            "verdict|twins",
-            "What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.",
-        ),
-    ] = "verdict",
-    metric: Annotated[
-        list[str] | None,
-        value("--metric", "KEY", "Measure this of every run besides (docs/metrics.md); repeatable."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        value(
-            "-o --out",
-            "DIR",
-            "Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
-        ),
-    ] = None,
+    longest: Annotated[float | None, value("--longest", "S")] = None,
+    judge: Annotated[str, value("--judge", "verdict|twins")] = "verdict",
+    metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
+    output: Annotated[Path | None, value("-o --out", "DIR")] = None,
     resume: Annotated[Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
-    cell: Annotated[
-        int | None, value("--cell", "N", "With results: print the commands that make logs of a cell.")
-    ] = None,
+    cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     yes: Annotated[bool, flag("--yes", "Run an oversized sweep.")] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[bool, _option("--map", help="Draw the stability map with theory lines.")] = False,
-    width: Annotated[
-        float | None, _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column.")
-    ] = None,
-    margin: Annotated[
-        str | None,
-        _option(
-            "--margin",
-            metavar="KEY=FROM:TO",
-            help="Search the edge of stability along a key instead, at every point of the grid.",
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float, _option("--tolerance", metavar="SHARE", help="Width of an edge relative to its value.")
-    ] = 0.005,
-    confirm: Annotated[
-        int | None,
-        _option(
-            "--confirm",
-            metavar="K",
-            min=1,
-            help="With results: run this many cells on each side of the edge live.",
-        ),
-    ] = None,
+    width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
+    margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
+    tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
+    confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
     Finished runs are kept, however the sweep ends: --resume, or the same command with the same -o, continues.
+
+    Options:
+        scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.
+        over: An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
+        seeds: How many seeds, or a list, as in 1..20; default: one.
+        law: Sweep laws as well; default: the scenario's.
+        longest: Longest run of an undecided cell, s; default: eight times the duration.
+        judge: What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.
+        metric: Measure this of every run besides (docs/metrics.md); repeatable.
+        output: Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.
+        cell: With results: print the commands that make logs of a cell.
+        width: Width of the map, in; default: one column.
+        margin: Search the edge of stability along a key instead, at every point of the grid.
+        tolerance: Width of an edge relative to its value.
+        confirm: With results: run this many cells on each side of the edge live.
     """
     from ..studies.sweep import plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
