@@ -120,39 +120,29 @@ def _run_sweep(
     One that is too large is refused before it has a folder.
     """
     from ..studies.executor import count_workers
-    from ..studies.sweep.sweep_run import (
-        PLAN_FILE,
-        RESULTS_FILE,
-        describe_sweep_plan,
-        describe_sweep_speed,
-        estimate_sweep,
-        format_wall_time,
-        open_sweep_folder,
-        prepare_sweep_folder,
-        refuse_oversized_sweep,
-    )
+    from ..studies.sweep import sweep_run
 
     begun, plan, done = None, asked, []
-    if path is not None and (plan is None or (path / PLAN_FILE).exists()):
-        begun = open_sweep_folder(path, plan)
+    if path is not None and (plan is None or (path / sweep_run.PLAN_FILE).exists()):
+        begun = sweep_run.open_sweep_folder(path, plan)
         plan, done = begun.plan, begun.read_done()
     assert plan is not None
-    _print_lines(describe_sweep_plan(plan))
+    _print_lines(sweep_run.describe_sweep_plan(plan))
     if begun is not None:
         terminal.print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
-    expected = estimate_sweep(plan, done, workers)
+    expected = sweep_run.estimate_sweep(plan, done, workers)
     if not yes:
-        refuse_oversized_sweep(plan, expected, workers)
-    folder = begun or prepare_sweep_folder(plan, path)
+        sweep_run.refuse_oversized_sweep(plan, expected, workers)
+    folder = begun or sweep_run.prepare_sweep_folder(plan, path)
     if expected.seconds:
-        about = format_wall_time(expected.seconds)
+        about = sweep_run.format_wall_time(expected.seconds)
         terminal.print_text(f"  about {about}, by some of its cells; into {folder.path}")
     swept = _run_in_folder(folder, jobs, on, expected)
     if not (expected.entries or swept.runs):
         terminal.out.print("nothing was left to run")
-    speed = [describe_sweep_speed(swept)] if swept.runs else []
-    _print_results(swept.results, [*speed, f"results: {folder.path / RESULTS_FILE}"], folder.path)
+    speed = [sweep_run.describe_sweep_speed(swept)] if swept.runs else []
+    _print_results(swept.results, [*speed, f"results: {folder.path / sweep_run.RESULTS_FILE}"], folder.path)
     return swept
 
 
