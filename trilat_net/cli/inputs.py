@@ -42,9 +42,7 @@ def scenario_show_command(
 
 @options.command("mine.toml")
 def scenario_check_command(
-    file: options.ScenarioArgument,
-    overrides: options.SetOption = None,
-    as_json: options.JsonOption = False,
+    file: options.ScenarioArgument, overrides: options.SetOption = None, as_json: options.JsonOption = False
 ) -> None:
     """Checks a scenario, and prints what follows from it."""
     from ..scenario.describe import describe_scenario
@@ -56,8 +54,7 @@ def scenario_check_command(
     if as_json:
         facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
         return terminal.print_json(facts)
-    for line in lines:
-        terminal.print_text(line)
+    terminal.print_texts(lines)
     return None
 
 

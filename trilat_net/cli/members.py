@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ..errors import LawWithheld, RunFailed, UsageError
+from ..net.clock import Clock, SystemClock, make_system_clock
+from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
 from . import options
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from recorder.play.player import PlayProgress
     from recorder.play.session_reader import SessionHeader
 
-    from ..net.clock import Clock
     from ..scenario import Scenario
 
 
@@ -139,7 +140,6 @@ def record_command(
     from ..log.log_layout import find_parts, parse_channel_filter
     from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
-    from ..net.clock import make_system_clock
     from ..net.topics import RECORDER
 
     options.check_session_name(session)
@@ -243,9 +243,7 @@ def replay_command(
     from recorder.play.play_process import PlayOptions, play_log
     from recorder.play.session_reader import parse_selection, preload_messages
 
-    from ..net.clock import SystemClock
     from ..net.connection import default_endpoint
-    from ..process import Interrupt
 
     if preload < 0:
         raise UsageError(f"--preload is a number of MiB, not {preload}")
@@ -298,7 +296,7 @@ def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Cal
         )
 
 
-def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
+def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
     """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 
@@ -406,10 +404,8 @@ def router_command(
     continues when the router is restarted. Routers that --connect to each other act as one.
     """
     from ..net.access_rules import ROUTER
-    from ..net.clock import SystemClock
     from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
-    from ..process import Interrupt
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
@@ -460,9 +456,7 @@ def ros2_command(
     from sites.running_session import RunningSession
 
     from ..net.access_rules import BRIDGE
-    from ..net.clock import SystemClock
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
-    from ..process import Interrupt
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")

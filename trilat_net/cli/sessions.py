@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
+from ..net.clock import SystemClock, make_system_clock
+from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.session_text import MARKS
 from . import options
@@ -24,11 +26,7 @@ if TYPE_CHECKING:
 
 
 @options.command("paper --duration 10 --set control.Kd=5")
-def demo_command(
-    scenario: options.ScenarioArgument = "paper",
-    *,
-    run: options.RunOptions,
-) -> None:
+def demo_command(scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
     run_and_report(run.load(scenario), run)
 
@@ -87,8 +85,6 @@ def live_command(
     """
     from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
     from live.terminal_watch import watch_session
-
-    from ..net.clock import SystemClock
 
     clock, say = SystemClock(), terminal.print_line
     page = PageOptions(host, port, insecure, browser)
@@ -171,9 +167,6 @@ def ping_command(
         return _answer(answer, reach.keys, seconds, insecure=insecure)
     from sites.session_ping import ping_session
 
-    from ..net.clock import make_system_clock
-    from ..process import Interrupt
-
     connection = reach.resolve(operates=False)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
@@ -234,9 +227,7 @@ def _benchmark(
 def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool) -> None:
     from sites.session_ping import ping_topic
 
-    from ..net.clock import SystemClock
     from ..net.ros2_graph import Refusals, Ros2Graph, check_ros_name
-    from ..process import Interrupt
 
     name, clock = check_ros_name(topic, "topic"), SystemClock()
     graph = Ros2Graph(
@@ -251,8 +242,6 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
     from math import inf
 
     from sites.network_benchmark import run_far_end
-
-    from ..process import Interrupt
 
     with Interrupt() as interrupt:
         stopped, last_s = interrupt.requested, seconds or inf
@@ -275,8 +264,6 @@ def watch_command(
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
-    from ..net.clock import SystemClock
-
     name, clock = options.check_session_name(session), SystemClock()
     show = partial(show_in_terminal, clock, name, terminal.out)
     raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
@@ -291,11 +278,6 @@ def _find(session: str, reach: options.Reach) -> "RunningSession":
 
     connection = reach.resolve(operates=False)
     return RunningSession(options.check_session_name(session), connection)
-
-
-def _print_answers(answers: list[str]) -> None:
-    for text in answers:
-        terminal.print_text(text)
 
 
 @options.command("--session paper s", "--session paper --end")
@@ -315,18 +297,13 @@ def stop_command(
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
     running = _find(session, reach)
-    _print_answers(running.end() if end else running.stop(*(sites or ())))
+    terminal.print_texts(running.end() if end else running.stop(*(sites or ())))
 
 
 @options.command("--session paper s")
-def enable_command(
-    session: SessionOption,
-    sites: SitesArgument = None,
-    *,
-    reach: options.Reach,
-) -> None:
+def enable_command(session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach) -> None:
     """Lets stopped arms follow again: they wait for their peers and align with them."""
-    _print_answers(_find(session, reach).enable(*(sites or ())))
+    terminal.print_texts(_find(session, reach).enable(*(sites or ())))
 
 
 @options.command("--session paper s")
@@ -337,7 +314,7 @@ def reset_command(
     reach: options.Reach,
 ) -> None:
     """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
-    _print_answers(_find(session, reach).reset(*sites))
+    terminal.print_texts(_find(session, reach).reset(*sites))
 
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
@@ -464,8 +441,6 @@ def doctor_command(
     fails.
     """
     from sites.doctor import examine_machine
-
-    from ..net.clock import SystemClock
 
     connection = ways.find_endpoints()
     name = None if session is None else options.check_session_name(session)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import UsageError
+from ..net.clock import SystemClock
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
@@ -57,7 +58,6 @@ def test_command(
 ) -> None:
     r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what failed."""
     from ..files import write_whole
-    from ..net.clock import SystemClock
     from ..studies.executor import check_workers
     from ..studies.trials import encode_junit_xml
 
@@ -127,7 +127,6 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
 
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":
-    from ..net.clock import SystemClock
     from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
@@ -167,7 +166,6 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
         with terminal.progress_bar(label) as show:
             yield show
         return
-    from ..net.clock import SystemClock
     from ..studies.sweep.sweep_run import format_wall_time
 
     clock = SystemClock()
@@ -200,8 +198,7 @@ def _run_tuning(
     if not as_json:
         laws = ", ".join(space.law for space in asked.spaces)
         terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
-        for line in describe_procedure(asked):
-            terminal.print_text(f"  {line}")
+        terminal.print_texts(f"  {line}" for line in describe_procedure(asked))
         cores = "1 core" if workers == 1 else f"{workers} cores"
         duration = format_wall_time(asked.estimate_s(workers))
         terminal.print_text(

@@ -4,7 +4,7 @@ Invariant: everything printed is in the result files too, except live runs, whic
 interrupted prints the command that resumes it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,8 +56,7 @@ def _draw_map(
     command = build_sweep_command(results.plan, "--map", *words)
     with terminal.progress_bar("linear analysis") as progress:
         made = build_stability_map(results, (command,), jobs, progress, on=on)
-    for line in made.remarks:
-        terminal.print_text(f"note: {line}")
+    terminal.print_texts(f"note: {line}" for line in made.remarks)
     terminal.print_paths(write_map(made, folder, form.width_in))
 
 
@@ -127,7 +126,7 @@ def _run_sweep(
         begun = sweep_run.open_sweep_folder(path, plan)
         plan, done = begun.plan, begun.read_done()
     assert plan is not None
-    _print_lines(sweep_run.describe_sweep_plan(plan))
+    terminal.print_texts(sweep_run.describe_sweep_plan(plan))
     if begun is not None:
         terminal.print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
@@ -165,12 +164,9 @@ def _run_in_folder(
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
     from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
 
-    _print_lines([*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))])
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        terminal.print_text(line)
+    terminal.print_texts(
+        [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]
+    )
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
@@ -246,6 +242,7 @@ def sweep_command(
     require_polars()
     given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
+    draw = partial(_draw_map, width=width, jobs=jobs, on=on)
     if cell is not None or resume is not None or results is not None:
         _refuse_beside_results(given)
     elif confirm is not None:
@@ -260,7 +257,7 @@ def sweep_command(
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
         return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
-        return _show_results(results, jobs, on, mapped=mapped, width=width, confirm=confirm, as_json=as_json)
+        return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
@@ -275,21 +272,14 @@ def sweep_command(
             swept = _run_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
         with terminal.lines_aside(as_json):
-            _draw_map(swept.results, swept.folder.path, width, jobs, on)
+            draw(swept.results, swept.folder.path)
     if as_json:
         terminal.print_json(swept.results.to_dict())
     return None
 
 
 def _show_results(
-    path: Path,
-    jobs: int | None,
-    on: str | None,
-    *,
-    mapped: bool,
-    width: float | None,
-    confirm: int | None,
-    as_json: bool,
+    path: Path, confirm: int | None, draw: "Callable[[SweepResults, Path], None] | None", *, as_json: bool
 ) -> None:
     from ..studies.sweep.sweep_run import describe_sweep_plan, read_results
 
@@ -297,28 +287,21 @@ def _show_results(
     with terminal.lines_aside(as_json):
         if confirm is not None:
             _confirm_cells(results, confirm)
-        elif mapped:
-            _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
+        elif draw is not None:
+            draw(results, path if path.is_dir() else path.parent)
         else:
-            _print_lines(describe_sweep_plan(results.plan))
+            terminal.print_texts(describe_sweep_plan(results.plan))
             _print_results(results, [], path)
     if as_json:
         terminal.print_json(results.to_dict())
 
 
+_OF_A_PLAN = ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--metric", "--set", "--duration")
+
+
 def _refuse_beside_results(given: Sequence[str]) -> None:
     """Refuses options that a sweep was planned with where it is finished or continued."""
-    for name in (
-        "--over",
-        "--seeds",
-        "--law",
-        "-o",
-        "--longest",
-        "--judge",
-        "--metric",
-        "--set",
-        "--duration",
-    ):
+    for name in _OF_A_PLAN:
         if name in given:
             raise UsageError(f"{name} is of the sweep already: leave it out")
     if "--margin" in given:

@@ -245,9 +245,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             entries.append((f"{site}: {when}", line))
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         axes.set(
-            yscale="log",
-            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
-            ylabel=f"largest error ({unit})",
+            yscale="log", ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high), ylabel=f"largest error ({unit})"
         )
         plot.mark(axes, log.sites)
         plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)])
