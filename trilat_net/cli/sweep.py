@@ -235,11 +235,10 @@ def sweep_command(
         tolerance: Width of an edge relative to its value.
         confirm: With results: run this many cells on each side of the edge live.
     """
-    from ..studies.sweep import plan_sweep
+    from ..studies.sweep import plan_sweep, sweep_run
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
-    from ..studies.sweep.sweep_run import require_polars
 
-    require_polars()
+    sweep_run.require_polars()
     given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
