@@ -42,9 +42,7 @@ def scenario_show_command(
 
 @options.command("mine.toml")
 def scenario_check_command(
-    file: options.ScenarioArgument,
-    overrides: options.SetOption = None,
-    as_json: options.JsonOption = False,
+    file: options.ScenarioArgument, overrides: options.SetOption = None, as_json: options.JsonOption = False
 ) -> None:
     """Checks a scenario, and prints what follows from it."""
     from ..scenario.describe import describe_scenario
@@ -56,8 +54,7 @@ def scenario_check_command(
     if as_json:
         facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
         return terminal.print_json(facts)
-    for line in lines:
-        terminal.print_text(line)
+    terminal.print_texts(lines)
     return None
 
 
@@ -92,25 +89,21 @@ def new_law_command(
 @options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")
 def trace_import_command(
     form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
-    file: Annotated[
-        Path, typer.Argument(help="JSON of irtt, lines of ping -D, or a table with a header.", metavar="FILE")
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
     out: Annotated[Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")] = None,
-    way: Annotated[
-        str,
-        value(
-            "--way",
-            "half|send|receive|whole",
-            "Half a round trip, one way of irtt (send or receive), or delays as they are. "
-            "Default: half of a round trip, a one-way delay as it is.",
-        ),
-    ] = "",
+    way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
     column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
     every_s: Annotated[float, value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Makes a trace for links from what another program measured, and prints statistics of the network."""
+    """Makes a trace for links from what another program measured, and prints statistics of the network.
+
+    Options:
+        file: JSON of irtt, lines of ping -D, or a table with a header.
+        way: Half a round trip, one way of irtt (send or receive), or delays as they are. Default: half of a
+            round trip, a one-way delay as it is.
+    """
     from ..scenario.measured_traces import import_trace
 
     place = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
@@ -127,16 +120,8 @@ def trace_import_command(
 @options.command("keys m1 m2 s recorder operator --host 192.0.2.1")
 def keys_new_command(
     folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
-    members: Annotated[
-        list[str],
-        typer.Argument(
-            help="The sites; and recorder, operator, router, bridge if there are any.", metavar="MEMBER..."
-        ),
-    ],
-    hosts: Annotated[
-        list[str] | None,
-        value("--host", "NAME", "Host name or address at which a member listens; repeatable."),
-    ] = None,
+    members: Annotated[list[str], typer.Argument(metavar="MEMBER...")],
+    hosts: Annotated[list[str] | None, value("--host", "NAME")] = None,
     days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
 ) -> None:
     """Makes keys: a private certificate authority, and for each member a folder for its machine alone.
@@ -144,6 +129,10 @@ def keys_new_command(
     Bring each folder to its machine by a channel that you trust, and give it as --keys. Members without keys,
     or with keys of another authority, cannot connect; a member can send only under its own name. Keep the
     folder `authority` where no member runs, or delete it: new keys are always made for all members at once.
+
+    Options:
+        members: The sites; and recorder, operator, router, bridge if there are any.
+        hosts: Host name or address at which a member listens; repeatable.
     """
     from ..net.member_keys import create_keys
 

@@ -104,23 +104,18 @@ def log_recover_command(
 @options.command("run.mcap --to parquet")
 def log_export_command(
     files: options.LogsArgument,
-    form: Annotated[
-        str,
-        options.value(
-            "--to",
-            "|".join(list_export_formats()),
-            "ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file "
-            "per site and kind; npz, mat: one file with an array per column.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        options.value("-o --out", "OUT", "File or folder; default: next to FILE, named after it."),
-    ] = None,
+    form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
+    output: Annotated[Path | None, options.value("-o --out", "OUT")] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Exports a log to files for other tools: names end in their units, numbers are exact."""
+    """Exports a log to files for other tools: names end in their units, numbers are exact.
+
+    Options:
+        form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
+            site and kind; npz, mat: one file with an array per column.
+        output: File or folder; default: next to FILE, named after it.
+    """
     from ..reporting.export import Exporter
 
     exporter = Exporter(form, output, force=force, log=files[0])

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ..errors import LawWithheld, RunFailed, UsageError
+from ..net.clock import Clock, SystemClock, make_system_clock
+from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.text_table import TextTable
 from . import options
@@ -21,48 +23,22 @@ if TYPE_CHECKING:
     from recorder.play.player import PlayProgress
     from recorder.play.session_reader import SessionHeader
 
-    from ..net.clock import Clock
     from ..scenario import Scenario
 
 
 @options.command("m1 --scenario paper")
 def site_command(
-    name: Annotated[
-        str, typer.Argument(help="Name of the site in the scenario.", autocompletion=options.complete_sites)
-    ],
-    scenario: Annotated[
-        str,
-        typer.Option(
-            "--scenario",
-            "-s",
-            help="Name of a shipped scenario, or path of a TOML file.",
-            autocompletion=options.complete_scenarios,
-        ),
-    ],
+    name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
+    scenario: Annotated[str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)],
     session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
     *,
     ways: options.MemberOptions,
     join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the others, s.")] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
-    stay: Annotated[
-        float, seconds("--stay", "At the end, wait until the recorder has left, at most this long, s.")
-    ] = 0.0,
-    without: Annotated[
-        list[str] | None,
-        value(
-            "--without",
-            "SITE",
-            "Option of the first site: begin without SITE, which may join later; repeatable.",
-        ),
-    ] = None,
-    leave_timeout: Annotated[
-        float | None,
-        seconds(
-            "--leave-timeout",
-            "Under glide: time to go on without a site that has left, s; default: to the end.",
-        ),
-    ] = None,
+    stay: Annotated[float, seconds("--stay")] = 0.0,
+    without: Annotated[list[str] | None, value("--without", "SITE")] = None,
+    leave_timeout: Annotated[float | None, seconds("--leave-timeout")] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
     duration: options.DurationOption = None,
@@ -73,6 +49,13 @@ def site_command(
 
     Without endpoints, the sites of a session find each other on this machine: each listens at a loopback port
     derived from session and site, and connects to the sites that precede it in the scenario.
+
+    Options:
+        name: Name of the site in the scenario.
+        scenario: Name of a shipped scenario, or path of a TOML file.
+        stay: At the end, wait until the recorder has left, at most this long, s.
+        without: Option of the first site: begin without SITE, which may join later; repeatable.
+        leave_timeout: Under glide: time to go on without a site that has left, s; default: to the end.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site
@@ -121,40 +104,17 @@ def record_command(
     session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
     ways: options.MemberOptions,
-    output: Annotated[
-        Path | None,
-        value(
-            "-o --out --output",
-            "FILE",
-            "Default: SESSION.mcap; with --conclude run.mcap in the next free folder.",
-        ),
-    ] = None,
-    join_timeout: Annotated[
-        float | None,
-        seconds("--join-timeout", "Longest wait for the session to begin, s; default: no limit."),
-    ] = None,
+    output: Annotated[Path | None, value("-o --out --output", "FILE")] = None,
+    join_timeout: Annotated[float | None, seconds("--join-timeout")] = None,
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
-    concluded: Annotated[
-        bool, flag("--conclude", "Afterwards verify the log, and write a report into its folder.")
-    ] = False,
-    include: Annotated[
-        list[str] | None,
-        value("--include", "KEYS", "Record only these channels, as in '**/m1/**'; repeatable."),
-    ] = None,
-    exclude: Annotated[
-        list[str] | None, value("--exclude", "KEYS", "Leave these channels out, as in '**/link'; repeatable.")
-    ] = None,
-    split_size: Annotated[
-        float | None, value("--split-size", "MIB", "Split the log into parts of at most this size, MiB.")
-    ] = None,
-    split_duration: Annotated[
-        float | None, value("--split-duration", "S", "Split the log into parts of this duration, s.")
-    ] = None,
+    concluded: Annotated[bool, flag("--conclude")] = False,
+    include: Annotated[list[str] | None, value("--include", "KEYS")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "KEYS")] = None,
+    split_size: Annotated[float | None, value("--split-size", "MIB")] = None,
+    split_duration: Annotated[float | None, value("--split-duration", "S")] = None,
     carry_on: Annotated[bool, flag("--continue", "If the log exists, write its next part.")] = False,
-    durable: Annotated[
-        bool, flag("--durable", "Sync to the disk at every flush instead of every second.")
-    ] = False,
+    durable: Annotated[bool, flag("--durable")] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
     png: options.PngOption = False,
@@ -163,6 +123,16 @@ def record_command(
 
     Without endpoints it asks the first site, at its loopback port, for the others. Parts are named
     FILE-001.mcap and so on. The name of a file ends in .active until the file is finished.
+
+    Options:
+        output: Default: SESSION.mcap; with --conclude run.mcap in the next free folder.
+        join_timeout: Longest wait for the session to begin, s; default: no limit.
+        concluded: Afterwards verify the log, and write a report into its folder.
+        include: Record only these channels, as in '**/m1/**'; repeatable.
+        exclude: Leave these channels out, as in '**/link'; repeatable.
+        split_size: Split the log into parts of at most this size, MiB.
+        split_duration: Split the log into parts of this duration, s.
+        durable: Sync to the disk at every flush instead of every second.
     """
     from recorder.record_process import record_session
 
@@ -170,7 +140,6 @@ def record_command(
     from ..log.log_layout import find_parts, parse_channel_filter
     from ..log.log_writer import LogStorage, parse_split
     from ..log.ros2.viz_channels import parse_viz_rate
-    from ..net.clock import make_system_clock
     from ..net.topics import RECORDER
 
     options.check_session_name(session)
@@ -231,51 +200,20 @@ _MIB = 1 << 20
 
 @options.command("run.mcap --rate 2 --start 5")
 def replay_command(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="An MCAP log, or the parts of one in their order.")
-    ],
-    rate: Annotated[
-        str, value("--rate", "X", "Speed relative to the recording, or max: as fast as possible.")
-    ] = "1",
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    rate: Annotated[str, value("--rate", "X")] = "1",
     loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
-    start: Annotated[
-        float | None, value("--start", "S", "Start of the part to play, s since tick 0.")
-    ] = None,
+    start: Annotated[float | None, value("--start", "S")] = None,
     stop: Annotated[float | None, value("--stop", "S", "End of the part to play, s since tick 0.")] = None,
-    duration: Annotated[
-        float | None, value("--duration", "S", "Duration of the part to play, s, instead of --stop.")
-    ] = None,
-    include: Annotated[
-        list[str] | None,
-        value(
-            "--include",
-            "KEYEXPR",
-            "Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.",
-        ),
-    ] = None,
-    exclude: Annotated[
-        list[str] | None,
-        value("--exclude", "KEYEXPR", "Leave these channels out, as in '**/link'; repeatable."),
-    ] = None,
-    prefix: Annotated[
-        str, value("--prefix", "WORD", "Name the session WORD-NAME; with '' NAME, as recorded.")
-    ] = "replay",
+    duration: Annotated[float | None, value("--duration", "S")] = None,
+    include: Annotated[list[str] | None, value("--include", "KEYEXPR")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "KEYEXPR")] = None,
+    prefix: Annotated[str, value("--prefix", "WORD")] = "replay",
     session: Annotated[str | None, value("--session", "ID", "Name of the session, without a prefix.")] = None,
-    time: Annotated[
-        str, value("--time", "publish|log", "Play messages at their times of sending, or of arrival.")
-    ] = "publish",
-    low_cpu: Annotated[
-        bool, flag("--low-cpu", "Sleep until every deadline, which is about 0.1 ms less exact.")
-    ] = False,
+    time: Annotated[str, value("--time", "publish|log")] = "publish",
+    low_cpu: Annotated[bool, flag("--low-cpu")] = False,
     needs_recorder: options.NeedsRecorderOption = False,
-    preload: Annotated[
-        int,
-        value(
-            "--preload",
-            "MIB",
-            "Largest log held in memory; another process reads a larger one during the replay.",
-        ),
-    ] = 256,
+    preload: Annotated[int, value("--preload", "MIB")] = 256,
     listen: options.ListenOption = None,
     connect: options.ConnectOption = None,
     router: options.RouterOption = None,
@@ -288,14 +226,24 @@ def replay_command(
     To recorders, viewers and `trilat ping` it looks like a running session: it answers for the sites of the
     log, and its messages are theirs, byte for byte. Without endpoints it listens where the session's first
     site would.
+
+    Options:
+        files: An MCAP log, or the parts of one in their order.
+        rate: Speed relative to the recording, or max: as fast as possible.
+        start: Start of the part to play, s since tick 0.
+        duration: Duration of the part to play, s, instead of --stop.
+        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.
+        exclude: Leave these channels out, as in '**/link'; repeatable.
+        prefix: Name the session WORD-NAME; with '' NAME, as recorded.
+        time: Play messages at their times of sending, or of arrival.
+        low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
+        preload: Largest log held in memory; another process reads a larger one during the replay.
     """
     from recorder.play.pace import parse_rate
     from recorder.play.play_process import PlayOptions, play_log
     from recorder.play.session_reader import parse_selection, preload_messages
 
-    from ..net.clock import SystemClock
     from ..net.connection import default_endpoint
-    from ..process import Interrupt
 
     if preload < 0:
         raise UsageError(f"--preload is a number of MiB, not {preload}")
@@ -348,7 +296,7 @@ def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Cal
         )
 
 
-def _line(clock: "Clock") -> Callable[["PlayProgress"], None]:
+def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
     """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 
@@ -456,10 +404,8 @@ def router_command(
     continues when the router is restarted. Routers that --connect to each other act as one.
     """
     from ..net.access_rules import ROUTER
-    from ..net.clock import SystemClock
     from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
-    from ..process import Interrupt
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
@@ -487,22 +433,11 @@ def ros2_command(
     session: Annotated[str, value("--session", "ID", "Session to show.")],
     ros: options.RosRouterOption = None,
     domain: options.RosDomainOption = 0,
-    distro: Annotated[
-        str,
-        value("--ros-distro", "humble|jazzy|kilted|lyrical", "Distribution of ROS 2 whose form is written."),
-    ] = "jazzy",
+    distro: Annotated[str, value("--ros-distro", "humble|jazzy|kilted|lyrical")] = "jazzy",
     rate: Annotated[
-        float,
-        value(
-            "--rate",
-            "HZ",
-            "Messages a second of each topic.",
-            callback=options.check_range(1.0, 20_000.0, "a rate, Hz,"),
-        ),
+        float, value("--rate", "HZ", callback=options.check_range(1.0, 20000.0, "a rate, Hz,"))
     ] = 100.0,
-    names: Annotated[
-        str, value("--names", "crisp|crtk|FILE", "Names of topics, or a TOML file of them and of robots.")
-    ] = "crisp",
+    names: Annotated[str, value("--names", "crisp|crtk|FILE")] = "crisp",
     timeout: options.AnswerOption = 10.0,
     *,
     reach: options.Reach,
@@ -511,14 +446,17 @@ def ros2_command(
 
     ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here. The bridge waits
     for the router, and ends with the session. docs/ros2.md has all topics and services.
+
+    Options:
+        distro: Distribution of ROS 2 whose form is written.
+        rate: Messages a second of each topic.
+        names: Names of topics, or a TOML file of them and of robots.
     """
     from sites.ros2_bridge import read_topic_table, serve_ros2
     from sites.running_session import RunningSession
 
     from ..net.access_rules import BRIDGE
-    from ..net.clock import SystemClock
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
-    from ..process import Interrupt
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")

@@ -1,6 +1,7 @@
 """Options that several commands share, alone or together, and the scenario, connection or log they mean."""
 
 import inspect
+import re
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import wraps
@@ -39,26 +40,37 @@ check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
 """Refuses a waiting time out of range."""
 
 
-def value(names: str, metavar: str, text: str, **more: Any) -> Any:
+def value(names: str, metavar: str, text: str = "", **more: Any) -> Any:
     """Returns an option that takes a value, with its help; several names are separated by spaces."""
     return typer.Option(*names.split(), metavar=metavar, help=text, **more)
 
 
-def flag(names: str, text: str, **more: Any) -> Any:
+def flag(names: str, text: str = "", **more: Any) -> Any:
     """Returns an option without a value, with its help."""
     return typer.Option(names, help=text, **more)
 
 
-def seconds(name: str, text: str) -> Any:
+def seconds(name: str, text: str = "") -> Any:
     """Returns an option that takes a waiting time, s, with its help."""
     return value(name, "S", text, callback=check_seconds)
 
 
+_TOLD = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
+"""An entry of a docstring's section `Options`, after `inspect.cleandoc`."""
+
+
 def command(*examples: str) -> Callable[[Runs], Runs]:
-    """Declares a command of the program, with the arguments of its examples."""
+    """Declares a command of the program, with the arguments of its examples.
+
+    An option whose help does not fit into its line has it in the section `Options` of the docstring.
+    """
 
     def declare(run: Runs) -> Runs:
         run.examples = examples  # type: ignore[attr-defined]
+        head, _, told = (inspect.getdoc(run) or "").partition("\n\nOptions:\n")
+        run.__doc__ = head or None
+        for name, text in _TOLD.findall(told):
+            run.__annotations__[name].__metadata__[0].help = " ".join(text.split())
         return run
 
     return declare

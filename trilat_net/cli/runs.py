@@ -63,18 +63,8 @@ def sim_command(
 @options.command("run.mcap")
 def verify_command(
     files: options.LogsArgument,
-    virtual: Annotated[
-        bool, flag("--virtual", "Compare with virtual time too, with and without the log's arrivals.")
-    ] = False,
-    resume_every: Annotated[
-        int,
-        value(
-            "--resume-every",
-            "N",
-            "Start sites afresh from the records every N ticks: shows what a law knows besides.",
-            min=0,
-        ),
-    ] = 0,
+    virtual: Annotated[bool, flag("--virtual")] = False,
+    resume_every: Annotated[int, value("--resume-every", "N", min=0)] = 0,
     *,
     laws: options.LawFiles,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
@@ -85,6 +75,10 @@ def verify_command(
     Exit code 0: all agrees, the log is as it was made, and enough of every site was judged. 1: something
     differs, was changed, or is missing. 2: no log. 4: a site's law is code from outside that may not run
     without --law; all else agrees.
+
+    Options:
+        virtual: Compare with virtual time too, with and without the log's arrivals.
+        resume_every: Start sites afresh from the records every N ticks: shows what a law knows besides.
     """
     from ..execution.log_checks import run_log_checks
 
@@ -187,29 +181,25 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
 def figure_command(
     file: options.LogArgument,
     names: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Names of figures, see --list; default: all that FILE has.",
-            metavar="NAME",
-            autocompletion=options.complete_figures,
-        ),
+        list[str] | None, typer.Argument(metavar="NAME", autocompletion=options.complete_figures)
     ] = None,
-    width_in: Annotated[
-        float, value("--width", "3.5|7", "Width of one or two columns of a paper, in.")
-    ] = 3.5,
+    width_in: Annotated[float, value("--width", "3.5|7")] = 3.5,
     formats: Annotated[str, value("--format", "pdf,png,svg", "One or more formats.")] = "pdf,png",
     folder: Annotated[Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")] = None,
-    others: Annotated[
-        list[Path] | None,
-        value("--with", "FILE", "Draw this log over FILE, as the figure overlay; repeatable."),
-    ] = None,
+    others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
     laws: options.LawFiles,
     listed: Annotated[bool, flag("--list", "Only list the figures.")] = False,
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time."""
+    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time.
+
+    Options:
+        names: Names of figures, see --list; default: all that FILE has.
+        width_in: Width of one or two columns of a paper, in.
+        others: Draw this log over FILE, as the figure overlay; repeatable.
+    """
     log = laws.open(file)
     if listed:
         _list_figures(log, as_json=as_json)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError
+from ..net.clock import SystemClock, make_system_clock
+from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.session_text import MARKS
 from . import options
@@ -24,11 +26,7 @@ if TYPE_CHECKING:
 
 
 @options.command("paper --duration 10 --set control.Kd=5")
-def demo_command(
-    scenario: options.ScenarioArgument = "paper",
-    *,
-    run: options.RunOptions,
-) -> None:
+def demo_command(scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions) -> None:
     """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
     run_and_report(run.load(scenario), run)
 
@@ -66,21 +64,12 @@ def run_and_report(
 def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
-    session: Annotated[
-        str | None, value("--session", "ID", "Show this running session instead of starting one.")
-    ] = None,
+    session: Annotated[str | None, value("--session", "ID")] = None,
     *,
     reach: options.Reach,
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host", help="Address of the page; beyond loopback it needs --insecure and has a token."
-        ),
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
-    insecure: Annotated[
-        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
-    ] = False,
+    insecure: Annotated[bool, flag("--insecure")] = False,
     browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
     run: options.RunOptions,
 ) -> None:
@@ -88,11 +77,14 @@ def live_command(
 
     The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
     page shows a session that already runs, and leaves it running.
+
+    Options:
+        session: Show this running session instead of starting one.
+        host: Address of the page; beyond loopback it needs --insecure and has a token.
+        insecure: Allow --host beyond loopback, without encryption.
     """
     from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
     from live.terminal_watch import watch_session
-
-    from ..net.clock import SystemClock
 
     clock, say = SystemClock(), terminal.print_line
     page = PageOptions(host, port, insecure, browser)
@@ -126,38 +118,19 @@ def ping_command(
     count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
-        str | None,
-        value(
-            "--benchmark",
-            "SCENARIO",
-            "Measure the network instead, by size, rate and transport, for this scenario.",
-            autocompletion=options.complete_scenarios,
-        ),
+        str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)
     ] = None,
-    ros2: Annotated[
-        str | None, value("--ros2", "TOPIC", "Measure how long messages of this topic of ROS 2 take instead.")
-    ] = None,
+    ros2: Annotated[str | None, value("--ros2", "TOPIC")] = None,
     ros: options.RosRouterOption = None,
     domain: options.RosDomainOption = 0,
     overrides: options.SetOption = None,
     seconds: Annotated[
         float | None,
-        value(
-            "--seconds",
-            "S",
-            "Duration of all cases together, s; default 24. With --answer: time until it ends; with "
-            "--ros2: 5.",
-            callback=options.check_range(1.0, 86_400.0, "a number of seconds"),
-        ),
+        value("--seconds", "S", callback=options.check_range(1.0, 86400.0, "a number of seconds")),
     ] = None,
-    picture: Annotated[
-        Path | None, value("--figure", "FILE", "Draw the benchmark: .png, .svg or .pdf.")
-    ] = None,
+    picture: Annotated[Path | None, value("--figure", "FILE")] = None,
     force: options.ForceOption = False,
-    answer: Annotated[
-        list[str] | None,
-        value("--answer", "EP", "Answer benchmarks from elsewhere, at this endpoint; repeatable."),
-    ] = None,
+    answer: Annotated[list[str] | None, value("--answer", "EP")] = None,
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
     clock_offset: options.ClockOffsetOption = 0.0,
@@ -175,6 +148,14 @@ def ping_command(
 
     With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any type, unseen
     (docs/ros2.md).
+
+    Options:
+        benchmark: Measure the network instead, by size, rate and transport, for this scenario.
+        ros2: Measure how long messages of this topic of ROS 2 take instead.
+        seconds: Duration of all cases together, s; default 24. With --answer: time until it ends; with
+            --ros2: 5.
+        picture: Draw the benchmark: .png, .svg or .pdf.
+        answer: Answer benchmarks from elsewhere, at this endpoint; repeatable.
     """
     ways = {"--benchmark": benchmark is not None, "--ros2": ros2 is not None, "--answer": bool(answer)}
     _refuse_others(context, next((way for way, chosen in ways.items() if chosen), ""))
@@ -185,9 +166,6 @@ def ping_command(
     if answer:
         return _answer(answer, reach.keys, seconds, insecure=insecure)
     from sites.session_ping import ping_session
-
-    from ..net.clock import make_system_clock
-    from ..process import Interrupt
 
     connection = reach.resolve(operates=False)
     clock = make_system_clock(clock_offset, clock_drift)
@@ -249,9 +227,7 @@ def _benchmark(
 def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool) -> None:
     from sites.session_ping import ping_topic
 
-    from ..net.clock import SystemClock
     from ..net.ros2_graph import Refusals, Ros2Graph, check_ros_name
-    from ..process import Interrupt
 
     name, clock = check_ros_name(topic, "topic"), SystemClock()
     graph = Ros2Graph(
@@ -266,8 +242,6 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
     from math import inf
 
     from sites.network_benchmark import run_far_end
-
-    from ..process import Interrupt
 
     with Interrupt() as interrupt:
         stopped, last_s = interrupt.requested, seconds or inf
@@ -290,8 +264,6 @@ def watch_command(
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
-    from ..net.clock import SystemClock
-
     name, clock = options.check_session_name(session), SystemClock()
     show = partial(show_in_terminal, clock, name, terminal.out)
     raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
@@ -306,11 +278,6 @@ def _find(session: str, reach: options.Reach) -> "RunningSession":
 
     connection = reach.resolve(operates=False)
     return RunningSession(options.check_session_name(session), connection)
-
-
-def _print_answers(answers: list[str]) -> None:
-    for text in answers:
-        terminal.print_text(text)
 
 
 @options.command("--session paper s", "--session paper --end")
@@ -330,18 +297,13 @@ def stop_command(
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
     running = _find(session, reach)
-    _print_answers(running.end() if end else running.stop(*(sites or ())))
+    terminal.print_texts(running.end() if end else running.stop(*(sites or ())))
 
 
 @options.command("--session paper s")
-def enable_command(
-    session: SessionOption,
-    sites: SitesArgument = None,
-    *,
-    reach: options.Reach,
-) -> None:
+def enable_command(session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach) -> None:
     """Lets stopped arms follow again: they wait for their peers and align with them."""
-    _print_answers(_find(session, reach).enable(*(sites or ())))
+    terminal.print_texts(_find(session, reach).enable(*(sites or ())))
 
 
 @options.command("--session paper s")
@@ -352,7 +314,7 @@ def reset_command(
     reach: options.Reach,
 ) -> None:
     """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
-    _print_answers(_find(session, reach).reset(*sites))
+    terminal.print_texts(_find(session, reach).reset(*sites))
 
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
@@ -479,8 +441,6 @@ def doctor_command(
     fails.
     """
     from sites.doctor import examine_machine
-
-    from ..net.clock import SystemClock
 
     connection = ways.find_endpoints()
     name = None if session is None else options.check_session_name(session)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import UsageError
+from ..net.clock import SystemClock
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
@@ -57,7 +58,6 @@ def test_command(
 ) -> None:
     r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what failed."""
     from ..files import write_whole
-    from ..net.clock import SystemClock
     from ..studies.executor import check_workers
     from ..studies.trials import encode_junit_xml
 
@@ -127,7 +127,6 @@ def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "Tri
 
 
 def _run_live(batch: "list[Trial]") -> "TrialReport":
-    from ..net.clock import SystemClock
     from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
@@ -167,7 +166,6 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
         with terminal.progress_bar(label) as show:
             yield show
         return
-    from ..net.clock import SystemClock
     from ..studies.sweep.sweep_run import format_wall_time
 
     clock = SystemClock()
@@ -200,8 +198,7 @@ def _run_tuning(
     if not as_json:
         laws = ", ".join(space.law for space in asked.spaces)
         terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
-        for line in describe_procedure(asked):
-            terminal.print_text(f"  {line}")
+        terminal.print_texts(f"  {line}" for line in describe_procedure(asked))
         cores = "1 core" if workers == 1 else f"{workers} cores"
         duration = format_wall_time(asked.estimate_s(workers))
         terminal.print_text(
@@ -222,46 +219,36 @@ _option = partial(value, rich_help_panel="Tune laws")
 @options.command("a.mcap b.mcap", "--tune free --law adaptive,p_d")
 def compare_command(
     context: typer.Context,
-    files: Annotated[
-        list[Path] | None, typer.Argument(help="Two or more MCAP logs.", metavar="FILE FILE...")
-    ] = None,
-    tune: Annotated[
-        str | None, _option("--tune", "SCENARIO", "Compare tuned control laws in this scenario instead.")
-    ] = None,
-    law: Annotated[
-        str | None,
-        _option(
-            "--law",
-            "LAW,LAW...",
-            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: "
-            "adaptive_robust, known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, "
-            "authority, impedance, smith, and your own, as in mylaws:Law.",
-        ),
-    ] = None,
+    files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
+    tune: Annotated[str | None, _option("--tune", "SCENARIO")] = None,
+    law: Annotated[str | None, _option("--law", "LAW,LAW...")] = None,
     budget: Annotated[int, _option("--budget", "N", "Candidates per law.")] = 64,
     seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
-    seeds: Annotated[
-        int, _option("--seeds", "N", "Seeds of the scenario that each candidate is the mean of.")
-    ] = 1,
-    objective: Annotated[
-        str, _option("--objective", "error|settling", "The objective besides effort.")
-    ] = "error",
-    gravity: Annotated[
-        float, _option("--gravity", "PERCENT", "Gravity that all laws assume, in % of the truth.")
-    ] = 100.0,
+    seeds: Annotated[int, _option("--seeds", "N")] = 1,
+    objective: Annotated[str, _option("--objective", "error|settling")] = "error",
+    gravity: Annotated[float, _option("--gravity", "PERCENT")] = 100.0,
     duration: options.DurationOption = None,
     overrides: options.SetOption = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
-    output: Annotated[
-        Path | None, _option("--out -o", "DIR", "Folder of the results; default: the next free runs/tune-...")
-    ] = None,
+    output: Annotated[Path | None, _option("--out -o", "DIR")] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Compares logs and the differences of their experiments; or control laws, all tuned by one procedure.
 
     Ranks nothing: arms that hang, or that no operator moves, also have small errors.
+
+    Options:
+        files: Two or more MCAP logs.
+        tune: Compare tuned control laws in this scenario instead.
+        law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust, known, p_f, wave,
+            tdpa, tanks, four_channel, six_channel, saturated_pd, authority, impedance, smith, and your own,
+            as in mylaws:Law.
+        seeds: Seeds of the scenario that each candidate is the mean of.
+        objective: The objective besides effort.
+        gravity: Gravity that all laws assume, in % of the truth.
+        output: Folder of the results; default: the next free runs/tune-...
     """
     if tune is None:
         for name in options.given_options(context):
@@ -322,28 +309,12 @@ def bench_command(
     small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,
     task: Annotated[str | None, value("--task", "TASK,TASK...", "Only these tasks.")] = None,
     law: Annotated[str | None, value("--law", "LAW,LAW...", "Only these laws.")] = None,
-    link: Annotated[
-        str | None, value("--link", "LINK,LINK...", "Other links, as in rtt68-loss10,4g.")
-    ] = None,
+    link: Annotated[str | None, value("--link", "LINK,LINK...")] = None,
     seeds: Annotated[int | None, value("--seeds", "N", "Number of seeds; default: the study's.")] = None,
-    cell: Annotated[
-        str | None, value("--cell", "TASK/LAW/LINK", "Print the commands that make logs of a cell.")
-    ] = None,
-    tune: Annotated[
-        bool,
-        typer.Option(
-            "--tune",
-            help="Tune the laws again, and store their gains with the suite.",
-            rich_help_panel="Gains",
-        ),
-    ] = False,
-    confirm: Annotated[
-        bool, typer.Option("--confirm", help="Run what is not stable for 100 s: it is refuted or confirmed.")
-    ] = False,
-    output: Annotated[
-        Path | None,
-        value("--out -o", "DIR", "Folder; continues a suite in it. Default: runs/bench-STUDY."),
-    ] = None,
+    cell: Annotated[str | None, value("--cell", "TASK/LAW/LINK")] = None,
+    tune: Annotated[bool, typer.Option("--tune", rich_help_panel="Gains")] = False,
+    confirm: Annotated[bool, typer.Option("--confirm")] = False,
+    output: Annotated[Path | None, value("--out -o", "DIR")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
@@ -351,6 +322,13 @@ def bench_command(
     """Runs control laws on the same tasks over the same links: stability, energy, errors, effort, stiffness.
 
     One procedure tuned the gains of every law. Finished runs are kept: the same command continues.
+
+    Options:
+        link: Other links, as in rtt68-loss10,4g.
+        cell: Print the commands that make logs of a cell.
+        tune: Tune the laws again, and store their gains with the suite.
+        confirm: Run what is not stable for 100 s: it is refuted or confirmed.
+        output: Folder; continues a suite in it. Default: runs/bench-STUDY.
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
     from ..studies.bench.bench_figures import write_bench

@@ -4,7 +4,7 @@ Invariant: everything printed is in the result files too, except live runs, whic
 interrupted prints the command that resumes it.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,8 +56,7 @@ def _draw_map(
     command = build_sweep_command(results.plan, "--map", *words)
     with terminal.progress_bar("linear analysis") as progress:
         made = build_stability_map(results, (command,), jobs, progress, on=on)
-    for line in made.remarks:
-        terminal.print_text(f"note: {line}")
+    terminal.print_texts(f"note: {line}" for line in made.remarks)
     terminal.print_paths(write_map(made, folder, form.width_in))
 
 
@@ -120,39 +119,29 @@ def _run_sweep(
     One that is too large is refused before it has a folder.
     """
     from ..studies.executor import count_workers
-    from ..studies.sweep.sweep_run import (
-        PLAN_FILE,
-        RESULTS_FILE,
-        describe_sweep_plan,
-        describe_sweep_speed,
-        estimate_sweep,
-        format_wall_time,
-        open_sweep_folder,
-        prepare_sweep_folder,
-        refuse_oversized_sweep,
-    )
+    from ..studies.sweep import sweep_run
 
     begun, plan, done = None, asked, []
-    if path is not None and (plan is None or (path / PLAN_FILE).exists()):
-        begun = open_sweep_folder(path, plan)
+    if path is not None and (plan is None or (path / sweep_run.PLAN_FILE).exists()):
+        begun = sweep_run.open_sweep_folder(path, plan)
         plan, done = begun.plan, begun.read_done()
     assert plan is not None
-    _print_lines(describe_sweep_plan(plan))
+    terminal.print_texts(sweep_run.describe_sweep_plan(plan))
     if begun is not None:
         terminal.print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
-    expected = estimate_sweep(plan, done, workers)
+    expected = sweep_run.estimate_sweep(plan, done, workers)
     if not yes:
-        refuse_oversized_sweep(plan, expected, workers)
-    folder = begun or prepare_sweep_folder(plan, path)
+        sweep_run.refuse_oversized_sweep(plan, expected, workers)
+    folder = begun or sweep_run.prepare_sweep_folder(plan, path)
     if expected.seconds:
-        about = format_wall_time(expected.seconds)
+        about = sweep_run.format_wall_time(expected.seconds)
         terminal.print_text(f"  about {about}, by some of its cells; into {folder.path}")
     swept = _run_in_folder(folder, jobs, on, expected)
     if not (expected.entries or swept.runs):
         terminal.out.print("nothing was left to run")
-    speed = [describe_sweep_speed(swept)] if swept.runs else []
-    _print_results(swept.results, [*speed, f"results: {folder.path / RESULTS_FILE}"], folder.path)
+    speed = [sweep_run.describe_sweep_speed(swept)] if swept.runs else []
+    _print_results(swept.results, [*speed, f"results: {folder.path / sweep_run.RESULTS_FILE}"], folder.path)
     return swept
 
 
@@ -175,12 +164,9 @@ def _run_in_folder(
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
     from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
 
-    _print_lines([*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))])
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        terminal.print_text(line)
+    terminal.print_texts(
+        [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]
+    )
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
@@ -207,97 +193,55 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
 def sweep_command(
     context: typer.Context,
     scenario: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[SCENARIO|RESULTS]",
-            help="Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.",
-            autocompletion=options.complete_scenarios,
-        ),
+        str | None, typer.Argument(metavar="[SCENARIO|RESULTS]", autocompletion=options.complete_scenarios)
     ] = None,
-    over: Annotated[
-        list[str] | None,
-        value(
-            "--over",
-            "KEY=VALUES",
-            "An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.",
-        ),
-    ] = None,
-    seeds: Annotated[
-        str | None, value("--seeds", "N|LIST", "How many seeds, or a list, as in 1..20; default: one.")
-    ] = None,
-    law: Annotated[
-        str | None, value("--law", "LAW,LAW...", "Sweep laws as well; default: the scenario's.")
-    ] = None,
+    over: Annotated[list[str] | None, value("--over", "KEY=VALUES")] = None,
+    seeds: Annotated[str | None, value("--seeds", "N|LIST")] = None,
+    law: Annotated[str | None, value("--law", "LAW,LAW...")] = None,
     duration: options.DurationOption = None,
-    longest: Annotated[
-        float | None,
-        value("--longest", "S", "Longest run of an undecided cell, s; default: eight times the duration."),
-    ] = None,
-    judge: Annotated[
-        str,
-        value(
-            "--judge",
-            "verdict|twins",
-            "What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.",
-        ),
-    ] = "verdict",
-    metric: Annotated[
-        list[str] | None,
-        value("--metric", "KEY", "Measure this of every run besides (docs/metrics.md); repeatable."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        value(
-            "-o --out",
-            "DIR",
-            "Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.",
-        ),
-    ] = None,
+    longest: Annotated[float | None, value("--longest", "S")] = None,
+    judge: Annotated[str, value("--judge", "verdict|twins")] = "verdict",
+    metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
+    output: Annotated[Path | None, value("-o --out", "DIR")] = None,
     resume: Annotated[Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
-    cell: Annotated[
-        int | None, value("--cell", "N", "With results: print the commands that make logs of a cell.")
-    ] = None,
+    cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     yes: Annotated[bool, flag("--yes", "Run an oversized sweep.")] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[bool, _option("--map", help="Draw the stability map with theory lines.")] = False,
-    width: Annotated[
-        float | None, _option("--width", metavar="3.5|7", help="Width of the map, in; default: one column.")
-    ] = None,
-    margin: Annotated[
-        str | None,
-        _option(
-            "--margin",
-            metavar="KEY=FROM:TO",
-            help="Search the edge of stability along a key instead, at every point of the grid.",
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float, _option("--tolerance", metavar="SHARE", help="Width of an edge relative to its value.")
-    ] = 0.005,
-    confirm: Annotated[
-        int | None,
-        _option(
-            "--confirm",
-            metavar="K",
-            min=1,
-            help="With results: run this many cells on each side of the edge live.",
-        ),
-    ] = None,
+    width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
+    margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
+    tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
+    confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
 
     Finished runs are kept, however the sweep ends: --resume, or the same command with the same -o, continues.
-    """
-    from ..studies.sweep import plan_sweep
-    from ..studies.sweep.margin_search import format_range_axis, parse_search_range
-    from ..studies.sweep.sweep_run import require_polars
 
-    require_polars()
+    Options:
+        scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.
+        over: An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
+        seeds: How many seeds, or a list, as in 1..20; default: one.
+        law: Sweep laws as well; default: the scenario's.
+        longest: Longest run of an undecided cell, s; default: eight times the duration.
+        judge: What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.
+        metric: Measure this of every run besides (docs/metrics.md); repeatable.
+        output: Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.
+        cell: With results: print the commands that make logs of a cell.
+        width: Width of the map, in; default: one column.
+        margin: Search the edge of stability along a key instead, at every point of the grid.
+        tolerance: Width of an edge relative to its value.
+        confirm: With results: run this many cells on each side of the edge live.
+    """
+    from ..studies.sweep import plan_sweep, sweep_run
+    from ..studies.sweep.margin_search import format_range_axis, parse_search_range
+
+    sweep_run.require_polars()
     given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
+    draw = partial(_draw_map, width=width, jobs=jobs, on=on)
     if cell is not None or resume is not None or results is not None:
         _refuse_beside_results(given)
     elif confirm is not None:
@@ -312,7 +256,7 @@ def sweep_command(
             raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
         return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
-        return _show_results(results, jobs, on, mapped=mapped, width=width, confirm=confirm, as_json=as_json)
+        return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
     else:
@@ -327,21 +271,14 @@ def sweep_command(
             swept = _run_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
         with terminal.lines_aside(as_json):
-            _draw_map(swept.results, swept.folder.path, width, jobs, on)
+            draw(swept.results, swept.folder.path)
     if as_json:
         terminal.print_json(swept.results.to_dict())
     return None
 
 
 def _show_results(
-    path: Path,
-    jobs: int | None,
-    on: str | None,
-    *,
-    mapped: bool,
-    width: float | None,
-    confirm: int | None,
-    as_json: bool,
+    path: Path, confirm: int | None, draw: "Callable[[SweepResults, Path], None] | None", *, as_json: bool
 ) -> None:
     from ..studies.sweep.sweep_run import describe_sweep_plan, read_results
 
@@ -349,28 +286,21 @@ def _show_results(
     with terminal.lines_aside(as_json):
         if confirm is not None:
             _confirm_cells(results, confirm)
-        elif mapped:
-            _draw_map(results, path if path.is_dir() else path.parent, width, jobs, on)
+        elif draw is not None:
+            draw(results, path if path.is_dir() else path.parent)
         else:
-            _print_lines(describe_sweep_plan(results.plan))
+            terminal.print_texts(describe_sweep_plan(results.plan))
             _print_results(results, [], path)
     if as_json:
         terminal.print_json(results.to_dict())
 
 
+_OF_A_PLAN = ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--metric", "--set", "--duration")
+
+
 def _refuse_beside_results(given: Sequence[str]) -> None:
     """Refuses options that a sweep was planned with where it is finished or continued."""
-    for name in (
-        "--over",
-        "--seeds",
-        "--law",
-        "-o",
-        "--longest",
-        "--judge",
-        "--metric",
-        "--set",
-        "--duration",
-    ):
+    for name in _OF_A_PLAN:
         if name in given:
             raise UsageError(f"{name} is of the sweep already: leave it out")
     if "--margin" in given:

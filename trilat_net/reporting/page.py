@@ -140,10 +140,7 @@ def render_report(
     scenario = log.scenario
     bounds = charts.workspace_box_m(log)
     factor = charts.picture_scale(log, bounds)
-    data = {
-        **charts.Charts(log, twin, bounds).data(),
-        "bounds_m": [factor * bound for bound in bounds],
-    }
+    data = {**charts.Charts(log, twin, bounds).data(), "bounds_m": [factor * bound for bound in bounds]}
     return Template(_asset("report.html")).substitute(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),

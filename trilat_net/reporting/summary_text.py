@@ -7,14 +7,7 @@ Invariant: a link with one constant delay and no loss gets no line.
 
 from collections.abc import Iterator, Sequence
 
-from ..analysis.link_summary import (
-    ClockSummary,
-    LinkSummary,
-    SampleCounts,
-    ValueStatistics,
-    summarise_clock,
-    summarise_links,
-)
+from ..analysis import link_summary
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..execution.log_checks import LogCheckReport
 from ..execution.rerun import LinkEffect, LogAndRerun, Rerun
@@ -71,7 +64,7 @@ def format_outside_lines(log: Log) -> list[str]:
 
 def format_link_lines(log: Log) -> list[str]:
     """Returns a line per link that is not stated as constant without loss, or was not so."""
-    return _first([format_link_line(use) for use in summarise_links(log) if not use.plain])
+    return _first([format_link_line(use) for use in link_summary.summarise_links(log) if not use.plain])
 
 
 def format_change_lines(log: Log) -> list[str]:
@@ -107,13 +100,13 @@ def format_clock_lines(log: Log) -> list[str]:
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
-            use = summarise_clock(log, peer, site)
+            use = link_summary.summarise_clock(log, peer, site)
             if use is not None and not use.shared:
                 lines.append(f"clock of {peer} seen by {site}: {format_clock(use)}")
     return _first(lines)
 
 
-def format_link_line(use: LinkSummary) -> str:
+def format_link_line(use: link_summary.LinkSummary) -> str:
     """Returns the summary of a link in a line."""
     measured = any(state.link.measured for state in use.stated)
     parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
@@ -136,7 +129,7 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
     return ", then ".join(words)
 
 
-def format_clock(use: ClockSummary) -> str:
+def format_clock(use: link_summary.ClockSummary) -> str:
     """Returns offset, bound and drift of a clock in a few words."""
     known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
     words = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
@@ -147,7 +140,7 @@ def format_clock(use: ClockSummary) -> str:
     return ", ".join(words)
 
 
-def _ms(spread: ValueStatistics, factor: float = 1.0) -> str:
+def _ms(spread: link_summary.ValueStatistics, factor: float = 1.0) -> str:
     values = (spread.mean, spread.deviation, spread.p99, spread.max)
     mean, deviation, p99, largest = (_number(factor * value) for value in values)
     return f"{mean} +- {deviation} ms (p99 {p99}, max {largest})"
@@ -157,7 +150,7 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
-def _losses(use: LinkSummary, counts: SampleCounts) -> str:
+def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
     losses = {
         "missing on the way": counts.missing,
         "lost": counts.lost,

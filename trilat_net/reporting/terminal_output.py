@@ -85,10 +85,15 @@ def print_marked(mark: str, text: object) -> None:
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
+def print_texts(texts: Iterable[object]) -> None:
+    """Prints lines as `print_text` does."""
+    for text in texts:
+        print_text(text)
+
+
 def print_paths(paths: Iterable[Path]) -> None:
     """Prints the files that were written, a line each."""
-    for path in paths:
-        print_text(f"  {path}")
+    print_texts(f"  {path}" for path in paths)
 
 
 def print_json(value: Any) -> None:

@@ -16,18 +16,8 @@ from ...core.ticks import NS_PER_S
 from ...log.log_layout import SCENARIO, collect_provenance
 from ...log.log_reader import Log
 from ...log.mcap_writer import McapWriter
-from ...log.ros2 import cdr
+from ...log.ros2 import cdr, ros2_messages
 from ...log.ros2.cdr import pack_string
-from ...log.ros2.ros2_messages import (
-    FRAMES,
-    ROBOT,
-    ROBOT_CHANNELS,
-    SESSION_CHANNELS,
-    Ros2Channel,
-    Ros2SiteChannels,
-    pack_event,
-    stack_signals,
-)
 from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
@@ -77,7 +67,7 @@ def export_ros2(log: Log, path: Path, written: Written = lambda _: None) -> None
         file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
         file.add_attachment(0, 0, SCENARIO, "application/toml", log.scenario_text.encode())
         sites = [_SiteMessages(log, name, written) for name in log.sites]
-        known = {f"/{name}": channel for name, channel in SESSION_CHANNELS.items()}
+        known = {f"/{name}": channel for name, channel in ros2_messages.SESSION_CHANNELS.items()}
         for site in sites:
             known |= site.channels
         bag = _BagChannels(file, known)
@@ -91,7 +81,7 @@ def export_ros2(log: Log, path: Path, written: Written = lambda _: None) -> None
 class _BagChannels:
     """The channels of a bag, of all that are known by topic; each is registered with its first message."""
 
-    def __init__(self, file: McapWriter, known: dict[str, Ros2Channel]) -> None:
+    def __init__(self, file: McapWriter, known: dict[str, ros2_messages.Ros2Channel]) -> None:
         self._file, self._known = file, known
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -115,7 +105,7 @@ class _SiteMessages:
     def __init__(self, log: Log, name: str, progress: Callable[[int], None]) -> None:
         self._log, self._name, self._progress = log, name, progress
         self._epoch_unix_ns = int(log.session.get("epoch_unix_ns", "0"))
-        self._shapes = shapes = Ros2SiteChannels(log.scenario, name)
+        self._shapes = shapes = ros2_messages.Ros2SiteChannels(log.scenario, name)
         self._states = cdr.JointStatePacker(shapes.joints)
         self._reference = cdr.JointStatePacker(shapes.joints, effort=False)
         self.channels = {
@@ -124,7 +114,10 @@ class _SiteMessages:
             **{f"/{name}/{part}": array.channel for part, array in shapes.arrays.items()},
         }
         if shapes.robot is not None:
-            self.channels |= {f"/{name}/{ROBOT}": ROBOT_CHANNELS[ROBOT], _TF: ROBOT_CHANNELS[FRAMES]}
+            self.channels |= {
+                f"/{name}/{ros2_messages.ROBOT}": ros2_messages.ROBOT_CHANNELS[ros2_messages.ROBOT],
+                _TF: ros2_messages.ROBOT_CHANNELS[ros2_messages.FRAMES],
+            }
 
     def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
         return [(part if part == _TF else f"/{self._name}/{part}", data) for part, data in messages]
@@ -136,7 +129,7 @@ class _SiteMessages:
         for count, at in enumerate(np.argsort(part.log_time_ns, kind="stable").tolist(), 1):
             state = part.states[at]
             stamp_ns = max(0, self._epoch_unix_ns + state.tick * NS_PER_S // part.rate_hz)
-            row = [column[0] for column in stack_signals([state])]
+            row = [column[0] for column in ros2_messages.stack_signals([state])]
             messages = [
                 ("joint_states", self._states.pack(stamp_ns, state.q, state.qd, state.tau)),
                 *self._shapes.end_effector(state),
@@ -147,7 +140,7 @@ class _SiteMessages:
                 messages.insert(1, ("reference", self._reference.pack(stamp_ns, state.q_des, state.qd_des)))
             if (robot := self._shapes.robot) is not None:
                 if count == 1:
-                    messages.append((ROBOT, pack_string(robot.description)))
+                    messages.append((ros2_messages.ROBOT, pack_string(robot.description)))
                 messages.append((_TF, robot.pack(stamp_ns, state.q)))
             yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
             if not count % _EVERY or count == len(part):
@@ -165,7 +158,7 @@ def _events(log: Log) -> Iterator[_TimedMessages]:
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:
-        messages = [(f"/{topic}", data) for topic, data in pack_event(event, publish_ns)]
+        messages = [(f"/{topic}", data) for topic, data in ros2_messages.pack_event(event, publish_ns)]
         yield _TimedMessages(log_ns, publish_ns, messages)
 
 

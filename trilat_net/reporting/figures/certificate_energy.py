@@ -157,14 +157,8 @@ def _legend_pt(form: FigureSize) -> float:
 
 def _draw_work(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
     for (name, values), line in zip(balance.dissipation.items(), style.DASHES, strict=False):
-        _draw(
-            balance,
-            axes,
-            values,
-            label=_TAKEN.get(name, f"taken: {name}"),
-            color=style.REFERENCE,
-            linestyle=line,
-        )
+        label = _TAKEN.get(name, f"taken: {name}")
+        _draw(balance, axes, values, label=label, color=style.REFERENCE, linestyle=line)
     links = np.sum([x for name, x in balance.work.items() if "->" in name], axis=0)
     given = {name: x for name, x in balance.work.items() if "->" not in name}
     shown = {"hands": given.pop("hands"), "walls": given.pop("walls"), "links": links, **given}

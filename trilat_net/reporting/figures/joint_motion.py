@@ -14,25 +14,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ...analysis import site_signals
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import trace_dominance
-from ...analysis.site_signals import (
-    SETTLED_ERROR_RAD,
-    controller_torques,
-    external_torques,
-    joint_angles,
-    joint_error_rates,
-    joint_errors,
-    largest_magnitude,
-    largest_remaining_error,
-    operator_displacement,
-    parameter_estimates,
-    reference_angles,
-    settling_time_s,
-    shared_unit,
-    sites_with_operator,
-    true_parameters,
-)
+from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.timeline import list_changes
 from ...analysis.torque_sources import list_walls, wall_depth, wall_force
 from ...core.chain import LINK_PARAMETERS
@@ -57,15 +42,15 @@ _STEP = 0.01
 """Of its extent, between two points of a path."""
 NO_OPERATOR = "no site has an operator in this run"
 
-explain_absent_operator = unless(sites_with_operator, NO_OPERATOR)
+explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
 """Returns why there is no torque of an operator to draw; "" if there is one."""
 
 
 @draws("operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True)
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques of the operators ON the arms over time, N m; Fig. 3 of the paper."""
-    signal = style.site_records(log, external_torques)
-    return _draw_joints(log, form, sites_with_operator(log), signal, "torque on the arm (N m)")
+    signal = style.site_records(log, site_signals.external_torques)
+    return _draw_joints(log, form, site_signals.sites_with_operator(log), signal, "torque on the arm (N m)")
 
 
 def _explain_no_twin(log: Log) -> str:
@@ -83,7 +68,7 @@ def draw_operator_displacement(
     That run, `twin`, is simulated if it is not given.
     """
     other = simulate_without_operators(log) if twin is None else twin
-    signal = partial(operator_displacement, log, other)
+    signal = partial(site_signals.operator_displacement, log, other)
     return _draw_joints(log, form, log.sites, signal, "moved by operators (rad)")
 
 
@@ -92,11 +77,11 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
     limits: dict[str, Array] = {}
     for site in log.sites:
-        largest = np.abs(controller_torques(log[site])).max(axis=0, initial=0.0)
+        largest = np.abs(site_signals.controller_torques(log[site])).max(axis=0, initial=0.0)
         stated = np.broadcast_to(log.scenario.sites[site].limits.tau_limit_nm, largest.shape)
         if (largest >= stated).any():
             limits[site] = stated
-    signal = style.site_records(log, controller_torques)
+    signal = style.site_records(log, site_signals.controller_torques)
     return _draw_joints(log, form, log.sites, signal, "control torque (N m)", [*limits.values()])
 
 
@@ -166,8 +151,9 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         if len(upper) == 2:
             upper[1].sharey(upper[0])
             upper[1].tick_params(labelleft=False)
-        plot.joint_row(upper, sites_with_operator(log), style.site_records(log, external_torques))
-        plot.joint_row(lower, log.sites, style.site_records(log, joint_angles))
+        torques = style.site_records(log, site_signals.external_torques)
+        plot.joint_row(upper, site_signals.sites_with_operator(log), torques)
+        plot.joint_row(lower, log.sites, style.site_records(log, site_signals.joint_angles))
         plot.finish(lowest, style.site_legend_entries(log, log.sites))
     return plot.figure
 
@@ -188,7 +174,7 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(log, form, _height_in(log, height_in)) as plot:
         grid, lowest = _add_joint_rows(plot, form, heads, labels, "col")
         for site, row in zip(log.sites, grid, strict=True):
-            actual, desired = joint_angles(log[site]), reference_angles(log[site])
+            actual, desired = site_signals.joint_angles(log[site]), site_signals.reference_angles(log[site])
             for joint, axes in enumerate(row[: actual.shape[1]]):
                 plot.trace(axes, site, actual[:, joint], 1.6)
                 plot.trace(axes, site, desired[:, joint], **style.LIMIT_LINE)
@@ -206,7 +192,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     In task space it is that of the place along each axis, m. The lowest panel shows, at every time, the
     largest error of any joint that is still to come: where it crosses the dashed line, the site has settled.
     """
-    titles, unit = style.name_shared(log), shared_unit(log)
+    titles, unit = style.name_shared(log), site_signals.shared_unit(log)
     count = len(titles)
     rows = len(style.arrange_joints(count, form.narrow))
     with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
@@ -214,12 +200,12 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         settling = panels.below
         assert settling is not None
         style.title_joints(log, panels.joints, titles)
-        plot.joint_row(panels.joints, log.sites, style.site_records(log, joint_errors))
+        plot.joint_row(panels.joints, log.sites, style.site_records(log, site_signals.joint_errors))
         for axes in panels.joints[:: panels.columns]:
             axes.set_ylabel(f"tracking error ({unit})")
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
-            remaining = largest_remaining_error(log[site])
+            remaining = site_signals.largest_remaining_error(log[site])
             positive = style.positive(remaining)
             plot.trace(settling, site, positive)
             low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
@@ -239,19 +225,19 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A triangle marks the time at which a site settles; the legend has its value.
     """
-    entries = []
+    entries, unit = [], site_signals.shared_unit(log)
     with style.time_figure(log, form, 2.4) as plot:
         axes = style.add_panels(plot.figure, 1, 1)[0, 0]
         low = high = SETTLED_ERROR_RAD
         for site in log.sites:
             line = style.site_line(log, site)
-            size = largest_magnitude(joint_errors(log[site]))
+            size = site_signals.largest_magnitude(site_signals.joint_errors(log[site]))
             positive = style.positive(size)
             plot.trace(axes, site, positive)
             if size.any():
                 least, most = np.nanpercentile(positive, (2.0, 100.0)).tolist()
                 low, high = min(low, least), max(high, most)
-            settled = settling_time_s(log[site])
+            settled = site_signals.settling_time_s(log[site])
             if settled is not None:
                 mark = {"marker": "v", "markersize": 6.0, "color": line["color"], "clip_on": False}
                 axes.plot(settled, SETTLED_ERROR_RAD, **mark)
@@ -259,12 +245,10 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             entries.append((f"{site}: {when}", line))
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         axes.set(
-            yscale="log",
-            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
-            ylabel=f"largest error ({shared_unit(log)})",
+            yscale="log", ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high), ylabel=f"largest error ({unit})"
         )
         plot.mark(axes, log.sites)
-        plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {shared_unit(log)}", style.LIMIT_LINE)])
+        plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)])
     return plot.figure
 
 
@@ -335,9 +319,9 @@ def _draw_estimate(
     plot: style.TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
 ) -> None:
     """Draws the estimates of one parameter, and its true value once if all sites share it."""
-    truths = {site: float(true_parameters(plot.log, site)[index]) for site in sites}
+    truths = {site: float(site_signals.true_parameters(plot.log, site)[index]) for site in sites}
     for site in sites:
-        plot.trace(axes, site, parameter_estimates(plot.log[site])[:, index], width)
+        plot.trace(axes, site, site_signals.parameter_estimates(plot.log[site])[:, index], width)
     if len(set(truths.values())) == 1:
         axes.axhline(truths[sites[0]], **style.LIMIT_LINE)
         return
@@ -351,7 +335,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A ring marks the start of a site, a disc its end.
     """
-    titles, unit = style.name_shared(log), shared_unit(log)
+    titles, unit = style.name_shared(log), site_signals.shared_unit(log)
     places = style.arrange_joints(len(titles), form.narrow)
     height_in = 0.72 * form.width_in / len(places[0])
     with style.styled_figure(form, 1.0 + len(places) * height_in) as figure:
@@ -359,7 +343,7 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         row = [axes for name, axes in panels.items() if name != "."]
         for site in log.sites:
             part, line = log[site], style.site_line(log, site, _LOOP_PT)
-            e, ed = joint_errors(part), joint_error_rates(part)
+            e, ed = site_signals.joint_errors(part), site_signals.joint_error_rates(part)
             for joint, axes in enumerate(row[: e.shape[1]] if len(part) else ()):
                 _draw_path(axes, np.stack([e[:, joint], ed[:, joint]], axis=1), line)
         style.title_joints(log, row, titles)
@@ -451,7 +435,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
             plot.mark(axes, [site])
         for site in log.sites:
-            moved = joint_angles(log[site]) - np.array(log.scenario.sites[site].q0_rad)
+            moved = site_signals.joint_angles(log[site]) - np.array(log.scenario.sites[site].q0_rad)
             for axes, values in zip(column[len(owners) :], moved.T, strict=False):
                 plot.trace(axes, site, values)
         for title, axes in zip(titles, column[len(owners) :], strict=True):

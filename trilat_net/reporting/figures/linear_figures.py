@@ -160,7 +160,7 @@ def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
 
 
 _SIZE = REPORT_SIZE._replace(width_in=COLUMN_IN)
-_HEIGHT_IN = 3.0
+_HEIGHT_IN = 3.2
 _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
 
 
@@ -189,7 +189,6 @@ def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: s
     axes.plot(both.real, both.imag, mark, markersize=4.5, fillstyle="none", color=colour, label=label)
 
 
-_HEIGHT_IN = 3.2
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
 

@@ -75,17 +75,8 @@ def run_bench_task(task: BenchRunItem) -> BenchRun:
     judged = _run(scenario, task.to_s or scenario.duration_s, twins)
     if not task.to_s:
         judged = _lengthen(judged, twins)
-    made = BenchRun(
-        cell.name,
-        cell.inputs,
-        task.seed,
-        scenario.random,
-        scenario.sha256,
-        judged.stability,
-        judged.end.behaviour,
-        judged.text,
-    )
-    made = msgspec.structs.replace(made, length_s=judged.scenario.duration_s, to_s=task.to_s)
+    found = judged.stability, judged.end.behaviour, judged.text, judged.scenario.duration_s, task.to_s
+    made = BenchRun(cell.name, cell.inputs, task.seed, scenario.random, scenario.sha256, *found)
     if judged.end.diverged_at_s is None:
         made = _measure(made, judged, TASKS[cell.task].duration_s)
         if cell.task == "contact" and not made.masked:

@@ -81,11 +81,7 @@ TASKS = {
     ),
     "disagree": BenchTask(
         "two users, of whom the first leads, hold poses that are 0.4 rad apart",
-        {
-            "sites.m1.hands": [_hand(_LEFT)],
-            "sites.m2.hands": [_hand(_RIGHT)],
-            "dominance": _shares(_FIRST),
-        },
+        {"sites.m1.hands": [_hand(_LEFT)], "sites.m2.hands": [_hand(_RIGHT)], "dominance": _shares(_FIRST)},
         users=2,
     ),
     "outage": BenchTask(

@@ -56,13 +56,7 @@ _UNITS = {
     "_s": "s",
 }
 """The longest that a key ends in counts."""
-_GAINS = {
-    "K": "N m/rad",
-    "d": "N m s/rad",
-    "Kp": "N m s/rad",
-    "Kd": "N m s/rad",
-    "Lambda": "1/s",
-}
+_GAINS = {"K": "N m/rad", "d": "N m s/rad", "Kp": "N m s/rad", "Kd": "N m s/rad", "Lambda": "1/s"}
 
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
@@ -411,8 +405,7 @@ def _least_inertia(arm: ArmModel) -> float:
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:
     """The adaptive law as `digital` computes it, without delay: it rests where Gamma g^2 h < Kp, about."""
     delays_s = _delays_s(scenario)
-    chains = any(arm.chain is not None for arm in scenario.arms.values())
-    if scenario.scheme != "digital" or delays_s is None or chains:
+    if scenario.scheme != "digital" or delays_s is None:
         return None
     excess = []
     for spec in scenario.sites.values():

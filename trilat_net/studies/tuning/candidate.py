@@ -26,12 +26,7 @@ import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
-from ...analysis.run_end import (
-    EndBehaviour,
-    RunEnd,
-    Stability,
-    find_hanging_sites,
-)
+from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array

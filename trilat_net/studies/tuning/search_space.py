@@ -115,12 +115,7 @@ class SearchSpace(NamedTuple):
         return tables
 
     def _write(
-        self,
-        scenario: Scenario,
-        site: str,
-        knowledge: ModelInformation,
-        gains: GainValues,
-        longest_ms: float,
+        self, scenario: Scenario, site: str, knowledge: ModelInformation, gains: GainValues, longest_ms: float
     ) -> dict[str, Any]:
         if self.kind is None:
             told = {"gravity": knowledge.gravity} if self.told == "gravity" else {}
