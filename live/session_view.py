@@ -280,7 +280,6 @@ class SessionView:
             self.dominance[site] = table["to"]
 
     def _follow_timeline(self) -> None:
-        """Takes the scenario's own changes of links into the tables when their time has come."""
         newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
         for planned in [one for one in self._planned if one[0] <= newest_ns]:
             self._planned.remove(planned)

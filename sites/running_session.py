@@ -137,7 +137,6 @@ class RunningSession:
 
 
 def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
-    """Returns the identity of a site of a session that runs."""
     info = find_site_info(bus, clock, session, site, embedded_names_reader(session))
     if not info.running:
         raise SessionError(f"session {session!r} has not begun: {site} waits for the others")

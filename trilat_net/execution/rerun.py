@@ -363,7 +363,6 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
 
 
 def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields everything that an executed site publishes, in order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.record(state, tick.payload)

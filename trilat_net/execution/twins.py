@@ -245,7 +245,6 @@ class _TwinRuns:
                 self._push(n, end_s)
 
     def _push(self, n: int, at_s: float) -> None:
-        """Lets a twin, which is as the run is, have its push."""
         push = self._pushes[n]
         self._twins[n].push(push.field, push.by)
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
@@ -321,7 +320,6 @@ class _TwinRuns:
 
 
 def _choose_ends(pushes: Sequence[Push], end_s: float) -> Array:
-    """Returns the ends of windows, s: equal ones, and each instant of a push."""
     if any(not 0.0 <= push.at_s < end_s for push in pushes):
         raise NotRepeatable(f"no twins: a push lies within the run, from 0 s until before {end_s:g} s")
     pushed = {push.at_s for push in pushes} - {0.0}

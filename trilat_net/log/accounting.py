@@ -33,11 +33,9 @@ class RangeSet:
         self._lasts: list[int] = []
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Yields (first, last) of every range, lowest first."""
         return zip(self._firsts, self._lasts, strict=True)
 
     def __len__(self) -> int:
-        """Returns the number of ranges."""
         return len(self._firsts)
 
     def append(self, first: int, last: int) -> None:

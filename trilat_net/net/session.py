@@ -185,7 +185,6 @@ class SessionJoin:
                 self._admitted.add(event.member)
 
     def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
-        """Returns the boots of the sites on another clock."""
         return {
             boot
             for name, boot in boots.items()

@@ -268,7 +268,6 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns Zenoh's reason for refusing a configuration; "" if it accepts it."""
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
@@ -277,7 +276,6 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns Zenoh's message without the lines of its source."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 

@@ -217,7 +217,6 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
 
 
 def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Drops nulls, which are unset keys in Zenoh's files."""
     return {
         key: _without_nulls(value) if isinstance(value, dict) else value
         for key, value in stated.items()

@@ -122,7 +122,6 @@ def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]
 
 
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    """Returns kind, ending and joint name of a key that names a joint; the name is "" of any other."""
     for kind, ending in (("q", "_rad"), ("push", "_mean_nm")):
         if key.startswith(f"{kind}_") and key.endswith(ending):
             return kind, ending, key.removeprefix(f"{kind}_").removesuffix(ending)

@@ -85,7 +85,6 @@ def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: 
 
 
 def _find_store() -> Path:
-    """Returns where the remembered files stand, by their hashes."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "trilat-net", "laws.json")
 
 

@@ -165,7 +165,6 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns a file that a scenario names: a shipped one, or that of a folder."""
     shipped = Path(str(SHIPPED_FOLDER / name))
     return shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
 
@@ -290,7 +289,6 @@ def _resolve_arm(
 
 
 def _name_joints(table: TomlTable, urdf: dict[str, str]) -> tuple[str, ...]:
-    """Returns the names that the file of an arm gives its joints, in their order; () of a planar arm."""
     if not table.get("urdf"):
         return ()
     return tuple(joint.name for joint in read_arm(msgspec.convert(table, Arm), urdf).joints)
@@ -341,7 +339,6 @@ def _model_arm(
 
 
 def _chain_limits(model: ArmModel) -> TomlTable:
-    """Returns the limits that a chain's file states, and the usual ones where it states none."""
     usual = Limits()
     pairs = (("tau_limit_nm", model.efforts), ("qd_limit_rad_s", model.speeds))
     return {
@@ -367,7 +364,6 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
 
 
 def _draw_site(site: TomlTable, path: str, draws: Draws) -> None:
-    """Replaces the distributions of a site, its operators and environments aside, by numbers."""
     site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)
     for group in (*(one for one in SITE_GROUPS if one != "arm"), "control"):
         site[group] = draws.draw_numbers(site[group], f"{path}.{group}")

@@ -371,7 +371,6 @@ def _check_task_poses(scenario: Scenario) -> None:
 
 
 def _check_actors(actors: Sequence[operators.Operator | operators.Environment], path: str) -> None:
-    """Refuses operators and environments with a problem that no single key shows."""
     for n, actor in enumerate(actors):
         if found := actor.find_problem():
             raise ScenarioError(found.problem, path=f"{path}[{n}].{found.key}")

@@ -243,7 +243,6 @@ def _check_values(
 
 
 def _check_lengths(table: fields.TomlTable, kind: fields.StructType, counts: fields.VectorCounts) -> None:
-    """Raises `msgspec.ValidationError` for a vector, or a row of a table, that does not fit the arm."""
     if found := fields.find_count_problem(table, kind, counts):
         raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
     for n, row in enumerate(table.get("points", ())):
