@@ -111,11 +111,7 @@ def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> li
 
     The random ones are by less and by more than `delta`: growth that is not of small motions alone differs.
     """
-    each = [
-        (f"{name}.q{joint + 1}", delta)
-        for name in scenario.names
-        for joint in range(scenario.layout(name).joints)
-    ]
+    each = [(joint.replace(" joint ", ".q"), delta) for joint in list_joints(scenario)]
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
     chosen = [("theta", delta)] * (learns and count > 2)
     random = max(1, min(3, count - len(each) - len(chosen)))

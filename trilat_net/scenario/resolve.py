@@ -266,9 +266,9 @@ def _resolve_site(
             return [0.0] * counts.axes
         return model.end_effector(site["q0_rad"])
 
-    holding = Holding(counts, site["q0_rad"], end_effector)
+    holding = Holding(counts, site["q0_rad"], end_effector, draws)
     for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-        site[group] = resolve_operators(site.get(group, []), kinds, holding, f"{path}.{group}", draws)
+        site[group] = resolve_operators(site.get(group, []), kinds, holding, f"{path}.{group}")
     return {key: site[key] for key in field_names(SiteSpec) if key in site}
 
 

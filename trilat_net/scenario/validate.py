@@ -31,8 +31,6 @@ from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """A singular value below this share of the largest is of a direction without motion."""
-FORCE_REFLECTION_SITES = 2
-"""Sites of direct force reflection: one master, one slave."""
 
 
 def refuse_external_arms(scenario: Scenario, given: Collection[str] = ()) -> None:
