@@ -255,7 +255,6 @@ def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
     rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
 
     def place(q: Vector) -> Sequence[float]:
-        """Returns the place of the end effector, m."""
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return place_end_effector(rows, tip)
 

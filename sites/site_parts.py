@@ -130,14 +130,7 @@ class SiteParts:
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
-        self.changes = ChangeServer(
-            scenario,
-            name,
-            asked,
-            lambda: self.site.mode,
-            lambda: self.switch is None or self.switch.held,
-            stops,
-        )
+        self.changes = ChangeServer(scenario, name, asked, lambda: self.site.mode, self._is_held, stops)
         warm_up(scenario, name, clock)
 
     def _meet_outside_arm(self) -> None:
@@ -152,6 +145,9 @@ class SiteParts:
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             self.switch = DeadManSwitch(name, ring, self.clock, dropped)
+
+    def _is_held(self) -> bool:
+        return self.switch is None or self.switch.held
 
     def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
         keep = self.buffer.channels[channel].keep

@@ -207,7 +207,9 @@ class Rerun(Result):
             LogRefused: the disk refused.
         """
         log, request = self.before, self.request
-        session, epoch_unix_ns = log.session["session"], _read_epoch_unix_ns(log)
+        session, epoch = log.session["session"], log.session.get("epoch_unix_ns", "0")
+        if not epoch.isdecimal() or (epoch_unix_ns := int(epoch)) > MAX_TIME_NS:
+            raise LogError(f"{log.source}: its epoch_unix_ns is no time: {epoch[:40]!r}")
         metadata = rerun_metadata(log, request)
         writer = LogWriter(
             stream, request.scenario, session, RERUN_DRIVER, epoch_unix_ns, metadata, views_hz=views_hz
@@ -323,13 +325,6 @@ def rerun(
             sites[name], over = compare_site_rerun(before, request, site, execution.deliveries[name], own)
             links |= {link.link: link for link in over}
     return Rerun(before, request, ticks, sites, links)
-
-
-def _read_epoch_unix_ns(log: Log) -> int:
-    written = log.session.get("epoch_unix_ns", "0")
-    if not written.isdecimal() or int(written) > MAX_TIME_NS:
-        raise LogError(f"{log.source}: its epoch_unix_ns is no time: {written[:40]!r}")
-    return int(written)
 
 
 def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:

@@ -410,7 +410,6 @@ class SessionAccounts:
                 yield channel, self._start_gaps.setdefault((topic, boot), gap)
 
     def _begin_anew(self, join: Event, made: int) -> None:
-        """Takes what a site did not make between the ticks of one start and the first one of the next."""
         for channel, gap in self._find_start_gaps(join.member, join.boot):
             base, rate_hz = self._bases.get(self._topic(join.member, channel), 0), self._rates_hz[join.member]
             gap.begin_anew(*(count_messages(channel, ticks, rate_hz) - base for ticks in (join.ticks, made)))

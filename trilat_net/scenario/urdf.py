@@ -448,7 +448,6 @@ def _child(element: Element, tag: str, place: str) -> Element | None:
 
 
 def _read_number(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> float:
-    """Returns a number of an element, finite and of a size that arithmetic takes."""
     word = element.get(key)
     if word is None:
         _refuse(place, f"its <{element.tag}> has no {key}")

@@ -199,7 +199,6 @@ def _make_sent_channels(scenario: Scenario, site: str) -> dict[str, ArrayChannel
 
 
 def _ms(us: int) -> float:
-    """Returns milliseconds; NaN if nothing was measured."""
     return us / 1e3 if us != -1 else math.nan
 
 

@@ -228,14 +228,18 @@ def _check_values(
 
     try:
         msgspec.convert(table, kind)
-        _check_lengths(table, kind, counts)
+        if found := fields.find_count_problem(table, kind, counts):
+            raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
+        for n, row in enumerate(table.get("points", ())):
+            if len(row) != 1 + counts.joints:
+                raise msgspec.ValidationError(f"of another arm - at `$.points[{n}]`")
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at ")
         if missing := re.search(r"missing required field `(\w+)`", problem):
             key = missing[1]
             raise ScenarioError(f"is missing: {describe_values(key)}", path=f"{path}.{key}") from None
-        found = re.match(r"`\$\.(\w+)(.*)`", place)
-        key, rest = (found[1], found[2]) if found else ("", place)
+        at = re.match(r"`\$\.(\w+)(.*)`", place)
+        key, rest = (at[1], at[2]) if at else ("", place)
         if key not in entry:  # taken over from the arm, which is refused at its own key
             return
         if key == "points":
@@ -244,11 +248,3 @@ def _check_values(
         value = repr(entry[key])
         is_now = f", is {value}" if len(value) <= _SHOWN else ""
         raise ScenarioError(f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}") from None
-
-
-def _check_lengths(table: fields.TomlTable, kind: fields.StructType, counts: fields.VectorCounts) -> None:
-    if found := fields.find_count_problem(table, kind, counts):
-        raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
-    for n, row in enumerate(table.get("points", ())):
-        if len(row) != 1 + counts.joints:
-            raise msgspec.ValidationError(f"of another arm - at `$.points[{n}]`")
