@@ -463,7 +463,6 @@ class PageServer:
                 page.takes_part, page.asks = not any(map(self._list_held, here)), None
 
     def _list_held(self, page: Page) -> list[str]:
-        """Returns the sites whose newest record names a page as holding the arm."""
         sites = (self._frame or {}).get("sites", {})
         return [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
 
@@ -557,7 +556,6 @@ def serve_page(
 
 
 def _has_browser() -> bool:
-    """True if this process may open a browser that somebody sees."""
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):

@@ -188,7 +188,11 @@ class SessionFrames:
         row += [link["age_ms"] for link in links.values()]
         if any(site["new"] for site in sites.values()):
             self.points.add([round(t_s, 4), *(None if x is None else float(f"{x:.5g}") for x in row)])
-        self._add_energy()
+        course = view.advance_energy()
+        for t_energy_s, V, supplied in zip(*(column.tolist() for column in course or ()), strict=True):
+            if t_energy_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
+                self._energy_s = t_energy_s
+                self.energies.add([t_energy_s, V, supplied])
         energy = view.energy
         return {
             "t": t_s,
@@ -245,14 +249,6 @@ class SessionFrames:
             "share": view.dominance.get(receiver, {}).get(peer, 0.0),
             **counts,
         }
-
-    def _add_energy(self) -> None:
-        if (course := self._view.advance_energy()) is None:
-            return
-        for t_s, V, supplied in zip(*(column.tolist() for column in course), strict=True):
-            if t_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
-                self._energy_s = t_s
-                self.energies.add([t_s, V, supplied])
 
 
 def show_event(event: Event) -> Json:

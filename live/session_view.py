@@ -177,7 +177,10 @@ class SessionView:
         for name, site in self.sites.items():
             for channel, message, _ in site.repair.poll(now_ns, alive=not self.silent(site)):
                 self._keep(name, site, channel, message.content)
-        self._follow_timeline()
+        newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
+        for planned in [one for one in self._planned if one[0] <= newest_ns]:
+            self._planned.remove(planned)
+            self.links[planned[1]] = planned[2]
 
     def advance_energy(self) -> EnergyCourse | None:
         """Returns V at the ticks of which all records have come since the last call; None without any."""
@@ -278,10 +281,3 @@ class SessionView:
             self.links[table["link"]] = table["to"]
         elif "dominance" in table:
             self.dominance[site] = table["to"]
-
-    def _follow_timeline(self) -> None:
-        """Takes the scenario's own changes of links into the tables when their time has come."""
-        newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
-        for planned in [one for one in self._planned if one[0] <= newest_ns]:
-            self._planned.remove(planned)
-            self.links[planned[1]] = planned[2]

@@ -45,7 +45,6 @@ class InboundQueue:
         self.overflowed: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        """Returns the number of waiting messages."""
         return len(self._queue)
 
     def take(self, key: str, payload: bytes) -> None:

@@ -159,7 +159,6 @@ class Recording:
             (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes another start of a site that says that it comes, or that it is there."""
         event = decode(payload, Event)
         comes = event.kind in ("coming", "join") and event.boots.get(name) == event.boot
         if comes and event.member == name and self._scenario.sites_may_return:

@@ -99,7 +99,7 @@ class SiteReception:
         if channel == topics.EVENT:
             event = self._decoders[channel](payload)
             message = SiteMessage(event.n, event.n, event.t_ns, event)
-            sender = event.member
+            sender, ticks = event.member, event.ticks if event.kind in ("join", "end") else 0
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError("out of range", f"{self.name} says it made {event.ticks} ticks")
         else:
@@ -107,12 +107,12 @@ class SiteReception:
             number = number_message(channel, tick.tick, self._rate_hz)
             t_ns = tick.sent_ns if channel == topics.STATE else tick.t_ns
             message = SiteMessage(number, tick.tick, t_ns, tick)
-            sender = tick.site
+            sender, ticks = tick.site, tick.tick + 1
         if sender != self.name or message.content.boot != self._boot:
             raise WireError("stranger", f"{sender}, start {message.content.boot}, on a key of {self.name}")
         if message.number >= self._most[channel]:
             raise WireError("out of range", f"{self.name}/{channel} number {message.number}")
-        if _count_ticks(message.content) > self._possible_ticks:
+        if ticks > self._possible_ticks:
             raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {message.number}")
         if isinstance(message.content, Event):
             self._take_room(message.content, len(payload))
@@ -200,9 +200,3 @@ class SiteReception:
             for channel, account in self.accounts.items()
             if account.missing
         )
-
-
-def _count_ticks(content: State | LinkStats | Event) -> int:
-    if isinstance(content, Event):
-        return content.ticks if content.kind in ("join", "end") else 0
-    return content.tick + 1

@@ -173,7 +173,6 @@ def _start(
 
 
 def _is_over(children: list[_Child], result: SessionResult) -> bool:
-    """True once a child has failed, or all have ended; notes the failures."""
     result.problems += [problem for child in children if (problem := child.problem())]
     return bool(result.problems) or all(child.code() == 0 for child in children)
 

@@ -214,7 +214,6 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
 
 
 def _split_address(place: str) -> tuple[str, int] | None:
-    """Returns host and port of an endpoint over TCP or QUIC; None for another."""
     found = re.fullmatch(r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?", place)
     return (found[1].strip("[]"), int(found[2])) if found and int(found[2]) < 1 << 16 else None
 

@@ -98,7 +98,6 @@ class NearEnd:
         self._put(sample.ljust(size_bytes, b"\0"))
 
     def _answers(self) -> Iterator[tuple[int, int]]:
-        """Yields numbers of samples that came back, with their round trips, ns."""
         while (entry := self._inbox.poll()) is not None:
             sample, arrived_ns = entry
             if sample is not None and sample.answer and sample.owner == self._owner:

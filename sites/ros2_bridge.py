@@ -502,7 +502,7 @@ class Bridge:
         clock, connected = self._ends.clock, True
         wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
         poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
-        while not stopped() and not self._is_over():
+        while not (stopped() or (self._met and not self._present)):
             if self._show(rate_hz):
                 return True
             for target in self.targets.values():
@@ -534,9 +534,6 @@ class Bridge:
                 (self._present.add if alive else self._present.discard)(parts)
                 self._met = True
         return anew
-
-    def _is_over(self) -> bool:
-        return self._met and not self._present
 
     def _diagnose(self) -> None:
         """Publishes the state of every site."""

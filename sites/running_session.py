@@ -137,7 +137,6 @@ class RunningSession:
 
 
 def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
-    """Returns the identity of a site of a session that runs."""
     info = find_site_info(bus, clock, session, site, embedded_names_reader(session))
     if not info.running:
         raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
@@ -256,7 +255,6 @@ def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
     rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
 
     def place(q: Vector) -> Sequence[float]:
-        """Returns the place of the end effector, m."""
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return place_end_effector(rows, tip)
 

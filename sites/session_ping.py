@@ -91,7 +91,20 @@ class SessionPing:
     def report(self) -> PingReport:
         """Returns what it found."""
         members = [self._describe(info) for _, info in sorted(self.infos.items())]
-        return PingReport(self._session, members, self._list_links())
+        links = [
+            {
+                "from": peer,
+                "to": site,
+                "delay_us": stats.delay_us[peer],
+                "delay_max_us": stats.delay_max_us.get(peer, -1),
+                "rtt_us": stats.rtt_us.get(peer, -1),
+                "offset_us": stats.offset_us.get(peer, 0),
+                "bound_us": stats.bound_us.get(peer, 0),
+            }
+            for site, stats in sorted(self.links.items())
+            for peer in stats.delay_us
+        ]
+        return PingReport(self._session, members, links)
 
     def _describe(self, info: Info) -> dict[str, Any]:
         trips, shared = self.pinger.trips.get(info.boot), info.clock == self._clock.identity()
@@ -117,22 +130,6 @@ class SessionPing:
             facts["offset_ns"] = estimate.offset_ns
             facts["bound_us"] = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
         return facts
-
-    def _list_links(self) -> list[dict[str, Any]]:
-        """Returns the links as running sites measure them; times in us."""
-        return [
-            {
-                "from": peer,
-                "to": site,
-                "delay_us": stats.delay_us[peer],
-                "delay_max_us": stats.delay_max_us.get(peer, -1),
-                "rtt_us": stats.rtt_us.get(peer, -1),
-                "offset_us": stats.offset_us.get(peer, 0),
-                "bound_us": stats.bound_us.get(peer, 0),
-            }
-            for site, stats in sorted(self.links.items())
-            for peer in stats.delay_us
-        ]
 
 
 def ping_session(

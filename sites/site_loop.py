@@ -7,6 +7,7 @@ of the loop: it is a peer's sample, or it is counted by reason and dropped. Samp
 arrive, before their tick, and carry the instants of their arrival, not of their draining.
 """
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -209,17 +210,6 @@ class StateBlock:
             self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
 
 
-def _find_newest_tick(timing: SiteTiming, k: int, now_ns: int) -> int:
-    """Returns the last tick from k on whose deadline is not in the future."""
-    first, after = k, k + 2
-    while timing.schedule.deadline(after) <= now_ns:
-        first, after = after, 2 * after - k
-    while after - first > 1:
-        middle = (first + after) // 2
-        first, after = (middle, after) if timing.schedule.deadline(middle) <= now_ns else (first, middle)
-    return first
-
-
 def _send_sample(
     name: str, boot: int, clock: Clock, timing: SiteTiming, io: "RunningSite", output: TickRecord
 ) -> tuple[Any, ...]:
@@ -253,7 +243,7 @@ def run_loop(
         woke_ns = clock.monotonic_ns()
         skipped = 0
         if not catches_up and k > first and woke_ns >= timing.schedule.deadline(k + 1):
-            skipped = min(_find_newest_tick(timing, k, woke_ns), ticks - 1) - k
+            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.schedule.deadline) - 1
             k += skipped
             deadline_ns = timing.schedule.deadline(k)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)

@@ -287,7 +287,6 @@ class RunningSite:
         news.clear()
 
     def _tell_skipped(self, k: int, t_ns: int) -> None:
-        """Publishes which ticks up to tick k were not made."""
         if self._skipped:
             ticks, self._skipped = " ".join(self._skipped), []
             text = f"{self._parts.name} did not make ticks {ticks}"

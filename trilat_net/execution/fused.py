@@ -280,7 +280,6 @@ class FusedRun:
 
     @cached_property
     def _state(self) -> RunState:
-        """All that a planned run changes."""
         laws, arrays = self._law_arrays, self._tables
         held = [self._progress, self._taken, *self._sent, self._sums]
         held += [array for array in arrays if isinstance(array, np.ndarray)]

@@ -9,7 +9,7 @@ import numpy as np
 from ..core.delay import max_delay_us
 from ..core.exogenous import LIVE_KINDS
 from ..core.fused_run import RecordedFeed
-from ..core.ticks import NS_PER_S, CoreChange
+from ..core.ticks import NS_PER_S
 from ..core.vectors import Array, IntArray
 from ..log.log_reader import Log
 from ..scenario.law_consent import find_user_laws
@@ -45,7 +45,13 @@ def read_run_inputs(log: Log) -> RunInputs:
         LogError: the log names a change that is none.
     """
     ticks = max(len(log[name]) for name in log.sites)
-    changes = _list_changes(log)
+    listed = [
+        (tick * NS_PER_S // log[name].rate_hz, (tick, i, change))
+        for i, name in enumerate(log.scenario.names)
+        for tick, taken in log.commands(name).items()
+        for change in taken
+    ]
+    changes = [one for _, one in sorted(listed, key=lambda timed: timed[0])]
     models = [change.model for _, _, change in changes if change.model is not None]
     first, samples, late_ns = _list_arrivals(log, ticks)
     return RunInputs(
@@ -54,17 +60,6 @@ def read_run_inputs(log: Log) -> RunInputs:
         late_ns,
         max_delay_us(models, [None] * len(models)) if models else 0,
     )
-
-
-def _list_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes that sites took in, by time: tick, place of the site, change."""
-    listed = [
-        (tick * NS_PER_S // log[name].rate_hz, (tick, i, change))
-        for i, name in enumerate(log.scenario.names)
-        for tick, changes in log.commands(name).items()
-        for change in changes
-    ]
-    return [one for _, one in sorted(listed, key=lambda timed: timed[0])]
 
 
 def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:

@@ -207,7 +207,9 @@ class Rerun(Result):
             LogRefused: the disk refused.
         """
         log, request = self.before, self.request
-        session, epoch_unix_ns = log.session["session"], _read_epoch_unix_ns(log)
+        session, epoch = log.session["session"], log.session.get("epoch_unix_ns", "0")
+        if not epoch.isdecimal() or (epoch_unix_ns := int(epoch)) > MAX_TIME_NS:
+            raise LogError(f"{log.source}: its epoch_unix_ns is no time: {epoch[:40]!r}")
         metadata = rerun_metadata(log, request)
         writer = LogWriter(
             stream, request.scenario, session, RERUN_DRIVER, epoch_unix_ns, metadata, views_hz=views_hz
@@ -325,13 +327,6 @@ def rerun(
     return Rerun(before, request, ticks, sites, links)
 
 
-def _read_epoch_unix_ns(log: Log) -> int:
-    written = log.session.get("epoch_unix_ns", "0")
-    if not written.isdecimal() or int(written) > MAX_TIME_NS:
-        raise LogError(f"{log.source}: its epoch_unix_ns is no time: {written[:40]!r}")
-    return int(written)
-
-
 def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
     """Returns the session metadata that name the source log and the changes."""
     digests = {}
@@ -363,7 +358,6 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
 
 
 def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields everything that an executed site publishes, in order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.record(state, tick.payload)

@@ -155,7 +155,6 @@ class RerunSite:
         return RerunTick(self.name, output.tick, output.t_ns, output.mode, payload, same, False, stats)
 
     def _keep(self, n: int) -> RerunTick:
-        """Keeps record n of the log; execution resumes later."""
         self._certain = False
         self.output = output = read_output(self._part.states[n], self._part.peers)
         payload = self._part.payloads[n]

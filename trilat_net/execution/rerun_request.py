@@ -194,7 +194,6 @@ def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> 
 
 
 def _shorten(value: object) -> str:
-    """Returns a value in a few characters; of a list of tables their number."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)

@@ -7,6 +7,7 @@ without a record are unknown; samples that no record lists are assumed to have a
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from operator import attrgetter
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -34,30 +35,17 @@ ReceivedMotion = State | Arrival
 """A sample of a peer, as it was recorded or as it is computed now."""
 
 
+_MOTION = attrgetter("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
+_REST = attrgetter("x", "xd", "wrench", "ch", "hand")
+
+
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     """Returns a record in the form in which `Site.step` returned it."""
     modes = {mode.name.lower(): mode for mode in Mode}
-    return TickRecord(
-        state.tick,
-        state.t_ns,
-        modes.get(state.mode, Mode.DIVERGED),
-        state.q,
-        state.qd,
-        state.q_des,
-        state.qd_des,
-        state.tau,
-        state.tau_x,
-        state.theta_hat,
-        [state.used.get(peer, -1) for peer in peers],
-        state.rx_crc,
-        state.cmd,
-        state.mem if len(state.mem) > len(state.q_des) else [],
-        state.x,
-        state.xd,
-        state.wrench,
-        state.ch,
-        state.hand,
-    )
+    begin = state.tick, state.t_ns, modes.get(state.mode, Mode.DIVERGED)
+    taken = [state.used.get(peer, -1) for peer in peers], state.rx_crc, state.cmd
+    mem = state.mem if len(state.mem) > len(state.q_des) else []
+    return TickRecord._make([*begin, *_MOTION(state), *taken, mem, *_REST(state)])
 
 
 def make_arrival(peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0) -> Arrival:

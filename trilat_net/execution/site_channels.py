@@ -67,7 +67,6 @@ class SiteChannels:
         return entries
 
     def _excuse_skipped(self, tick: int, cmd: Sequence[str]) -> None:
-        """Counts nothing as missing of the ticks that the site did not make before one."""
         if skipped := count_skipped_ticks(cmd):
             for channel in (topics.STATE, topics.LINK):
                 self.accounts[channel].begin_anew(*skipped_numbers(channel, tick, skipped, self._rate_hz))

@@ -111,11 +111,7 @@ def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> li
 
     The random ones are by less and by more than `delta`: growth that is not of small motions alone differs.
     """
-    each = [
-        (f"{name}.q{joint + 1}", delta)
-        for name in scenario.names
-        for joint in range(scenario.layout(name).joints)
-    ]
+    each = [(joint.replace(" joint ", ".q"), delta) for joint in list_joints(scenario)]
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
     chosen = [("theta", delta)] * (learns and count > 2)
     random = max(1, min(3, count - len(each) - len(chosen)))
@@ -200,7 +196,11 @@ class _TwinRuns:
         self._log, self._pushes = log, pushes
         self._layouts = [scenario.layout(name) for name in scenario.names]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
-        self._ends = _choose_ends(pushes, max(n / hz for n, hz in zip(ticks, rates_hz, strict=True)))
+        end_s = max(n / hz for n, hz in zip(ticks, rates_hz, strict=True))
+        if any(not 0.0 <= push.at_s < end_s for push in pushes):
+            raise NotRepeatable(f"no twins: a push lies within the run, from 0 s until before {end_s:g} s")
+        equal = np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
+        self._ends = np.array(sorted({*equal.tolist(), *({push.at_s for push in pushes} - {0.0})}))
         keep = math.ceil(float(np.diff(self._ends, prepend=0.0).max()) * max(rates_hz)) + 2
         runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
         for run in runs:
@@ -245,7 +245,6 @@ class _TwinRuns:
                 self._push(n, end_s)
 
     def _push(self, n: int, at_s: float) -> None:
-        """Lets a twin, which is as the run is, have its push."""
         push = self._pushes[n]
         self._twins[n].push(push.field, push.by)
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
@@ -318,15 +317,6 @@ class _TwinRuns:
             for push, largest, last, scale, pushed, died in kept
         ]
         return Twins(paths, self._joints, self._speed, self._same)
-
-
-def _choose_ends(pushes: Sequence[Push], end_s: float) -> Array:
-    """Returns the ends of windows, s: equal ones, and each instant of a push."""
-    if any(not 0.0 <= push.at_s < end_s for push in pushes):
-        raise NotRepeatable(f"no twins: a push lies within the run, from 0 s until before {end_s:g} s")
-    pushed = {push.at_s for push in pushes} - {0.0}
-    equal = np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
-    return np.array(sorted({*equal.tolist(), *pushed}))
 
 
 SAME_RUN = 1e-7

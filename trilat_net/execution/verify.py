@@ -219,7 +219,6 @@ class SiteVerifier:
             self._site.order(change, state.t_ns)
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Returns the difference of a record that another start, or another site, made; else None."""
         name = self._log.name
         if state.boot != (boot := self._boot):
             return RecordDifference(name, state.tick, "boot", state.boot, boot)

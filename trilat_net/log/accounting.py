@@ -33,21 +33,10 @@ class RangeSet:
         self._lasts: list[int] = []
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Yields (first, last) of every range, lowest first."""
         return zip(self._firsts, self._lasts, strict=True)
 
     def __len__(self) -> int:
-        """Returns the number of ranges."""
         return len(self._firsts)
-
-    def append(self, first: int, last: int) -> None:
-        """Adds numbers above all that are in it."""
-        if self._lasts and self._lasts[-1] == first - 1:
-            self._lasts[-1] = last
-        else:
-            self._firsts.append(first)
-            self._lasts.append(last)
-        self._drop_lowest()
 
     def insert(self, first: int, last: int) -> None:
         """Adds numbers that are not in it, wherever they belong."""
@@ -61,10 +50,10 @@ class RangeSet:
 
     def remove(self, number: int, last: int | None = None) -> bool:
         """Removes one number, or those up to the last one of a range; returns False if it is not in."""
-        place = bisect_right(self._firsts, number) - 1
-        if place < 0 or number > self._lasts[place]:
+        if (found := self.find(number)) is None:
             return False
-        sides = (self._firsts[place], number - 1), ((last or number) + 1, self._lasts[place])
+        place = bisect_right(self._firsts, number) - 1
+        sides = (found[0], number - 1), ((last or number) + 1, found[1])
         parts = [(a, b) for a, b in sides if a <= b]
         self._firsts[place : place + 1] = [a for a, _ in parts]
         self._lasts[place : place + 1] = [b for _, b in parts]
@@ -149,7 +138,7 @@ class Account:
     def expect(self, made: int) -> None:
         """Counts as missing what is not there of the first `made` messages."""
         if made > self.last + 1:
-            self._gaps.append(self.last + 1, made - 1)
+            self._gaps.insert(self.last + 1, made - 1)
             self.last = made - 1
 
     def begin_anew(self, first: int, made: int = 0) -> int:
@@ -421,7 +410,6 @@ class SessionAccounts:
                 yield channel, self._start_gaps.setdefault((topic, boot), gap)
 
     def _begin_anew(self, join: Event, made: int) -> None:
-        """Takes what a site did not make between the ticks of one start and the first one of the next."""
         for channel, gap in self._find_start_gaps(join.member, join.boot):
             base, rate_hz = self._bases.get(self._topic(join.member, channel), 0), self._rates_hz[join.member]
             gap.begin_anew(*(count_messages(channel, ticks, rate_hz) - base for ticks in (join.ticks, made)))

@@ -233,7 +233,6 @@ class LogFile:
         self._pending, self._done = bytearray(), 0
 
     def _cut(self) -> None:
-        """Removes what was written in part: the file ends at the end of the last flush."""
         self._broken = True
         self._pending, self._done = bytearray(), 0
         with suppress(OSError):

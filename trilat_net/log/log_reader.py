@@ -273,7 +273,6 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Returns how many ticks each site made, of those that stated it."""
         most = {name: self.scenario.ticks(name) for name in self.sites}
         ends = [event for event in self.events if event.kind == "end" and event.member in most]
         return {event.member: min(max(event.ticks, 0), most[event.member]) for event in ends}
@@ -524,7 +523,6 @@ def _reading(name: str) -> Iterator[None]:
 
 
 def _measure(stream: BinaryIO) -> int:
-    """Returns how many bytes a file has from its current position on."""
     here = stream.tell()
     size = stream.seek(0, os.SEEK_END)
     stream.seek(here)

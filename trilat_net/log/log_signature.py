@@ -8,7 +8,9 @@ nothing else. Only a file that agrees with its chain is signed.
 import base64
 import json
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,10 @@ from .running_digest import DIGESTS, DigestState, Integrity
 SUFFIX = ".sig"
 """Ending of a signature's file, behind the whole name of the log."""
 _FORMAT = "trilat-net log signature 1"
+_LOADERS: dict[Any, Callable[[bytes], object]] = {
+    Ed25519PrivateKey: partial(serialization.load_pem_private_key, password=None),
+    Ed25519PublicKey: serialization.load_pem_public_key,
+}
 _MOST_BYTES = 65_536
 """Of a key, and of a signature's file."""
 
@@ -85,7 +91,12 @@ def sign_log(
         LogError: the log cannot be read, has no digest chain, or does not agree with it.
         UsageError: the key is none, others can read it, or there is a signature already.
     """
-    path, key = Path(path), _load_private_key(Path(key_file))
+    path, key_file = Path(path), Path(key_file)
+    key = _load_key(
+        key_file, Ed25519PrivateKey, "private Ed25519 key; make a pair with: trilat keys pair NAME"
+    )
+    if find_rights_of_others(key_file):
+        raise UsageError(f"{key_file}: can be read by others: chmod 600 {key_file}")
     made = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(made, force=force)
     integrity, chain = _read_chain(path, progress)
@@ -109,7 +120,8 @@ def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress |
         LogError: a log cannot be read.
         UsageError: the key is none.
     """
-    key, found = _load_public_key(key_file), Finding("signature")
+    key = _load_key(key_file, Ed25519PublicKey, "public Ed25519 key; trilat keys pair NAME makes NAME.pub")
+    found = Finding("signature")
     for path in paths:
         if problem := _find_problem(path, key, progress):
             found.add(str(path), None, problem)
@@ -161,28 +173,16 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
     return integrity, reader.metadata.get(DIGESTS, {})
 
 
-def _load_private_key(path: Path) -> Ed25519PrivateKey:
-    key = _load_key(path, lambda data: serialization.load_pem_private_key(data, password=None))
-    if not isinstance(key, Ed25519PrivateKey):
-        raise UsageError(f"{path}: is no private Ed25519 key; make a pair with: trilat keys pair NAME")
-    if find_rights_of_others(path):
-        raise UsageError(f"{path}: can be read by others: chmod 600 {path}")
-    return key
-
-
-def _load_public_key(path: Path) -> Ed25519PublicKey:
-    key = _load_key(path, serialization.load_pem_public_key)
-    if not isinstance(key, Ed25519PublicKey):
-        raise UsageError(f"{path}: is no public Ed25519 key; trilat keys pair NAME makes NAME.pub")
-    return key
-
-
-def _load_key(path: Path, load: Any) -> Any:
-    """Returns the key in a PEM file; None if there is none of that kind."""
+def _load_key(path: Path, kind: Any, wanted: str) -> Any:
+    """Returns the key in a PEM file, which is to be of that kind."""
     try:
         with open_regular(path) as stream:
-            return load(stream.read(_MOST_BYTES))
+            data = stream.read(_MOST_BYTES)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
-        return None
+    key: object = None
+    with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
+        key = _LOADERS[kind](data)
+    if not isinstance(key, kind):
+        raise UsageError(f"{path}: is no {wanted}")
+    return key

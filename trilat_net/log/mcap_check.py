@@ -218,7 +218,6 @@ class FileCheck:
 
 
 def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
-    """Returns the entries of a message index, log time and place each, in the order of their places."""
     pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 

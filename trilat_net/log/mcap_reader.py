@@ -262,7 +262,6 @@ class McapReader:
                 self._ours.add(record.id)
 
     def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
-        """Reports, once, that the rest of a channel is not read."""
         if self._shares[channel] >= 0.0:
             self._shares[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")

@@ -97,14 +97,12 @@ class McapWriter:
         self._put(MAGIC + pack_record(Opcode.HEADER, header))
 
     def _put(self, data: bytes) -> int:
-        """Writes bytes and returns where they are."""
         self._stream.write(data)
         offset = self.position
         self.position += len(data)
         return offset
 
     def _add_to_summary(self, opcode: Opcode, body: bytes) -> bytes:
-        """Keeps a record for the end of the file, and returns it."""
         record = pack_record(opcode, body)
         self._summary[opcode] += record
         self._records[opcode] += 1

@@ -68,7 +68,6 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
-    """Returns the time of a part's first message, after all others if it has none, and its name."""
     first = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
     return min(first, default=1 << 63), part.source
 

@@ -113,7 +113,6 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
 
 
 def _decode_fields(payloads: Sequence[bytes], *fields: str, layout: Layout | None = None) -> Iterator[Any]:
-    """Yields a field of every record, or a tuple of several."""
     take: Callable[[Any], Any] = attrgetter(*fields)
     return map(take, map(_find_decoder(fields, layout).decode, payloads))
 
@@ -127,7 +126,6 @@ def _find_decoder(fields: tuple[str, ...], layout: Layout | None) -> msgspec.msg
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder of these fields alone; it skips all others."""
     fields = [
         (name, kind, _DEFAULTS[name]) if name in _DEFAULTS else (name, kind) for name, kind in types.items()
     ]

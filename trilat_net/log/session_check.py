@@ -284,7 +284,6 @@ class ChannelCheck:
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
-    """Returns a number in the metadata of a session; 0 if it is none."""
     text = about.get(key, "")
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 

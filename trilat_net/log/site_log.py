@@ -239,7 +239,6 @@ class SiteLog:
         return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Returns what a decoder makes of the records."""
         try:
             return freeze(decode_column(self.payloads, *arguments))
         except WireError as error:

@@ -119,7 +119,6 @@ class SiteClient:
         return self._gone
 
     def _follows_last(self, record: State, came_ns: int) -> bool:
-        """True if a record is later than the newest one, of the same start, and no later than it can be."""
         last = self._record
         if last is None:
             return True
@@ -381,7 +380,6 @@ class Hand(SiteClient):
             return self._sender.number
 
     def _beat(self) -> None:
-        """Repeats the newest message, so that a hand at rest is heard."""
         while not self._ended.wait(HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:

@@ -118,7 +118,6 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     tau_x: Torques = []
 
     def __post_init__(self) -> None:
-        """Refuses a torque that is not one finite number per joint."""
         if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
             raise ValueError(f"tau_x must be {len(self.q)} finite numbers, as q is")
 

@@ -362,7 +362,6 @@ class Ros2Graph:
         self._kept.append(self._session.declare_queryable(key, handler, complete=True))
 
     def _declare(self, end: EndpointKind, name: str, kind: str, qos: QualityOfService) -> tuple[str, bytes]:
-        """Shows an endpoint to others; returns its key, and what names it in attachments."""
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)
         token = self._place.endpoint_token(self._endpoints, end, name, kind, type_hash, qos)

@@ -175,17 +175,7 @@ class SessionJoin:
         self._coming = event, epoch
         return None
 
-    def _note_answer(self, event: Event) -> None:
-        """Notes that a running site admits this one, or why it does not."""
-        own = self._own
-        if event.about == own.member and event.boots.get(own.member) == own.boot:
-            if event.kind == "refused":
-                self.refusal = event.text
-            elif event.kind == "admit" and event.attempt == self._attempt:
-                self._admitted.add(event.member)
-
     def _other_clocks(self, boots: Mapping[str, int], clocks: Mapping[str, str]) -> set[int]:
-        """Returns the boots of the sites on another clock."""
         return {
             boot
             for name, boot in boots.items()
@@ -202,8 +192,13 @@ class SessionJoin:
                 continue
             if event.kind == "admit" and event.about in event.boots:
                 self._starts[event.about] = event.boots[event.about]
-            if self._coming is not None:
-                self._note_answer(event)
+            own = self._own
+            to_own = event.about == own.member and event.boots.get(own.member) == own.boot
+            if self._coming is not None and to_own:  # a running site admits this one, or says why not
+                if event.kind == "refused":
+                    self.refusal = event.text
+                elif event.kind == "admit" and event.attempt == self._attempt:
+                    self._admitted.add(event.member)
             announced = self._announced
             if announced is None or (event.attempt, event.boots) != (announced.attempt, announced.boots):
                 continue

@@ -360,7 +360,6 @@ def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
 
 
 def _hearing_notice(meter: LinkTimingMonitor, k: int) -> ClockNotice:
-    """Reports that a peer, which is heard, does not hear this site, or that it does again."""
     name = meter.peer.name
     if meter.unheard:
         text = f"{name} is heard and does not hear: for {UNHEARD_NS // 1_000_000} ms it acknowledged nothing"

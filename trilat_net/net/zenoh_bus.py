@@ -111,7 +111,13 @@ def open_zenoh(
     except zenoh.ZError as error:
         if mode == "client" and "Unable to connect" in str(error):
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
-        raise UsageError(_open_problem(error, listen, connect)) from None
+        if "in use" in str(error) or "AddrInUse" in str(error):
+            raise UsageError(
+                f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
+                "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
+            ) from None
+        places = _endpoint_texts([*listen, *connect])
+        raise UsageError(f"cannot open a Zenoh session with {places}: {_first_line(error)}") from None
 
 
 class ZenohBus:
@@ -268,7 +274,6 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns Zenoh's reason for refusing a configuration; "" if it accepts it."""
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
@@ -277,18 +282,8 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns Zenoh's message without the lines of its source."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
 def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
     return ", ".join(map(str, endpoints))
-
-
-def _open_problem(error: zenoh.ZError, listen: Sequence[Endpoint], connect: Sequence[Endpoint]) -> str:
-    if "in use" in str(error) or "AddrInUse" in str(error):
-        return (
-            f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
-            "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
-        )
-    return f"cannot open a Zenoh session with {_endpoint_texts([*listen, *connect])}: {_first_line(error)}"

@@ -196,7 +196,9 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
     for key, value in _leaves(settings, ()):
         need = REQUIREMENTS.get(key)
         if need is not None and not need.holds(value):
-            raise UsageError(f"{source}: {key}: {_short_json(value)} must be {need.must}")
+            text = json.dumps(value)
+            shown = text if len(text) <= 60 else f"{text[:57]}..."
+            raise UsageError(f"{source}: {key}: {shown} must be {need.must}")
         if key.startswith("access_control/") and "enabled" not in settings["access_control"]:
             raise UsageError(
                 f"{source}: access_control: has no `enabled: true`, without which Zenoh lets everybody in"
@@ -217,7 +219,6 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
 
 
 def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Drops nulls, which are unset keys in Zenoh's files."""
     return {
         key: _without_nulls(value) if isinstance(value, dict) else value
         for key, value in stated.items()
@@ -257,8 +258,3 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
     near = difflib.get_close_matches(unknown[1], re.findall(r"`([^`]*)`", unknown[2]), 1)
     choice = f"did you mean {near[0]}?" if near else f"there are {unknown[2].replace('`', '')}"
     return f"no key of Zenoh's; {choice}"
-
-
-def _short_json(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

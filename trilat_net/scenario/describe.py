@@ -6,7 +6,7 @@ differences.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from ..core.philox import link_key
 from ..core.vectors import Array
 from ..laws.conditions import LawSituation, StabilityCondition
+from ..laws.interface import LawSettings
 from .arms import TASK_AXES, read_arm
 from .delay_models import LinkBase
 from .sample_uses import count_silences, draw_uses
@@ -54,28 +55,23 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
     return delay_s
 
 
-def _list_situations(scenario: Scenario) -> list[LawSituation]:
-    """Returns what the condition of each site's law may be made of."""
+def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
+    """Yields each site, its law, and what the condition of that may be made of."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     every = (scenario.names, scenario.controls, scenario.alpha, _find_link_delays(scenario.links, rates_hz))
     ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
     hold_s = 0.0 if scenario.scheme != "digital" else ticks_s.pop() if len(ticks_s) == 1 else math.nan
-    return [
-        LawSituation(
-            *(n, *every, tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()), site.rate_hz),
-            gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
-            hold_s=hold_s,
-        )
-        for n, (name, site) in enumerate(scenario.sites.items())
-    ]
+    for n, (name, site) in enumerate(scenario.sites.items()):
+        limits_nm = tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist())
+        gravity_nm = scenario.arms[name].largest_gravity(site.arm.g_m_s2)
+        situation = LawSituation(n, *every, limits_nm, site.rate_hz, gravity_nm=gravity_nm, hold_s=hold_s)
+        yield name, scenario.controls[n], situation
 
 
 def describe_law_conditions(scenario: Scenario) -> list[str]:
     """Returns what the stability of the sites' laws rests on, a line for sites of whom the same holds."""
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
-    for name, law, situation in zip(
-        scenario.names, scenario.controls, _list_situations(scenario), strict=True
-    ):
+    for name, law, situation in _list_situations(scenario):
         if found := law.condition(situation):
             owners.setdefault((law.tag, found), []).append(name)
     words = {True: "holds", False: "does not hold", None: "is not decided here"}
@@ -89,9 +85,7 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
     """Returns which dominance factors have no effect by the laws that have them, and why."""
     ramped = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
-    for name, law, situation in zip(
-        scenario.names, scenario.controls, _list_situations(scenario), strict=True
-    ):
+    for name, law, situation in _list_situations(scenario):
         why = law.explain_idle_shares(situation)
         if not why and name in ramped and law.fixed_shares:
             why = "lines stay as they are at the start, whatever the timeline says"

@@ -7,11 +7,12 @@ smallest; a window's key holds [least, most].
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
+from ..core.chain import MAX_JOINTS
 from ..errors import ScenarioError
 from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys, field_names, suggest_nearest
 
@@ -24,7 +25,24 @@ ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 """Quantities of all sites together."""
 
 
-class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+class _RunPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    from_s: WindowTime
+    to_s: WindowTime
+    site: str = ""
+    error_peak_rad: LeastMost | None = None
+    speed_peak_rad_s: LeastMost | None = None
+    torque_peak_nm: LeastMost | None = None
+
+
+_JOINT_KEYS = [key.format(n) for key in ("q{}_rad", "push{}_mean_nm") for n in range(1, MAX_JOINTS + 1)]
+if TYPE_CHECKING:
+    _JointPart = _RunPart
+else:
+    _fields = [(key, LeastMost | None, None) for key in _JOINT_KEYS]
+    _JointPart = msgspec.defstruct("_JointPart", _fields, bases=(_RunPart,), frozen=True, kw_only=True)
+
+
+class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     """Expectations of the ticks from one time to another, as [least, most] of each quantity.
 
     A wall's force is that of the scenario's walls at the logged state, along their normals; of several it is
@@ -47,36 +65,6 @@ class ExpectWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         wall_hits: how often it begins: ticks with force after one without, within the window.
     """
 
-    from_s: WindowTime
-    to_s: WindowTime
-    site: str = ""
-    error_peak_rad: LeastMost | None = None
-    speed_peak_rad_s: LeastMost | None = None
-    torque_peak_nm: LeastMost | None = None
-    q1_rad: LeastMost | None = None
-    q2_rad: LeastMost | None = None
-    q3_rad: LeastMost | None = None
-    q4_rad: LeastMost | None = None
-    q5_rad: LeastMost | None = None
-    q6_rad: LeastMost | None = None
-    q7_rad: LeastMost | None = None
-    q8_rad: LeastMost | None = None
-    q9_rad: LeastMost | None = None
-    q10_rad: LeastMost | None = None
-    q11_rad: LeastMost | None = None
-    q12_rad: LeastMost | None = None
-    push1_mean_nm: LeastMost | None = None
-    push2_mean_nm: LeastMost | None = None
-    push3_mean_nm: LeastMost | None = None
-    push4_mean_nm: LeastMost | None = None
-    push5_mean_nm: LeastMost | None = None
-    push6_mean_nm: LeastMost | None = None
-    push7_mean_nm: LeastMost | None = None
-    push8_mean_nm: LeastMost | None = None
-    push9_mean_nm: LeastMost | None = None
-    push10_mean_nm: LeastMost | None = None
-    push11_mean_nm: LeastMost | None = None
-    push12_mean_nm: LeastMost | None = None
     wall_mean_n: LeastMost | None = None
     wall_deviation_n: LeastMost | None = None
     wall_peak_n: LeastMost | None = None
@@ -122,7 +110,6 @@ def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]
 
 
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    """Returns kind, ending and joint name of a key that names a joint; the name is "" of any other."""
     for kind, ending in (("q", "_rad"), ("push", "_mean_nm")):
         if key.startswith(f"{kind}_") and key.endswith(ending):
             return kind, ending, key.removeprefix(f"{kind}_").removesuffix(ending)

@@ -187,7 +187,6 @@ def check_law_class(source: LawSource, code: str, path: str) -> None:
 
 
 def _import(module: str, sha256: str) -> Any:
-    """Imports a module that Python finds."""
     found = importlib.import_module(module)
     if _imported.setdefault(module, sha256) != sha256:  # edited while this program runs
         found = importlib.reload(found)

@@ -52,7 +52,9 @@ def allow_logged_laws(
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember are about a file: give --law FILE too")
     named = list(dict.fromkeys((one.code, one.source_sha256) for one in list_imported_laws([scenario])))
-    known = _read_remembered() if named else {}
+    known: dict[str, str] = {}
+    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
+        known = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, str]) if named else {}
     for code, sha256 in named:
         if sha256 in known:
             allowed_laws.setdefault((code, sha256), LawConsent(Path(known[sha256]), sha256))
@@ -85,14 +87,7 @@ def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: 
 
 
 def _find_store() -> Path:
-    """Returns where the remembered files stand, by their hashes."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "trilat-net", "laws.json")
-
-
-def _read_remembered() -> dict[str, str]:
-    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
-        return msgspec.json.decode(_find_store().read_bytes(), type=dict[str, str])
-    return {}
 
 
 class LoggedUserLaw(NamedTuple):

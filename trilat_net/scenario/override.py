@@ -54,7 +54,6 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
 
 
 def _expand_single(scenario: Scenario, key: str, given: Mapping[str, Any]) -> str:
-    """Returns the key of a single site or link in the resolved scenario."""
     group, _, rest = key.partition(".")
     site, _, name = rest.partition(".control.")
     if group == "sites" and site in scenario.sites and name and _law(scenario, site, given) == _USER_LAW:
@@ -63,7 +62,6 @@ def _expand_single(scenario: Scenario, key: str, given: Mapping[str, Any]) -> st
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the path of a key of a user's law that stays."""
     settings = "" if name.split(".")[0] in ("law", *field_names(ImportedLaw)) else "settings."
     return f"{path}.{settings}{name}"
 
@@ -132,7 +130,6 @@ def split_entries(tables: TomlTable, pairs: Sequence[Override]) -> tuple[dict[st
 
 
 def _law(scenario: Scenario, site: str, given: Mapping[str, Any]) -> Any:
-    """Returns a site's law after the overrides."""
     now = scenario.sites[site].control.__struct_config__.tag
     return given.get(f"sites.{site}.control.law", given.get("control.law", now))
 
@@ -191,7 +188,6 @@ def _reach_table(tables: TomlTable, folders: Sequence[str], last: str) -> TomlTa
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
-    """Returns the index in a list that a part of a key means."""
     if not name.isdecimal() or int(name) >= len(entries):
         counted = f"it has {len(entries)}, counted from 0" if entries else "it has none"
         raise ScenarioError(f"no such entry: {counted}", path=path)

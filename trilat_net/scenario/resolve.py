@@ -165,7 +165,6 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns a file that a scenario names: a shipped one, or that of a folder."""
     shipped = Path(str(SHIPPED_FOLDER / name))
     return shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
 
@@ -254,12 +253,21 @@ def _resolve_site(
         site.get("control", {}), tables.get("control", {}), f"{path}.control", counts
     )
     if model is not None and model.chain is not None:
-        site["limits"] = {**_chain_limits(model), **site["limits"]}
+        pairs = (("tau_limit_nm", model.efforts), ("qd_limit_rad_s", model.speeds))
+        usual = {
+            key: [one if 0.0 < one < math.inf else getattr(Limits(), key) for one in stated]
+            for key, stated in pairs
+        }
+        site["limits"] = {**usual, **site["limits"]}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
         site["limits"] = {"tau_rate_limit_nm_s": GLIDE_TAU_RATE_NM_S, **site["limits"]}
     site.setdefault("role", "master")
     site.setdefault("rate_hz", tables.get("rate_hz", 1000))
-    _draw_site(site, path, draws)
+    site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)
+    for group in (*(one for one in SITE_GROUPS if one != "arm"), "control"):
+        site[group] = draws.draw_numbers(site[group], f"{path}.{group}")
+    if isinstance(settings := site["control"].get("settings"), dict):
+        site["control"]["settings"] = draws.draw_numbers(settings, f"{path}.control.settings")
     _check_counts(site, counts, path)
 
     def end_effector() -> list[float]:
@@ -267,9 +275,9 @@ def _resolve_site(
             return [0.0] * counts.axes
         return model.end_effector(site["q0_rad"])
 
-    holding = Holding(counts, site["q0_rad"], end_effector)
+    holding = Holding(counts, site["q0_rad"], end_effector, draws)
     for group, kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
-        site[group] = resolve_operators(site.get(group, []), kinds, holding, f"{path}.{group}", draws)
+        site[group] = resolve_operators(site.get(group, []), kinds, holding, f"{path}.{group}")
     return {key: site[key] for key in field_names(SiteSpec) if key in site}
 
 
@@ -290,7 +298,6 @@ def _resolve_arm(
 
 
 def _name_joints(table: TomlTable, urdf: dict[str, str]) -> tuple[str, ...]:
-    """Returns the names that the file of an arm gives its joints, in their order; () of a planar arm."""
     if not table.get("urdf"):
         return ()
     return tuple(joint.name for joint in read_arm(msgspec.convert(table, Arm), urdf).joints)
@@ -340,15 +347,6 @@ def _model_arm(
         raise ScenarioError(error.problem, path=f"{path}.{error.path or 'urdf'}") from None
 
 
-def _chain_limits(model: ArmModel) -> TomlTable:
-    """Returns the limits that a chain's file states, and the usual ones where it states none."""
-    usual = Limits()
-    pairs = (("tau_limit_nm", model.efforts), ("qd_limit_rad_s", model.speeds))
-    return {
-        key: [one if 0.0 < one < math.inf else getattr(usual, key) for one in stated] for key, stated in pairs
-    }
-
-
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
     """Refuses vectors of a site that do not fit its arm."""
     law = site["control"].get("law", "adaptive")
@@ -364,15 +362,6 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
             wanted, owner = counts.shared, f"sites share {counts.shared} coordinates"
         if isinstance(value, list) and len(value) != wanted:
             raise ScenarioError(f"has {len(value)} numbers, and {owner}", path=f"{path}.limits.{key}")
-
-
-def _draw_site(site: TomlTable, path: str, draws: Draws) -> None:
-    """Replaces the distributions of a site, its operators and environments aside, by numbers."""
-    site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)
-    for group in (*(one for one in SITE_GROUPS if one != "arm"), "control"):
-        site[group] = draws.draw_numbers(site[group], f"{path}.{group}")
-    if isinstance(settings := site["control"].get("settings"), dict):
-        site["control"]["settings"] = draws.draw_numbers(settings, f"{path}.control.settings")
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:

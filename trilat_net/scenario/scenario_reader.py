@@ -255,9 +255,4 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
     """Returns the function that reads the sites' names of embedded scenarios; errors call these `source`."""
-
-    def read_names(text: str) -> tuple[str, ...]:
-        """Returns the names of the sites; as `parse_embedded`."""
-        return parse_embedded(text, source).names
-
-    return read_names
+    return lambda text: parse_embedded(text, source).names

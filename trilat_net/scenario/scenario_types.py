@@ -347,7 +347,6 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns every state of every link in the run."""
         later = [link for name in self.links for _, link in scheduled_links(self.timeline, name)]
         return [*self.links.values(), *later]
 

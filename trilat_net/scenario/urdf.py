@@ -125,7 +125,6 @@ class _Pose(NamedTuple):
     origin_m: Three = _ZERO
 
     def __matmul__(self, inner: "_Pose") -> "_Pose":
-        """Returns where a frame is that is given in this one."""
         x, y, z = apply(self.rotation, inner.origin_m)
         ox, oy, oz = self.origin_m
         return _Pose(multiply(self.rotation, inner.rotation), (ox + x, oy + y, oz + z))
@@ -288,7 +287,6 @@ def _read_tree(root: Element) -> _Robot:
 
 
 def _walk(robot: _Robot, top: str) -> Iterator[tuple[str, bool]]:
-    """Yields a link and all below it, each with whether a joint between them moves."""
     waiting = [(top, False)]
     while waiting:
         name, moved = waiting.pop()
@@ -443,7 +441,6 @@ def _read_limit(edge: _Edge, place: str, notes: list[str]) -> tuple[float, float
 
 
 def _child(element: Element, tag: str, place: str) -> Element | None:
-    """Returns the child of that tag, which a file has once or not at all."""
     found = element.findall(tag)
     if len(found) > 1:
         _refuse(place, f"has {len(found)} <{tag}>: keep one")
@@ -451,7 +448,6 @@ def _child(element: Element, tag: str, place: str) -> Element | None:
 
 
 def _read_number(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> float:
-    """Returns a number of an element, finite and of a size that arithmetic takes."""
     word = element.get(key)
     if word is None:
         _refuse(place, f"its <{element.tag}> has no {key}")
@@ -525,7 +521,6 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
 
 
 def _fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the symmetric matrix of xx, xy, yy, xz, yz, zz."""
     xx, xy, yy, xz, yz, zz = entries
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 

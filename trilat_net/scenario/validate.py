@@ -31,8 +31,6 @@ from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """A singular value below this share of the largest is of a direction without motion."""
-FORCE_REFLECTION_SITES = 2
-"""Sites of direct force reflection: one master, one slave."""
 
 
 def refuse_external_arms(scenario: Scenario, given: Collection[str] = ()) -> None:
@@ -371,7 +369,6 @@ def _check_task_poses(scenario: Scenario) -> None:
 
 
 def _check_actors(actors: Sequence[operators.Operator | operators.Environment], path: str) -> None:
-    """Refuses operators and environments with a problem that no single key shows."""
     for n, actor in enumerate(actors):
         if found := actor.find_problem():
             raise ScenarioError(found.problem, path=f"{path}[{n}].{found.key}")
@@ -416,34 +413,27 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses a rule by which a site would always hold: the delay of its links alone exceeds its age."""
+    """Refuses a rule by which a site would always hold: its links or its peers' ticks alone are too slow."""
     _check_lost(scenario)
     for name, site in scenario.sites.items():
-        if site.on_stale.action == "glide":
-            _check_glide(scenario, name)
-            continue
+        slowest_hz = min(scenario.sites[one].rate_hz for one in (name, *scenario.peers(name)))
+        if site.on_stale.action == "glide" and site.on_stale.silence_ms < 2e3 / slowest_hz:
+            raise ScenarioError(
+                f"must be at least {2e3 / slowest_hz:g} ms, two periods of {slowest_hz} Hz, "
+                f"is {site.on_stale.silence_ms:g}",
+                path=f"sites.{name}.on_stale.silence_ms",
+            )
         for peer in scenario.peers(name):
             link = scenario.links[f"{peer}->{name}"]
             delay_ms = max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
             follows = scenario.dominance[name].get(peer, 0.0) > 0.0
-            if site.on_stale.action != "use" and follows and delay_ms >= site.on_stale.age_ms:
+            by_age = site.on_stale.action in ("hold", "brake")
+            if by_age and follows and delay_ms >= site.on_stale.age_ms:
                 raise ScenarioError(
                     f"must be above the {delay_ms:g} ms of {peer}->{name}, is {site.on_stale.age_ms:g}: "
                     f"the site would never follow {peer}",
                     path=f"sites.{name}.on_stale.age_ms",
                 )
-
-
-def _check_glide(scenario: Scenario, name: str) -> None:
-    """Refuses a silence that is shorter than the time between two samples."""
-    rule, path = scenario.sites[name].on_stale, f"sites.{name}.on_stale"
-    slowest_hz = min(scenario.sites[one].rate_hz for one in (name, *scenario.peers(name)))
-    if rule.silence_ms < 2e3 / slowest_hz:
-        raise ScenarioError(
-            f"must be at least {2e3 / slowest_hz:g} ms, two periods of {slowest_hz} Hz, "
-            f"is {rule.silence_ms:g}",
-            path=f"{path}.silence_ms",
-        )
 
 
 def _check_lost(scenario: Scenario) -> None:

@@ -26,7 +26,6 @@ _LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
 
 
 def _schema(text: str, parts: dict[str, str] = {}) -> bytes:  # noqa: B006
-    """Returns a type with those that it uses, as recorders of ROS 2 write it."""
     rule = "=" * 80
     return "".join([text, *(f"{rule}\nMSG: {name}\n{part}" for name, part in parts.items())]).encode()
 
@@ -80,13 +79,11 @@ def _pack_fields(offset: int, *values: int | str) -> bytes:
 
 
 def _split_stamp(stamp_ns: int) -> tuple[int, int]:
-    """Returns a stamp as seconds and nanoseconds."""
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     return min(seconds, _LAST_S), rest_ns
 
 
 def _format_floats(offset: int, count: int) -> tuple[str, int]:
-    """Returns the format of a list of numbers, its length first, and the offset after it."""
     before = -offset % 4
     start = offset + before + 4
     gap = -start % 8 if count else 0  # an empty list has nothing to align

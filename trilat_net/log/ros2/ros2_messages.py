@@ -154,7 +154,6 @@ class Ros2SiteChannels:
         )
 
     def _unit(self, unit: str) -> str:
-        """Returns the unit of the joints' numbers, or both where some turn and some slide."""
         return " or ".join(dict.fromkeys(self._arm.joint_units(unit)))
 
     def slow(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
@@ -200,7 +199,6 @@ def _make_sent_channels(scenario: Scenario, site: str) -> dict[str, ArrayChannel
 
 
 def _ms(us: int) -> float:
-    """Returns milliseconds; NaN if nothing was measured."""
     return us / 1e3 if us != -1 else math.nan
 
 

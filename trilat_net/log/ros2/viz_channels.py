@@ -60,12 +60,10 @@ class _BucketOutput:
         self._waiting = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the row that waits."""
         self.add_late(self._waiting, log_ns)
         self._waiting = ()
 
     def add_late(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes a bucket at once."""
         for row in rows:
             self._write(*row, log_ns)
 
@@ -144,7 +142,6 @@ class _SiteBuckets:
         self._open.append(message)
 
     def statistics(self, stats: LinkStats, log_ns: int) -> None:
-        """Takes the statistics of the site's loop."""
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
         for name, data in self._shapes.statistics(stats):
             self._put(self._topics[name], data, stamp_ns, log_ns)

@@ -85,7 +85,6 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem of the model's own keys."""
         return None
 
     def _describe_delay(self) -> str:

@@ -22,12 +22,10 @@ Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
 def _density(x: float) -> float:
-    """The standard normal density."""
     return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
 
 
 def _probability(x: float) -> float:
-    """The standard normal distribution function."""
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
@@ -95,7 +93,6 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns the problem of a deviation that is out of proportion to its mean."""
         delay_ms, deviation_ms = self._moments()
         if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
             return None

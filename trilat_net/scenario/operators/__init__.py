@@ -6,6 +6,7 @@ scenario is its tag. The kernel's own kinds name a `TorqueKind`; any other has a
 function that is compiled and one for many rows. Mistakes are refused at their own key.
 """
 
+import math
 import pkgutil
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -28,11 +29,13 @@ class Holding(NamedTuple):
         counts: how many numbers the vectors of the site have.
         q0_rad: the arm's start pose, as far as it is one.
         end_effector_m: returns the end effector's place in that pose.
+        draws: gives the numbers of distributions.
     """
 
     counts: fields.VectorCounts
     q0_rad: Any
     end_effector_m: Callable[[], list[float]]
+    draws: Draws
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
@@ -57,36 +60,40 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         return str(cls.__struct_config__.tag) != cls.__name__
 
     @classmethod
-    def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, draws: Draws, path: str
-    ) -> None:
+    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
         """Fills in what an author's entry left to the arm; errors call the entry `path`."""
 
     def find_problem(self) -> fields.KeyProblem | None:
         """Returns a problem that no range of a single key shows, or None."""
+        if math.hypot(*getattr(self, "normal", (1.0,))) < 1e-6:
+            return fields.KeyProblem("normal", "must point somewhere, is zero")
         start_s, end_s = getattr(self, "start_s", 0.0), getattr(self, "end_s", fields.MAX_QUANTITY)
         if end_s <= start_s:
             return fields.KeyProblem("end_s", f"must be later than start_s = {start_s:g}, is {end_s:g}")
         return None
 
 
-class OwnActor(ActorBase, frozen=True, kw_only=True):
+class TimedActor(ActorBase, frozen=True, kw_only=True):
+    """One that acts from `start_s` to `end_s`."""
+
+    start_s: fields.NotNegative = 0.0
+    end_s: fields.Positive = fields.MAX_QUANTITY
+
+
+class SampledActor(TimedActor, frozen=True, kw_only=True):
+    """One that, with `sampled`, is evaluated once a tick and held, as a digital haptic wall is."""
+
+    sampled: bool = False
+
+
+class OwnActor(SampledActor, frozen=True, kw_only=True):
     """An operator or an environment with a function of its own, a file of this folder.
 
     Its keys are numbers, or a vector with a number per joint or axis. It acts on the joints; or with `at_tip`
     on the end effector: then `act` and `effort` see its place and velocity, m and m/s, and give a force, N.
-
-    Attributes:
-        start_s: when it begins to act.
-        end_s: when it ends.
-        sampled: true: evaluated once a tick and held.
     """
 
     at_tip: ClassVar[bool] = False
-
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
-    sampled: bool = False
 
     def act(self, now: Any) -> None:
         """Writes `now.effort[i]`, N m or N, for i below `now.coordinates`, by now.t_s, now.at, now.speed.
@@ -173,31 +180,28 @@ def resolve_operators(
     kinds: Mapping[str, type[ActorBase]],
     holding: Holding,
     path: str,
-    draws: Draws,
 ) -> list[fields.TomlTable]:
     """Returns a site's operators or environments, complete, of the kinds that it may hold.
 
-    Errors call the list `path`; `draws` gives the numbers of distributions.
+    Errors call the list `path`.
     """
     if not isinstance(written, list):
         raise ScenarioError(f"must be a list of tables [[{path}]]", path=path)
-    return [_resolve_actor(entry, kinds, holding, f"{path}[{n}]", draws) for n, entry in enumerate(written)]
+    tables = []
+    for n, entry in enumerate(written):
+        place = f"{path}[{n}]"
+        if not isinstance(entry, dict):
+            raise ScenarioError("must be a table", path=place)
+        kind = _find_kind(entry, kinds, place)
+        fields.check_keys(entry, ("kind", *fields.field_names(kind)), place)
+        table = holding.draws.draw_numbers(fields.expand_vectors(entry, kind, holding.counts), place)
+        kind.complete(table, entry, holding, place)
+        _check_values(table, kind, entry, place, holding.counts)
+        tables.append(table)
+    return tables
 
 
-def _resolve_actor(
-    entry: Any, kinds: Mapping[str, type[ActorBase]], holding: Holding, path: str, draws: Draws
-) -> fields.TomlTable:
-    if not isinstance(entry, dict):
-        raise ScenarioError("must be a table", path=path)
-    kind = _check_kind(entry, kinds, path)
-    fields.check_keys(entry, ("kind", *fields.field_names(kinds[kind])), path)
-    table = draws.draw_numbers(fields.expand_vectors(entry, kinds[kind], holding.counts), path)
-    kinds[kind].complete(table, entry, holding, draws, path)
-    _check_values(table, kinds[kind], entry, path, holding.counts)
-    return table
-
-
-def _check_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str) -> str:
+def _find_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str) -> type[ActorBase]:
     """Returns the kind of an actor; refuses one in the wrong list with the name of the right one."""
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
@@ -206,7 +210,7 @@ def _check_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], p
         if isinstance(kind, str) and kind in others and kind not in kinds:
             raise ScenarioError(f"is {kind!r}, which belongs in {group}", path=f"{path}.kind")
     fields.check_choice(kind, list(kinds), f"{path}.kind")
-    return str(kind)
+    return kinds[kind]
 
 
 def _check_values(
@@ -224,14 +228,18 @@ def _check_values(
 
     try:
         msgspec.convert(table, kind)
-        _check_lengths(table, kind, counts)
+        if found := fields.find_count_problem(table, kind, counts):
+            raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
+        for n, row in enumerate(table.get("points", ())):
+            if len(row) != 1 + counts.joints:
+                raise msgspec.ValidationError(f"of another arm - at `$.points[{n}]`")
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at ")
         if missing := re.search(r"missing required field `(\w+)`", problem):
             key = missing[1]
             raise ScenarioError(f"is missing: {describe_values(key)}", path=f"{path}.{key}") from None
-        found = re.match(r"`\$\.(\w+)(.*)`", place)
-        key, rest = (found[1], found[2]) if found else ("", place)
+        at = re.match(r"`\$\.(\w+)(.*)`", place)
+        key, rest = (at[1], at[2]) if at else ("", place)
         if key not in entry:  # taken over from the arm, which is refused at its own key
             return
         if key == "points":
@@ -240,12 +248,3 @@ def _check_values(
         value = repr(entry[key])
         is_now = f", is {value}" if len(value) <= _SHOWN else ""
         raise ScenarioError(f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}") from None
-
-
-def _check_lengths(table: fields.TomlTable, kind: fields.StructType, counts: fields.VectorCounts) -> None:
-    """Raises `msgspec.ValidationError` for a vector, or a row of a table, that does not fit the arm."""
-    if found := fields.find_count_problem(table, kind, counts):
-        raise msgspec.ValidationError(f"{found.problem} - at `$.{found.key}`")
-    for n, row in enumerate(table.get("points", ())):
-        if len(row) != 1 + counts.joints:
-            raise msgspec.ValidationError(f"of another arm - at `$.points[{n}]`")

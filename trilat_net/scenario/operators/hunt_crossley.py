@@ -37,12 +37,6 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
     stiffness_n_m15: fields.NotNegative
     damping_s_m: fields.NotNegative = 0.0
 
-    def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a surface without a side."""
-        if math.hypot(*self.normal) < 1e-6:
-            return fields.KeyProblem("normal", "must point somewhere, is zero")
-        return super().find_problem()
-
     def act(self, now: Any) -> None:
         """Writes the force, N."""
         square = depth = inward = 0.0

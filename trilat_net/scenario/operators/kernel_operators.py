@@ -18,8 +18,7 @@ from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
 from ...core.live_hand import HandRules
 from ...errors import ScenarioError
-from ..distributions import Draws
-from ..operators import ActorBase, Holding
+from ..operators import ActorBase, Holding, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
@@ -46,25 +45,21 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
-class JointSpring(ActorBase, frozen=True, tag="spring"):
-    """An operator as a spring and a damper on every joint, towards a pose that moves (minimum jerk).
+class MovingSpring(ActorBase, frozen=True, kw_only=True):
+    """A spring and a damper of an operator, towards a target that moves (minimum jerk).
+
+    Four fields come first: the target, that before, left out as the arm starts; stiffness and damping.
 
     Attributes:
-        to_rad: the pose that it moves to, rad.
-        from_rad: the pose before, rad; left out: the arm's start pose.
-        stiffness_nm_rad: per joint, N m/rad.
-        damping_nm_s_rad: per joint, N m s/rad.
-        move_start_s: when the pose begins to move.
+        move_start_s: when the target begins to move.
         move_end_s: when it arrives.
         start_s: when the operator takes hold.
         end_s: when it lets go.
         sampled: true: evaluated once a tick and held.
     """
 
-    to_rad: fields.Joints
-    from_rad: fields.Joints
-    stiffness_nm_rad: fields.NotNegativeJoints
-    damping_nm_s_rad: fields.NotNegativeJoints = (0.0,)
+    at_tip: ClassVar[bool]
+
     move_start_s: fields.NotNegative = 0.0
     move_end_s: fields.NotNegative = 0.0
     start_s: fields.NotNegative = 0.0
@@ -72,27 +67,46 @@ class JointSpring(ActorBase, frozen=True, tag="spring"):
     sampled: bool = False
 
     @classmethod
-    def complete(
-        cls,
-        table: fields.TomlTable,
-        entry: fields.TomlTable,  # noqa: ARG003 - as all kinds
-        holding: Holding,
-        draws: Draws,
-        path: str,
-    ) -> None:
-        """Holds the arm at its start pose where none is given."""
-        draws.follow_start(table, "from_rad", holding.q0_rad, path)
-        draws.follow_start(table, "to_rad", table["from_rad"], path)
+    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:  # noqa: ARG003 - as all kinds
+        """Holds the arm as it starts where no target is given."""
+        to, before = fields.field_names(cls)[:2]
+        start = holding.end_effector_m() if cls.at_tip else holding.q0_rad
+        holding.draws.follow_start(table, before, start, path)
+        holding.draws.follow_start(table, to, table[before], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
         """Returns times in a wrong order."""
-        return super().find_problem() or _find_target_problem(self)
+        start_s, end_s = self.move_start_s, self.move_end_s
+        if (problem := super().find_problem()) or end_s >= start_s:
+            return problem
+        return fields.KeyProblem("move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}")
 
     def _source(self) -> TorqueSource:
-        return _spring_source(TorqueKind.HAND, self)
+        end, start, stiffness, damping = msgspec.structs.astuple(self)[:4]
+        held = self.start_s, self.end_s, self.move_start_s, self.move_end_s
+        kind = TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND
+        return TorqueSource(kind, *held, start, end, stiffness, damping, self.sampled)
 
 
-class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
+class JointSpring(MovingSpring, frozen=True, tag="spring"):
+    """An operator as a spring and a damper on every joint, towards a pose that moves.
+
+    Attributes:
+        to_rad: the pose that it moves to, rad.
+        from_rad: the pose before, rad; left out: the arm's start pose.
+        stiffness_nm_rad: per joint, N m/rad.
+        damping_nm_s_rad: per joint, N m s/rad.
+    """
+
+    at_tip: ClassVar[bool] = False
+
+    to_rad: fields.Joints
+    from_rad: fields.Joints
+    stiffness_nm_rad: fields.NotNegativeJoints
+    damping_nm_s_rad: fields.NotNegativeJoints = (0.0,)
+
+
+class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
     """An operator at the end effector: a spring and a damper in the plane, towards a point that moves.
 
     Attributes:
@@ -100,54 +114,15 @@ class EndEffectorSpring(ActorBase, frozen=True, tag="tip_spring"):
         from_m: the point before, m; left out: the end effector's start position.
         stiffness_n_m: along x and y, N/m.
         damping_n_s_m: along x and y, N s/m.
-        move_start_s: as of `JointSpring`, like those that follow.
     """
 
+    at_tip: ClassVar[bool] = True
     words: ClassVar[Mapping[str, str]] = _AXES_WORDS
 
     to_m: fields.Point
     from_m: fields.Point
     stiffness_n_m: fields.NotNegativeAxes
     damping_n_s_m: fields.NotNegativeAxes = (0.0,)
-    move_start_s: fields.NotNegative = 0.0
-    move_end_s: fields.NotNegative = 0.0
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
-    sampled: bool = False
-
-    @classmethod
-    def complete(
-        cls,
-        table: fields.TomlTable,
-        entry: fields.TomlTable,  # noqa: ARG003
-        holding: Holding,
-        draws: Draws,
-        path: str,
-    ) -> None:
-        """Holds the end effector at its start where no point is given."""
-        draws.follow_start(table, "from_m", holding.end_effector_m(), path)
-        draws.follow_start(table, "to_m", table["from_m"], path)
-
-    def find_problem(self) -> fields.KeyProblem | None:
-        """Returns times in a wrong order."""
-        return super().find_problem() or _find_target_problem(self)
-
-    def _source(self) -> TorqueSource:
-        return _spring_source(TorqueKind.TASK_HAND, self)
-
-
-def _find_target_problem(spring: JointSpring | EndEffectorSpring) -> fields.KeyProblem | None:
-    start_s, end_s = spring.move_start_s, spring.move_end_s
-    if end_s >= start_s:
-        return None
-    return fields.KeyProblem("move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}")
-
-
-def _spring_source(kind: TorqueKind, spring: JointSpring | EndEffectorSpring) -> TorqueSource:
-    """Returns a spring as the core has it; both kinds begin with the same four fields."""
-    end, start, stiffness, damping = msgspec.structs.astuple(spring)[:4]
-    held = spring.start_s, spring.end_s, spring.move_start_s, spring.move_end_s
-    return TorqueSource(kind, *held, start, end, stiffness, damping, spring.sampled)
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
@@ -169,7 +144,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
-class Chirp(ActorBase, frozen=True, tag="chirp"):
+class Chirp(TimedActor, frozen=True, tag="chirp"):
     """A torque of an operator whose frequency runs from one to another, evenly, again and again.
 
     Attributes:
@@ -177,16 +152,12 @@ class Chirp(ActorBase, frozen=True, tag="chirp"):
         from_hz: frequency at the beginning of a sweep, Hz.
         to_hz: frequency at its end, Hz.
         sweep_s: duration of a sweep, s.
-        start_s: when it begins.
-        end_s: when it ends.
     """
 
     peak_nm: fields.Joints
     from_hz: Frequency
     to_hz: Frequency
     sweep_s: fields.Positive
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
 
     def _source(self) -> TorqueSource:
         sweep = (self.start_s, self.start_s + self.sweep_s)
@@ -195,7 +166,7 @@ class Chirp(ActorBase, frozen=True, tag="chirp"):
         )
 
 
-class Multisine(ActorBase, frozen=True, tag="multisine"):
+class Multisine(TimedActor, frozen=True, tag="multisine"):
     """A torque of an operator that is a sum of sines of one amplitude.
 
     Attributes:
@@ -204,15 +175,11 @@ class Multisine(ActorBase, frozen=True, tag="multisine"):
         phases_rad: their phases at the start, rad; left out: -pi k (k - 1) / n for the k-th of n, which keeps
             the peak of their sum low (Schroeder, "Synthesis of low-peak-factor signals and binary sequences
             with low autocorrelation", IEEE Trans. Information Theory 16 (1970)).
-        start_s: when it begins.
-        end_s: when it ends.
     """
 
     amplitude_nm: fields.Joints
     frequencies_hz: Annotated[tuple[Frequency, ...], Meta(min_length=1, max_length=64)]
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
 
     def find_problem(self) -> fields.KeyProblem | None:
         """Returns too many or too few phases."""
@@ -262,14 +229,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     speed_limit_rad_s: fields.Positive = 4.0
 
     @classmethod
-    def complete(
-        cls,
-        table: fields.TomlTable,
-        entry: fields.TomlTable,
-        holding: Holding,  # noqa: ARG003
-        draws: Draws,  # noqa: ARG003
-        path: str,
-    ) -> None:
+    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:  # noqa: ARG003 - as all kinds
         """Leaves out what another mode has; refuses what the author wrote of that."""
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
@@ -311,22 +271,16 @@ def find_live_hand(operators: Iterable[ActorBase]) -> LiveHand | None:
     return next((one for one in operators if isinstance(one, LiveHand)), None)
 
 
-class ViscousEnvironment(ActorBase, frozen=True, tag="viscous"):
+class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     """An environment that resists motion of the joints.
 
     Attributes:
         damping_nm_s_rad: per joint, N m s/rad.
-        start_s: when it begins.
-        end_s: when it ends.
-        sampled: true: evaluated once a tick and held.
     """
 
     group: ClassVar[str] = "environment"
 
     damping_nm_s_rad: fields.NotNegativeJoints
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
-    sampled: bool = False
 
     def _source(self) -> TorqueSource:
         return TorqueSource(
@@ -334,7 +288,7 @@ class ViscousEnvironment(ActorBase, frozen=True, tag="viscous"):
         )
 
 
-class Wall(ActorBase, frozen=True, tag="wall"):
+class Wall(SampledActor, frozen=True, tag="wall"):
     """A unilateral wall for the end effector: it pushes out of itself, along its normal, and never pulls.
 
     Attributes:
@@ -342,9 +296,6 @@ class Wall(ActorBase, frozen=True, tag="wall"):
         normal: towards the free side; its length does not matter.
         stiffness_n_m: N/m.
         damping_n_s_m: N s/m.
-        start_s: when it begins.
-        end_s: when it ends.
-        sampled: true: evaluated once a tick and held, as a digital haptic wall is.
     """
 
     group: ClassVar[str] = "environment"
@@ -357,25 +308,12 @@ class Wall(ActorBase, frozen=True, tag="wall"):
     normal: fields.Point
     stiffness_n_m: fields.NotNegative
     damping_n_s_m: fields.NotNegative = 0.0
-    start_s: fields.NotNegative = 0.0
-    end_s: fields.Positive = fields.MAX_QUANTITY
-    sampled: bool = False
-
-    def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a wall without a side."""
-        if math.hypot(*self.normal) < 1e-6:
-            return fields.KeyProblem("normal", "must point somewhere, is zero")
-        return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        length = math.hypot(*self.normal) if len(self.normal) == 2 else math.sqrt(_sum_squares(self.normal))
+        x, y, z = (*self.normal, 0.0)[:3]
+        # `math.hypot` of three numbers rounds otherwise on other machines
+        length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)
         unit = tuple(x / length for x in self.normal)
         stiffness, damping = (self.stiffness_n_m, 0.0), (self.damping_n_s_m, 0.0)
         vectors: dict[str, Any] = {"a": self.point_m, "b": unit, "K": stiffness, "B": damping}
         return TorqueSource(TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled)
-
-
-def _sum_squares(vector: tuple[float, ...]) -> float:
-    """Returns x^2 + y^2 + z^2, rounded alike on every machine; `math.hypot` need not be."""
-    x, y, z = vector
-    return x * x + y * y + z * z
