@@ -213,8 +213,8 @@ def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: P
     model.key, model.sample, model.stamp_ns = np.int64(key), sample, stamp_ns
     first, count = model.trace_first, model.trace_count
     call_at(model.call, (points[first : first + count].reshape(-1).view(np.float64), model))
-    drawn_us: float = model.drawn_us
-    return min(drawn_us, model.location)
+    drawn_us: float = min(model.drawn_us, model.location)
+    return drawn_us
 
 
 @leaf

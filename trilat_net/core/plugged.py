@@ -30,7 +30,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
         kinds = tuple(signature.args[1])
         form = context.call_conv.get_function_type(types.none, kinds)
         place = builder.inttoptr(values[0], form.as_pointer())
-        given = cgutils.unpack_tuple(builder, values[1])
+        given: Any = cgutils.unpack_tuple(builder, values[1])  # type: ignore[no-untyped-call]
         status, _ = context.call_conv.call_function(builder, place, types.none, kinds, given)
         with builder.if_then(status.is_error, likely=False):
             context.call_conv.return_status_propagate(builder, status)

@@ -191,7 +191,7 @@ class Change(Frozen, frozen=True, omit_defaults=True):
     @property
     def after(self) -> LinkBase:
         """The link from then on."""
-        return msgspec.convert(self.to, Link)  # type: ignore[no-any-return]
+        return msgspec.convert(self.to, Link)
 
     @property
     def shares(self) -> dict[str, float]:
