@@ -171,7 +171,8 @@ def let_signals_kill() -> Callable[[], None]:
 def _watch_signals() -> Callable[[], None]:
     """Ends the process at a signal, from a thread, until the function returned is called."""
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)
+    if sys.platform != "win32":  # where no process is the first of a container
+        os.set_blocking(writer, False)
     before = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
