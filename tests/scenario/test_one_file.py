@@ -84,7 +84,7 @@ print(json.dumps({
     "identical": [one.identical == one.records for one in (verdict, again)],
     "check": tn.describe_scenario(log.scenario),
     "moved": float(np.abs(log[first].tau_x).max()),
-    "roots": len(tn.linear(SCENARIO, changes).roots) > 0,
+    "roots": len(tn.linear(SCENARIO, changes).continuous.roots) > 0,
     "refused": refused,
 }))
 """

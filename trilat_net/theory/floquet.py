@@ -71,7 +71,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     slips = np.zeros(len(spans_s))  # by which share of a tick the delays have not repeated
     for link in links:
         model, points, cycle_s = link.core(), link.points, 0.0
-        if points is not None and len(points) > 1:
+        if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
             cycle_s = float(2 * points[-1, 0] - points[-2, 0]) * 1e-6
         elif model.kind == DelayKind.SINE:
             cycle_s = model.extra * 1e-6
@@ -80,7 +80,8 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
             slips = np.maximum(slips, off_s * max(rates_hz))
     place = int(np.argmax(slips <= max(_SLIP, float(slips.min()))))
     drawn = any(link.random for link in links)
-    ends = any(link.points is not None and link.core().at_end == TraceEnd.HOLD for link in links)
+    kinds = [(model.kind, model.at_end) for model in (link.core() for link in links)]
+    ends = (DelayKind.TRACE, TraceEnd.HOLD) in kinds
     period_s = None if drawn or ends or slips[place] > 0.5 else float(spans_s[place])
     span_s = math.ceil((DRAWN_SPAN_S if drawn else MAX_PERIOD_S) * common_hz) / common_hz
     reach_ms = max((sum(link.moments()) + link.playout_ms for link in links), default=0.0)
