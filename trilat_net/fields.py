@@ -6,9 +6,11 @@ of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic far
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+import pkgutil
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, NamedTuple, TypeGuard, get_type_hints
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple, TypeGuard, TypeVar, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -20,6 +22,23 @@ from .errors import ScenarioError
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Immutable; unknown keys are refused."""
+
+    @classmethod
+    def is_kind(cls) -> bool:
+        """True if a scenario can name it by its tag, and it is no base of others."""
+        return cls.__struct_config__.tag not in (None, cls.__name__)
+
+
+K = TypeVar("K", bound=Frozen)
+
+
+def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
+    """Yields the kinds of a base that the files of its package define, by file and place there."""
+    for found in pkgutil.iter_modules(import_module(package).__path__):
+        module = f"{package}.{found.name}"
+        for one in vars(import_module(module)).values():
+            if isinstance(one, type) and issubclass(one, base) and one.__module__ == module and one.is_kind():
+                yield one
 
 
 MAX_QUANTITY = 1e9

@@ -6,9 +6,6 @@ distribution. It is found by its file in this folder; nothing else lists them. T
 measured; the two-state chain that draws it follows from these in closed form. Keys end in their unit.
 """
 
-import pkgutil
-from collections.abc import Iterator
-from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 
 import numpy as np
@@ -17,7 +14,7 @@ from msgspec import Meta
 from ...core.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel
 from ...core.plugged import list_numbers, plug
 from ...core.vectors import Points
-from ...fields import Frozen, KeyProblem
+from ...fields import Frozen, KeyProblem, find_kinds
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
 """The longest delay."""
@@ -65,11 +62,6 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     outages_s: Annotated[tuple[tuple[OutageTime, OutageTime], ...], Meta(max_length=MAX_OUTAGES)] = ()
     order: Literal["newest", "in_order"] = "newest"
     playout_ms: Milliseconds = 0.0
-
-    @classmethod
-    def is_kind(cls) -> bool:
-        """True if a scenario can name it, and it is no base of others."""
-        return str(cls.__struct_config__.tag) != cls.__name__
 
     def _delay(self) -> LinkModel:
         """Returns the delay alone, as the core has it."""
@@ -204,20 +196,14 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (-(-max(len(numbers), 1) // 2), 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        call = plug(self, "draw", LINK_MODEL_DTYPE)
-        return LinkModel(kind=DelayKind.OWN, location=1e3 * self._reach_ms(), call=call)
+        return LinkModel(kind=DelayKind.OWN, location=1e3 * self._reach_ms())
+
+    def core(self, from_ns: int = 0) -> LinkModel:
+        """Returns the core's model, as of any link, with the address of `draw`, which is compiled here."""
+        return super().core(from_ns)._replace(call=plug(self, "draw", LINK_MODEL_DTYPE))
 
 
-def _find_models() -> Iterator[type[LinkBase]]:
-    for found in pkgutil.iter_modules(__path__):
-        module = import_module(f"{__name__}.{found.name}")
-        here = (one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__)
-        yield from (
-            one for one in here if isinstance(one, type) and issubclass(one, LinkBase) and one.is_kind()
-        )
-
-
-DELAY_MODELS: dict[str, type[LinkBase]] = {str(one.__struct_config__.tag): one for one in _find_models()}
+DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)}
 """The models by name."""
 if TYPE_CHECKING:
     Link = LinkBase

@@ -7,10 +7,8 @@ function that is compiled and one for many rows. Mistakes are refused at their o
 """
 
 import math
-import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping
-from importlib import import_module
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Union
 
 import msgspec
@@ -55,11 +53,6 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         return self._source()
 
     @classmethod
-    def is_kind(cls) -> bool:
-        """True if a scenario can name it, and it is no base of others."""
-        return str(cls.__struct_config__.tag) != cls.__name__
-
-    @classmethod
     def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
         """Fills in what an author's entry left to the arm; errors call the entry `path`."""
 
@@ -99,7 +92,7 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         """Writes `now.effort[i]`, N m or N, for i below `now.coordinates`, by now.t_s, now.at, now.speed.
 
         It is compiled, and asked in every stage of the integrator: what it computes depends on its keys and
-        on `now` alone, and rounds alike everywhere (core.sincos, sqrt).
+        on `now` alone, and rounds alike everywhere (core.elementary, sqrt).
         """
         raise NotImplementedError
 
@@ -151,19 +144,9 @@ IN_WORDS = {
 """Those of the planar arm, and of any other."""
 
 
-def _find_actors(group: str) -> Iterator[type[ActorBase]]:
-    for found in pkgutil.iter_modules(__path__):
-        module = import_module(f"{__name__}.{found.name}")
-        here = (one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__)
-        for one in here:
-            if isinstance(one, type) and issubclass(one, ActorBase) and one.group == group and one.is_kind():
-                yield one
-
-
-OPERATORS: dict[str, type[ActorBase]] = {str(one.__struct_config__.tag): one for one in _find_actors("hands")}
-ENVIRONMENTS: dict[str, type[ActorBase]] = {
-    str(one.__struct_config__.tag): one for one in _find_actors("environment")
-}
+_KINDS = {str(kind.__struct_config__.tag): kind for kind in fields.find_kinds(__name__, ActorBase)}
+OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
+ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
 """The operators and the environments by the name of their kind."""
 if TYPE_CHECKING:
     Operator = ActorBase

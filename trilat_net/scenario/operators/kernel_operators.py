@@ -60,6 +60,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 
     at_tip: ClassVar[bool]
 
+    # Not those of `SampledActor`: the order of keys is that of a scenario's text, whose hash logs hold.
     move_start_s: fields.NotNegative = 0.0
     move_end_s: fields.NotNegative = 0.0
     start_s: fields.NotNegative = 0.0
