@@ -24,7 +24,7 @@ from .jit import bind_leaf, compile_named, leaf
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
-from .plugged import call_at, digest_beside
+from .plugged import call_at, digest_beside, find_address
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .user_law import LawInput, LawResults, check_results, describe_failure, law_name, list_remembered
@@ -250,8 +250,7 @@ class CompiledLaw:
             raise ScenarioError(
                 f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path
             ) from None
-        result = self._function.get_compile_result(self._function.nopython_signatures[0])
-        self.address = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        self.address = find_address(self._function)
         whole = np.zeros(1, form.law)
         for name, value in numbers.items():
             whole[0][name] = value

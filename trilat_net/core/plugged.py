@@ -55,6 +55,12 @@ def digest_beside(function: Callable[..., Any]) -> str:
     return hashlib.sha256(b"".join(one.read_bytes() for one in sorted(folder.glob("*.py")))).hexdigest()
 
 
+def find_address(compiled: Any) -> int:
+    """Returns the address of the machine code of a function that was compiled for one signature."""
+    result = compiled.get_compile_result(compiled.nopython_signatures[0])
+    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
 def _numbers_of(model: Any) -> dict[str, Array]:
     """Returns the numbers of a model by name; what is no number is left out."""
     named = {name: np.asarray(getattr(model, name)) for name in model.__struct_fields__}
@@ -94,5 +100,4 @@ def plug(model: Any, name: str, row: np.dtype[np.void]) -> int:
     if _config.DISABLE_JIT:
         _PLAIN[id(call)] = call
         return id(call)
-    result = call.get_compile_result(call.nopython_signatures[0])
-    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+    return find_address(call)
