@@ -22,7 +22,7 @@ from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.membership import Epoch, EventPublisher, describe_member, new_boot
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
-from trilat_net.net.zenoh_bus import share_one_thread
+from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt
 from trilat_net.scenario import embedded_names_reader, parse_embedded
 
@@ -180,7 +180,7 @@ def record_session(
     Raises:
         TrilatError: the session did not begin, the file cannot be written, or records are missing.
     """
-    share_one_thread()
+    share_threads()
     boot = new_boot()
     say(f"recorder: waiting for session {session!r} to begin")
     with ExitStack() as stack:

