@@ -131,12 +131,11 @@ class Recording:
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
         for arrived in queue.drain(until_ns):
             try:
-                if arrived.key not in self._blocks:
+                if arrived.key in self._blocks:
+                    self._take_block(*arrived)
+                else:
                     take = self._take_own if arrived.key in self._own else self._take
                     take(*arrived)
-                    continue
-                for payload in split_states(arrived.payload):  # one that is none drops those after it
-                    self._take(arrived.key, payload, arrived.mono_ns)
             except WireError as error:
                 self.dropped[error.reason] += 1
 
@@ -209,6 +208,13 @@ class Recording:
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
             log_time_ns = self.epoch.unix_ns + since_ns
             self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
+
+    def _take_block(self, key: str, block: bytes, mono_ns: int) -> None:
+        """Writes the records of a block; one that is none drops those after it."""
+        site, since_ns = self._channels[key][0], mono_ns - self.epoch.mono_ns
+        site.since_ns, log_time_ns, add = since_ns, self.epoch.unix_ns + since_ns, self._writer.add
+        for payload, record in site.take_records(split_states(block), mono_ns):
+            add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _take_own(self, key: str, payload: bytes, mono_ns: int) -> None:
         account, since_ns = self._own[key], mono_ns - self.epoch.mono_ns

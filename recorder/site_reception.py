@@ -7,6 +7,7 @@ the first word of an end all the same.
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
@@ -108,15 +109,38 @@ class SiteReception:
             t_ns = tick.sent_ns if channel == topics.STATE else tick.t_ns
             message = SiteMessage(number, tick.tick, t_ns, tick)
             sender, ticks = tick.site, tick.tick + 1
-        if sender != self.name or message.content.boot != self._boot:
-            raise WireError("stranger", f"{sender}, start {message.content.boot}, on a key of {self.name}")
-        if message.number >= self._most[channel]:
-            raise WireError("out of range", f"{self.name}/{channel} number {message.number}")
-        if ticks > self._possible_ticks:
-            raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {message.number}")
+        self._check(channel, sender, message.content.boot, message.number, ticks)
         if isinstance(message.content, Event):
             self._take_room(message.content, len(payload))
         return message
+
+    def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
+        if sender != self.name or boot != self._boot:
+            raise WireError("stranger", f"{sender}, start {boot}, on a key of {self.name}")
+        if number >= self._most[channel]:
+            raise WireError("out of range", f"{self.name}/{channel} number {number}")
+        if ticks > self._possible_ticks:
+            raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {number}")
+
+    def take_records(self, payloads: Iterable[bytes], came_ns: int) -> Iterator[tuple[bytes, State]]:
+        """Counts the published records of one block, and yields those that are no duplicates.
+
+        Raises:
+            WireError: one is no record of this site; those before it count.
+        """
+        decode, account = self._decoders[topics.STATE], self.accounts[topics.STATE]
+        name, boot, possible = self.name, self._boot, self._possible_ticks
+        for payload in payloads:
+            record: State = decode(payload)
+            tick = record.tick
+            if tick >= possible or record.site != name or record.boot != boot:
+                self._check(topics.STATE, record.site, record.boot, tick, tick + 1)
+            self.heard_ns = came_ns
+            new = account.take(tick, came_ns)
+            if record.cmd:
+                self._imply(record)
+            if new:
+                yield payload, record
 
     @property
     def _possible_ticks(self) -> int:
