@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo play setup test pytest compiled sessions live containers lint test-long faults docs bench lock clean
+.PHONY: help demo play setup test pytest compiled sessions live containers lint platforms test-long faults docs bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -60,13 +60,14 @@ test:
 pytest: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal -m "not live and not long" # some wait
 
-compiled: setup
+compiled: $(VENV)/runtime.stamp
 	$(BIN)/python -m tests.compile_core
+	@touch $(VENV)/compiled.stamp
 
 sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
-test-long: $(VENV)/long.stamp $(VENV)/docs.stamp
+test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
 
@@ -82,10 +83,12 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
 		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net || exit 1; \
 	done
-	$(BIN)/lint-imports
 
 faults: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.faults --seeds 2000 --write
