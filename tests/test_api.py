@@ -265,3 +265,9 @@ def test_errors_name_pages_that_are_there() -> None:
 @pytest.mark.long
 def test_the_page_of_keys_is_that_of_the_results() -> None:
     assert PAGE.read_text(encoding="utf-8") == build_page()
+
+
+def test_a_run_stands_for_its_scenario() -> None:
+    run = tn.simulate("two_sites", {"control.Kd": 5.0}, duration_s=0.02)
+    assert tn.load_scenario(run).text == run.scenario.text
+    assert tn.linear(run, ports=False).verdict == tn.linear(run.scenario, ports=False).verdict

@@ -72,8 +72,8 @@ def load_scenario(
     ('m1', 'm2', 's')
 
     Args:
-        source: the name of a shipped scenario, a path, a TOML text of several lines, its tables, or a
-            scenario.
+        source: the name of a shipped scenario, a path, a TOML text of several lines, its tables, a scenario,
+            or a run or log, which has one.
         overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a group applies to
             all (`override`).
         duration_s: the duration, s; by default the scenario's.
@@ -82,6 +82,7 @@ def load_scenario(
     Raises:
         ScenarioError: the source cannot be read or is not a valid scenario.
     """
+    source = getattr(source, "scenario", source)
     given = {"duration_s": duration_s, "seed": seed}
     more = {key: value for key, value in given.items() if value is not None}
     if isinstance(overrides, Mapping):
