@@ -97,7 +97,6 @@ _POLICY = (
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns every file of the page by its path, with its kind."""
     plots = (resources.files("trilat_net.reporting") / "assets").iterdir()
     files = {}
     for file in [*(resources.files("live") / "assets").iterdir(), *plots]:
@@ -356,7 +355,6 @@ class PageServer:
         return Response(HTTPStatus.OK, "OK", headers, content)
 
     def _problem_of(self, request: Request, query: str) -> str | None:
-        """Returns why a request is refused; None if it is not."""
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
         if not self._token and name not in LOOPBACK:
@@ -500,7 +498,6 @@ class PageServer:
         return {"hello": {**self._frames.describe(), "n": self._n, "ends": self._ends}}
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
-        """Returns the newest frame with what is new to a page."""
         frames, view = self._frames, self.view
         first = page.points == 0 and page.energies == 0
         most = 100_000 if first else POINTS_PER_FRAME

@@ -266,7 +266,6 @@ class SessionView:
                 self._change(name, content.command)
 
     def _change(self, site: str, text: str) -> None:
-        """Notes a change that a site has taken in, once."""
         if (site, text) in self._changes or self.scenario is None or self.energy is None:
             return
         self._changes.add((site, text))

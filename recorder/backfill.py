@@ -98,7 +98,6 @@ class GapRepair:
             self._open = _OpenRequest(wanted, self._bus.ask(self._key, encode(wanted)), now_ns)
 
     def _next_request(self) -> BackfillRequest | None:
-        """Returns the next request: channel by channel in turn, gap by gap."""
         for channel in self._turns:
             account = self._reception.accounts[channel]
             gap = account.wanted(self._next[channel]) or account.wanted()
@@ -136,7 +135,6 @@ class GapRepair:
         return past
 
     def _take(self, past: Backfill, wanted: BackfillRequest, now_ns: int) -> Iterator[RepairedMessage]:
-        """Takes the messages of an answer, and what it implies of the others."""
         channel = past.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)

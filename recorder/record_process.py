@@ -121,7 +121,6 @@ class Recorder:
         return recording
 
     def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Reports that the session begins, or that the recorder joins late."""
         own, now_ns = self._publisher.info, self._clock.monotonic_ns()
         self._publisher.update(running=True)
         text = "the session begins"

@@ -166,7 +166,6 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Notes another start of a site that a site admits, and how much that heard of the one before."""
         if (
             not isinstance(event, Event)
             or event.kind not in ("admit", LAST)

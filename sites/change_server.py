@@ -126,7 +126,6 @@ class ChangeServer:
         return ChangeReply(member=self._site, accepted=True, text=text, tick=k)
 
     def _order(self, k: int, order: SiteOrder) -> CoreChange:
-        """Returns an order to the site; refuses one that would have no effect."""
         mode, needed = self._mode(), _NEEDED_MODES.get(order)
         if needed is not None and mode is not needed:
             doing = mode.name.lower()

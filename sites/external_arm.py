@@ -153,7 +153,6 @@ class ExternalArm:
         self.taken += 1
 
     def _is_plausible(self, q: Sequence[float], passed_s: float) -> bool:
-        """True if the arm can have gone to `q` in a time from where it was measured last."""
         if self.newest is None:
             return True
         way = [limit * passed_s + STEP_MARGIN_RAD for limit in self._speed_limits]

@@ -82,7 +82,6 @@ class HandServer:
         return step.vector
 
     def _read(self, payload: bytes) -> HandCommand | None:
-        """Returns a message as the state machine takes it; None if it is refused, which is counted."""
         try:
             message = decode(payload, HandMessage)
         except WireError as error:

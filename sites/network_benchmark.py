@@ -138,7 +138,6 @@ class NearEnd:
 
 
 def _open(endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool) -> tuple[ZenohBus, str]:
-    """Returns the bus at an endpoint, and the name that an end has there."""
     encrypted = endpoint.startswith(ENCRYPTED)
     if encrypted and keys is None:
         raise UsageError(f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site")
@@ -354,7 +353,6 @@ def ping_benchmark(
 def _measure_endpoint(
     endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, share_s: float
 ) -> Iterator[dict[str, Any]]:
-    """Yields a row per size and rate."""
     bus, member = _open(endpoint, keys, listens=False, insecure=False)
     with closing(bus):
         near = NearEnd(bus, SystemClock(), member)

@@ -110,7 +110,6 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits another start of a site, or says why not."""
         member, before = event.member, self.boots.get(event.member)
         if event.boots.get(member) != event.boot or self._firsts.get(event.boot) == event.ticks:
             return

@@ -536,7 +536,6 @@ class Bridge:
         return anew
 
     def _diagnose(self) -> None:
-        """Publishes the state of every site."""
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
         newest_ns, parts = max((record.t_ns for record in records), default=0), list[cdr.Diagnosis]()
         for record in records:
@@ -583,7 +582,6 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
 
 
 def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
-    """Does what a service is asked for; what is refused is an answer as well."""
     try:
         return cdr.pack_trigger_response(success=True, text="; ".join(order(*sites)))
     except TrilatError as error:
@@ -594,7 +592,6 @@ def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
 def _repeated(
     period_s: float, act: Callable[[], None], last: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
-    """Does something again and again, in a thread of its own, and something else at the end."""
     over = threading.Event()
 
     def repeat() -> None:

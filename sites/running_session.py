@@ -249,7 +249,6 @@ def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenari
 
 
 def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
-    """Returns the function that places an arm's end effector by its joint angles."""
     if arm.chain is None:
         return arm.end_effector
     rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)

@@ -120,7 +120,6 @@ class PeerInbox:
         return Arrival(index, sample.tick, sample.q, sample.qd, delay_us, sample.tau_x, ch)
 
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
-        """True if a peer's arm can be where a sample says, and as fast, after the newest one so far."""
         limits, newest = self._links[index].speed_limit, self._newest[index]
         for speed, limit in zip(sample.qd, limits, strict=True):
             if not abs(speed) <= limit:

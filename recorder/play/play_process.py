@@ -150,7 +150,6 @@ class Playback:
         )
 
     def _await_recorders(self) -> None:
-        """Waits for announced recorders, and for at least one if the options ask for it."""
         clock, stand_ins = self.clock, self._stand_ins
         if self.options.needs_recorder:
             self.say("waiting for a recorder")
@@ -166,7 +165,6 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
-        """Answers recorders until they have everything, or have asked nothing for a while."""
         clock, stand_ins = self.clock, self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
         while clock.monotonic_ns() < give_up_ns and not self.stopped():

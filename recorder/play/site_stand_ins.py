@@ -162,7 +162,6 @@ class SiteStandIns:
         return False
 
     def _identity(self, site: str) -> bytes:
-        """Returns a site's identity, encoded a little while ago at most."""
         encoded_ns, answer = self._encoded.get(site, (0, b""))
         now_ns = self._clock.monotonic_ns()
         if not answer or now_ns - encoded_ns >= REFRESH_NS:

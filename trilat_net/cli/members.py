@@ -85,7 +85,6 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Refuses sites that cannot come late."""
     from ..scenario import find_site
 
     for late in without:
@@ -173,7 +172,6 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns where the log goes; the folder of a log with a report is made."""
     from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
@@ -297,7 +295,6 @@ def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Cal
 
 
 def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
-    """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 
     def show(progress: "PlayProgress") -> None:
@@ -362,7 +359,6 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
-    """Warns of damage that was not `reported` before, and of messages that did not arrive or arrived late."""
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
         terminal.print_error(

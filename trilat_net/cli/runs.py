@@ -233,7 +233,6 @@ def _formats(text: str) -> list[str]:
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints every figure, and for which of them a log has nothing to show."""
     from ..reporting.figures.registry import FIGURES
 
     absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
@@ -313,7 +312,6 @@ def rerun_command(
 
 
 def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
-    """Refuses a file that may not be written, before anything is executed."""
     from ..files import refuse_existing
     from ..log.log_layout import active_path
 

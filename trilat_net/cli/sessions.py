@@ -187,7 +187,6 @@ _OF_ROS2 = {"--ros2", "--ros", "--domain", "--seconds", "--json"}
 
 
 def _refuse_others(context: typer.Context, way: str) -> None:
-    """Refuses options that have no meaning beside --benchmark, --answer, --ros2, or none of them."""
     given = set(options.given_options(context))
     own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER, "--ros2": _OF_ROS2}.get(way)
     alone = {"--set", "--seconds", "--figure", "--force", "--insecure", "--ros", "--domain"}

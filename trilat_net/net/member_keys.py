@@ -94,7 +94,6 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Returns why these cannot be the members of a session, "" if they can."""
     for name in members:
         of_letters = isinstance(name, str) and all(c.isalnum() or c in "_-" for c in name)
         if not of_letters or not 0 < len(name) <= MOST_LETTERS or name == _AUTHORITY_FOLDER:
@@ -242,7 +241,6 @@ def read_member_keys(folder: str | Path) -> MemberKeys:
 def _find_fault(
     folder: Path, member: str, members: Sequence[str], certificate: x509.Certificate, key: Any
 ) -> str:
-    """Returns why the files of a member do not belong together, or do not hold now; "" if they do."""
     common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)

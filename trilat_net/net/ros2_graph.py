@@ -334,7 +334,6 @@ class Ros2Graph:
         self._listen(f"{self._place.domain}/{topic}/*/*", topic, heard)
 
     def _listen(self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]) -> None:
-        """Gives the messages of a key to `take`, each with its attachment; refuses those without."""
 
         def heard(sample: zenoh.Sample) -> None:
             attachment = _read_attachment(sample.attachment)

@@ -350,7 +350,6 @@ def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotic
 
 
 def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
-    """Reports a sample that arrived before it was sent, or windows that contradict each other."""
     name, before_ns, bound_ns = meter.peer.name, meter.worst_ns, meter.offset.bound_ns
     what = f"its stamps contradict those before, beyond the bound of {bound_ns / 1000:.0f} us"
     if before_ns:

@@ -109,8 +109,6 @@ def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str,
 
 
 class _Requirement(NamedTuple):
-    """Condition on the value of a key in a user's file."""
-
     holds: Callable[[Any], bool]
     must: str
 
@@ -238,7 +236,6 @@ def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tupl
 def _find_refused_key(
     settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
 ) -> tuple[tuple[str, ...], str] | None:
-    """Finds the key that Zenoh refuses, and its reason, by trying each key alone."""
     for key, value in settings.items():
         here = (*path, key)
         alone: Any = value
@@ -251,7 +248,6 @@ def _find_refused_key(
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    """Adds the most similar key to the refusal of an unknown key."""
     unknown = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
     if unknown is None or not path or unknown[1] != path[-1]:
         return reason

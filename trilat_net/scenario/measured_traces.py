@@ -150,7 +150,6 @@ def import_trace(
 
 
 def _arrange(sent: Sent) -> MeasuredTrace:
-    """Returns a trace of samples in order of their times."""
     if not sent:
         raise ValueError("it has no samples")
     sent.sort(key=lambda one: one[0])
@@ -236,7 +235,6 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
-    """Returns the place of a column and its unit, s: the wanted one, or the first with one of some names."""
     for place, cell in enumerate(cells):
         found = _COLUMN.match(cell)
         if found is not None and (cell == wanted if wanted else found["name"].lower() in names):

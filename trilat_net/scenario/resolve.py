@@ -152,7 +152,6 @@ def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
-    """Returns the text of a file that an arm names, or as much of it as shows that it is too long."""
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.urdf")
     try:
@@ -183,7 +182,6 @@ def _resolve_control(written: Any, default: TomlTable, path: str, counts: Vector
 
 
 def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: str) -> TomlTable:
-    """Returns a user's law: the hash of its file, and its settings."""
     inherited = default if default.get("law") == code else {}
     settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
     if not re.fullmatch(LAW_PATH_PATTERN, code):
@@ -284,7 +282,6 @@ def _resolve_site(
 def _resolve_arm(
     site: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool, path: str
 ) -> tuple[TomlTable, ArmModel | None]:
-    """Returns an arm's table with all numbers drawn, and its model, see `_model_arm`."""
     table, task = dict(site["arm"]), site["task"]
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
     table = draws.draw_numbers(table, path)
@@ -348,7 +345,6 @@ def _model_arm(
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of a site that do not fit its arm."""
     law = site["control"].get("law", "adaptive")
     tables: list[tuple[TomlTable, type[Frozen], str]]
     tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm"), (site["task"], Task, f"{path}.task")]

@@ -262,7 +262,6 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses vectors of one name and of several lengths that a site would get of its peers."""
     for site in scenario.names:
         lengths: dict[str, tuple[str, int]] = {}
         for peer in scenario.peers(site):
@@ -300,7 +299,6 @@ def _check_energy_laws(scenario: Scenario) -> None:
 
 
 def _check_start_poses(scenario: Scenario) -> None:
-    """Refuses an arm that would start beyond a stop."""
     for name, model in scenario.arms.items():
         joints = model.chain.joints if model.chain is not None else ()
         for n, (joint, start) in enumerate(zip(joints, scenario.sites[name].q0_rad, strict=False)):
@@ -479,7 +477,6 @@ def check_change(change: Change, path: str) -> None:
 
 
 def _reword(problem: str, path: str) -> str:
-    """Returns a validation message in the words of a scenario's author."""
     if problem.startswith("Invalid enum value"):
         choices = _CHOICES[path.rpartition(".")[2]]
         return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"

@@ -185,7 +185,6 @@ def resolve_operators(
 
 
 def _find_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str) -> type[ActorBase]:
-    """Returns the kind of an actor; refuses one in the wrong list with the name of the right one."""
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
     kind = entry["kind"]
@@ -203,7 +202,6 @@ def _check_values(
     path: str,
     counts: fields.VectorCounts,
 ) -> None:
-    """Refuses a wrong or a missing value, with the values that its key takes."""
     words = {name: both[counts != fields.VectorCounts()] for name, both in IN_WORDS.items()}
 
     def describe_values(key: str) -> str:
