@@ -16,8 +16,6 @@ SITES = ("m", "s")
 
 
 class Routed(Session):
-    """A session of two sites that go through a router."""
-
     def __init__(self, stage: Stage, duration: str, protocol: str = "tcp", *network: str) -> None:
         super().__init__(stage, "two_sites", SITES, "--duration", duration)
         self.endpoint = self.recorder_endpoint.replace("tcp", protocol)
@@ -35,8 +33,6 @@ class Routed(Session):
 
 
 class Keyed(Routed):
-    """The same with a key for each."""
-
     def __init__(self, stage: Stage, duration: str) -> None:
         super().__init__(stage, duration, "tls")
         create_keys(stage.folder / "keys", [*SITES, RECORDER, ROUTER], [], 1)

@@ -96,7 +96,6 @@ def key(member: str, channel: str) -> str:
 
 
 def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
-    """All that came until one's own word is heard, which is repeated until it is."""
     came: list[tuple[str, bytes]] = []
 
     def there() -> bool:

@@ -76,7 +76,6 @@ class World:
         return clock
 
     def wait(self, passed_ns: int, *wanted: int) -> None:
-        """Polls every millisecond for a time."""
         for _ in range(passed_ns // STEP_NS):
             self.pinger.poll(wanted)
             self.clock.sleep_until(self.clock.monotonic_ns() + STEP_NS)

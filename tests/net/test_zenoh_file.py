@@ -22,7 +22,6 @@ SOURCE = "mine.json5"
 
 
 def nested(path: str, value: object) -> Any:
-    """The configuration that states one key."""
     for key in reversed(path.split("/")):
         value = {key: value}
     return value
@@ -36,7 +35,6 @@ def found(settings: Mapping[str, Any], path: str) -> object:
 
 
 def checked(stated: object) -> ZenohFile:
-    """What is in a file, checked, with a Zenoh that takes everything."""
     return check_zenoh_file(SOURCE, stated, lambda _: "")
 
 

@@ -80,8 +80,6 @@ def driving(
     start: tuple[float, ...] = (0.3, -0.1),
     senses: bool = False,
 ) -> Act:
-    """The program of an arm, every millisecond, a quarter of one before the site's tick."""
-
     def drive(bus: Bus, clock: RelayClock) -> None:
         arm = Pendulum(start)
         with ArmClient(bus, clock, SESSION, "s") as port:
@@ -100,7 +98,6 @@ def driving(
 
 
 def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
-    """A session with that arm, and what became of its sites once it has run."""
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     session = Session.whole(scenario, folder, ends={})
     if act is not None:
@@ -188,7 +185,6 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
 def braked(
     bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]], arm: Pendulum | None = None
 ) -> None:
-    """The program of an arm with brakes, every millisecond."""
     arm = arm or Pendulum((0.3, -0.1))
     with ArmClient(bus, clock, SESSION, "s") as port:
         next_ns = clock.monotonic_ns()
@@ -421,8 +417,6 @@ def measurement(**changed: object) -> bytes:
 
 
 class Heard:
-    """An arm's measurements, by hand."""
-
     def __init__(self) -> None:
         self.clock = ManualClock()
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)

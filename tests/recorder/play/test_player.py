@@ -23,7 +23,6 @@ messages = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 2)), min_size=1
 
 
 def block(given: Iterable[tuple[int, int]]) -> MessageBatch:
-    """Messages at (ms, on a channel), numbered by their time, told by their place."""
     gathering = BatchBuilder()
     for number, (t_ms, channel) in enumerate(sorted(given)):
         gathering.add(t_ms * MS, channel, number, bytes([number]))
@@ -34,7 +33,6 @@ HEADER = SessionHeader("s", load_scenario("paper"), "", "", 0)
 
 
 def given_at_once(given: Iterable[tuple[int, int]]) -> MessageSource:
-    """A source that has all its messages."""
     return MessageSource(HEADER, block(given))
 
 
@@ -87,7 +85,6 @@ class Stage:
         )
 
     def play(self, rate: float = 1.0, later_ns: int = 0, *, loop: bool = False) -> Pace:
-        """Plays from 0 on, beginning so much later; returns what was due when."""
         pace = Pace(self.clock.now_ns + later_ns, 0, rate)
         self.player.prepare()
         self.player.play(pace, loop=loop)
