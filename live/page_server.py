@@ -196,8 +196,6 @@ class PageServer:
 
     Args:
         bus: a connection of its own to the session.
-        clock: the time.
-        session: the session's name.
         options: how it is served; at another address than this machine's it needs the token.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.

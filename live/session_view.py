@@ -68,10 +68,7 @@ class SiteView:
     """One running site: its reception, its newest record and statistics.
 
     Attributes:
-        reception: what came in, and what is missing.
-        window: its records.
-        record: the newest; None before the first.
-        stats: the newest; None before the first.
+        record, stats: the newest; None before the first.
         holds_from: its first tick that was seen.
         hand: the live hand that its scenario has there; None without one.
         holder: who took hold of its arm last.

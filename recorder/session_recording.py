@@ -284,10 +284,7 @@ class Recording:
             f"/{key}": f"{account.as_text(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
             for key, account in self.accounts.items()
         }
-        return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self._dropped_counts()}}
-
-    def _dropped_counts(self) -> list[tuple[str, int]]:
-        return [(reason, count) for reason, count in self.dropped.items() if count]
+        return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()}}
 
     def summary(self) -> list[str]:
         """Returns a line for every site, and for messages turned away or dropped."""
@@ -308,7 +305,7 @@ class Recording:
         if self._overflowed:
             lines.append(f"recorder: {self._overflowed} messages turned away because the queue was full")
         return lines + [
-            f"recorder: {count} messages dropped: {reason}" for reason, count in self._dropped_counts()
+            f"recorder: {count} messages dropped: {reason}" for reason, count in self.dropped.items()
         ]
 
     def problem(self) -> str | None:

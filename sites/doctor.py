@@ -75,16 +75,7 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields all findings, one after the other.
-
-    Args:
-        connection: the endpoints of a member, as given.
-        keys: the folder of its keys.
-        folder: where results go.
-        session: a session whose members are asked for their clocks, if any.
-        clock: this machine's.
-        insecure: whether it is known that everybody on the network is trusted.
-    """
+    """Yields all findings, one after the other, by the arguments of `doctor`."""
     yield from examine_keys(keys)
     owned = _read_keys(keys)
     yield from examine_links(connection, keys, owned, insecure=insecure)

@@ -49,8 +49,6 @@ class SiteOptions:
     """How a site takes part in a session.
 
     Attributes:
-        join_timeout_s: how long to wait for the others, s.
-        cpu: the processor to stay on, or None.
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
         clock_offset_s: injected offset of the clock from the machine's, s.
         clock_drift_ppm: injected drift of the clock, ppm.
@@ -71,20 +69,7 @@ class SiteOptions:
 
 
 class SiteParts:
-    """One site's parts; attributes of the same names as the arguments, and those made here.
-
-    Attributes:
-        setup: what the site is built from.
-        site: the site, at its start.
-        rings: the peers' records as they arrive.
-        watchdog: steps the site under a user's law; None without one.
-        arm: measurements of its external arm; None without one.
-        switch: its dead-man switch; None without one.
-        hand: whoever holds its arm; None without a live hand.
-        publish_sample: publishes what peers need of a tick.
-        states: the records that recorders have still to get.
-        publish_link: publishes statistics, and keeps them.
-    """
+    """One site's parts; those that its scenario does not ask for are None."""
 
     def __init__(
         self,

@@ -88,11 +88,7 @@ class LatenessSummary(NamedTuple):
 
 
 class LatenessHistogram:
-    """Counts messages by lateness: from their deadline to the call that publishes them.
-
-    Attributes:
-        max_us: the maximum so far, us.
-    """
+    """Counts messages by lateness: from their deadline to the call that publishes them."""
 
     def __init__(self) -> None:
         self.max_us = 0

@@ -45,9 +45,7 @@ class PlayOptions:
     Attributes:
         session: name of the session that others see.
         rate: seconds of the log per second; `math.inf`: as fast as all receivers take it.
-        loop: whether to play it round after round.
         low_cpu: whether to sleep to the deadlines.
-        needs_recorder: whether to wait for a recorder.
     """
 
     session: str

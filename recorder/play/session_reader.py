@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import msgspec
 
@@ -72,13 +72,15 @@ def parse_selection(
     start_s: float | None,
     stop_s: float | None,
     duration_s: float | None,
-    time: PlayTime,
+    time: str,
 ) -> PlaySelection:
     """Returns the selection that a user's options describe.
 
     Raises:
         UsageError: the options contradict each other, or one is not valid.
     """
+    if time not in get_args(PlayTime):
+        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {time!r}")
     for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
         if seconds is not None and not (math.isfinite(seconds) and abs(seconds) <= 1e9):
             raise UsageError(f"{name} is a number of seconds, not {seconds:g}")
@@ -91,7 +93,7 @@ def parse_selection(
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
     start_ns, stop_ns = (None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s))
-    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, time)
+    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, cast(PlayTime, time))
 
 
 HORIZON_NS = 70 * NS_PER_S

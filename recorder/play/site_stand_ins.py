@@ -174,7 +174,7 @@ class SiteStandIns:
         """Asks the present recorders for their identities; True once all have answered."""
         while (reply := self._recorder_query.poll()) is not None:
             try:
-                self._met.add(str(decode(reply.payload, Info).boot))
+                self._met.add(str(decode(reply[2], Info).boot))
             except WireError:
                 continue  # a stranger's
         if self.recorders - self._met:

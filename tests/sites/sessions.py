@@ -10,6 +10,7 @@ import msgpack
 
 from recorder.record_process import Recorder
 from sites import realtime
+from sites.running_session import RunningSession
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import take_part
 from tests.net.local_bus import LocalNetwork
@@ -208,3 +209,7 @@ def in_log(log: Log) -> dict[str, list[bytes]]:
 
 def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
     return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})
+
+
+def reached(bus: Bus, clock: Clock) -> RunningSession:
+    return RunningSession(SESSION, Connection(), bus, clock)

@@ -21,7 +21,6 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from sites.running_session import order_sites
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
@@ -40,7 +39,7 @@ from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session
+from .sessions import SESSION, Session, reached
 
 ARM = {
     "sites.s.plant": "external",
@@ -245,7 +244,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
                     clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-            told.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, ["s"], "enable"))
+            told.extend((one.accepted, one.text) for one in reached(bus, clock).order(["s"], "enable"))
 
     session.stranger(hold, at_ns=A_SECOND)
     log = session.run()

@@ -23,18 +23,14 @@ from sites.ros2_bridge import (
     SAFE_NS,
     SILENCE_NS,
     DominanceTopic,
-    Ends,
     RobotArm,
-    RobotTable,
-    ShareHistory,
-    SiteTopics,
     TargetTopic,
     read_joint_target,
     read_place_target,
-    read_topic_table,
     refuse_other_robots,
     show_session,
 )
+from sites.ros2_topics import Ends, RobotTable, ShareHistory, SiteTopics, read_topic_table
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -245,7 +245,7 @@ def replay_command(
 
     if preload < 0:
         raise UsageError(f"--preload is a number of MiB, not {preload}")
-    selection = parse_selection(include or (), exclude or (), start, stop, duration, _parse_time(time))
+    selection = parse_selection(include or (), exclude or (), start, stop, duration, time)
     speed = parse_rate(rate)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
@@ -274,12 +274,6 @@ def replay_command(
         raise typer.Exit(interrupt.exit_code)
     if outcome.cut or outcome.strays:
         raise typer.Exit(1)
-
-
-def _parse_time(text: str) -> Literal["publish", "log"]:
-    if text not in ("publish", "log"):
-        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {text!r}")
-    return "publish" if text == "publish" else "log"
 
 
 def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]) -> None:
@@ -448,7 +442,8 @@ def ros2_command(
         rate: Messages a second of each topic.
         names: Names of topics, or a TOML file of them and of robots.
     """
-    from sites.ros2_bridge import read_topic_table, serve_ros2
+    from sites.ros2_bridge import serve_ros2
+    from sites.ros2_topics import read_topic_table
     from sites.running_session import RunningSession
 
     from ..net.access_rules import BRIDGE

@@ -76,7 +76,8 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for member in members:
-        own = list(_relay() if member == ROUTER else _hold(member, ROLES.get(member, SITE_ROLE)))
+        relayed = [_rule(["ingress", "egress"], _EVERY, [f"{topics.ROOT}/**"])]
+        own = relayed if member == ROUTER else _hold(member, ROLES.get(member, SITE_ROLE))
         kept = (rule for rule in own if rule["key_exprs"])
         named = [{"id": f"{member} {n}", "permission": "allow", **rule} for n, rule in enumerate(kept)]
         rules += named
@@ -96,10 +97,6 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
 
 _ALIVE = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
 _EVERY = "put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", *_ALIVE
-
-
-def _relay() -> Iterator[dict[str, Any]]:
-    yield _rule(["ingress", "egress"], _EVERY, [f"{topics.ROOT}/**"])
 
 
 def _hold(member: str, role: _Role) -> Iterator[dict[str, Any]]:

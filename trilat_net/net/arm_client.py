@@ -247,10 +247,6 @@ class Hand(SiteClient):
     """Somebody at one arm; a context, which lets go at its end.
 
     Args:
-        bus: connection to the site.
-        clock: of this process.
-        session: the session's name.
-        site: the site of the arm.
         operator: the live hand of the scenario, as the core has it.
         place: returns where the arm is by its joint angles, in the coordinates of the target.
         source: who this is, for people.

@@ -112,11 +112,12 @@ class MemberQuery:
     def poll(self) -> Iterator[Info]:
         """Yields the answers that have arrived; repeats the query when it is due."""
         while (reply := self._query.poll()) is not None:
-            parts = topics.parse_key(reply.key)
+            _, key, payload = reply
+            parts = topics.parse_key(key)
             if parts is None:
                 continue
             try:
-                info = decode(reply.payload, Info)
+                info = decode(payload, Info)
             except WireError as error:  # another version of this program, or a stranger
                 self.unreadable[parts.member] = str(error)
                 continue

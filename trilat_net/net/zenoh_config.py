@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from ..errors import UsageError
 from ..files import open_regular
@@ -108,20 +108,19 @@ def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str,
     return both
 
 
-class _Requirement(NamedTuple):
-    holds: Callable[[Any], bool]
-    must: str
+_Requirement = tuple[Callable[[Any], bool], str]
+"""Whether the value of a key in a user's file will do, and what it must be."""
 
 
 def _exactly(value: object, must: str) -> _Requirement:
-    return _Requirement(lambda stated: stated == value and isinstance(stated, type(value)), must)
+    return (lambda stated: stated == value and isinstance(stated, type(value)), must)
 
 
 def _at_least(least: int, must: str) -> _Requirement:
-    return _Requirement(lambda stated: isinstance(stated, int) and stated >= least, must)
+    return (lambda stated: isinstance(stated, int) and stated >= least, must)
 
 
-_OURS = _Requirement(lambda _: False, "left out: a session sets it itself")
+_OURS: _Requirement = (lambda _: False, "left out: a session sets it itself")
 _NAMED = _exactly(False, "false: members meet at named endpoints and nowhere else")
 _UNTOUCHED = _exactly([], "empty: it would change or thin out a session's messages")
 _TX = "transport/link/tx"
@@ -150,9 +149,7 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
     "qos/publication": _UNTOUCHED,
     "qos/network": _UNTOUCHED,
     "downsampling": _UNTOUCHED,
-    "low_pass_filter": _Requirement(
-        lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"
-    ),
+    "low_pass_filter": (lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"),
 }
 """Requirements of a session by the path of the key in Zenoh's configuration."""
 
@@ -193,10 +190,10 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
         raise UsageError(f"{source}: {'/'.join(path)}: {_suggest_key(path, reason)}")
     for key, value in _leaves(settings, ()):
         need = REQUIREMENTS.get(key)
-        if need is not None and not need.holds(value):
+        if need is not None and not need[0](value):
             text = json.dumps(value)
             shown = text if len(text) <= 60 else f"{text[:57]}..."
-            raise UsageError(f"{source}: {key}: {shown} must be {need.must}")
+            raise UsageError(f"{source}: {key}: {shown} must be {need[1]}")
         if key.startswith("access_control/") and "enabled" not in settings["access_control"]:
             raise UsageError(
                 f"{source}: access_control: has no `enabled: true`, without which Zenoh lets everybody in"

@@ -31,6 +31,7 @@ from ..fields import (
     is_distribution,
     is_number,
     reword_problem,
+    split_refusal,
     suggest_nearest,
 )
 from ..files import open_regular
@@ -312,8 +313,8 @@ def _model_arm(
     except msgspec.ValidationError as error:
         if not (table.get("urdf") or chains):
             return None
-        problem, _, place = str(error).partition(" - at ")
-        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('`$.')}") from None
+        problem, place = split_refusal(error)
+        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('.')}") from None
     foreign = [key for key in table if key in (ArmLinks._fields if arm.urdf else CHAIN_KEYS)]
     if foreign:
         owner = f"belongs to the planar arm, and this one is {arm.urdf}" if arm.urdf else _OF_A_CHAIN
@@ -325,17 +326,16 @@ def _model_arm(
         raise ScenarioError(problem, path=f"{path}.{placed[0]}")
     if sum(abs(x) for x in arm.down) < 1e-6:
         raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
+    own = f"{path.removesuffix('arm')}task"
     try:
         task = msgspec.convert(task_table, Task)
     except msgspec.ValidationError as error:
         if any(map(is_distribution, task_table.values())):
             return None
-        problem, _, place = str(error).partition(" - at ")
-        raise ScenarioError(
-            reword_problem(problem), path=f"{path.removesuffix('arm')}task.{place.strip('`$.')}"
-        ) from None
+        problem, place = split_refusal(error)
+        raise ScenarioError(reword_problem(problem), path=f"{own}.{place.strip('.')}") from None
     if idle := task.find_idle_key(task_table):
-        raise ScenarioError(idle.problem, path=f"{path.removesuffix('arm')}task.{idle.key}")
+        raise ScenarioError(idle.problem, path=f"{own}.{idle.key}")
     try:
         return build_arm(arm, task, urdf, chains)
     except ScenarioError as error:
