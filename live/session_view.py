@@ -11,8 +11,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from recorder.backfill import GapRepair
-from recorder.inbound_queue import InboundMessage, InboundQueue
-from recorder.site_reception import SiteReception
+from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
     RecordWindow,

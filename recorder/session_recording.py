@@ -21,8 +21,7 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
-from .inbound_queue import InboundQueue
-from .site_reception import SiteMessage, SiteReception
+from .site_reception import InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""

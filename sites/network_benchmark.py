@@ -24,7 +24,6 @@ from trilat_net.core.vectors import Array
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
 from trilat_net.files import require_libraries
 from trilat_net.net import topics
-from trilat_net.net.access_rules import ROLES, ROUTER
 from trilat_net.net.bus import Bus, StampedInbox
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
@@ -36,6 +35,7 @@ from trilat_net.net.connection import (
 from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
 from trilat_net.net.messages import VERSION, PeerSample
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.zenoh_config import ROLES, ROUTER
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay

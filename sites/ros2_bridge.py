@@ -18,7 +18,6 @@ from trilat_net.errors import TrilatError, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
 from trilat_net.net import topics
-from trilat_net.net.access_rules import BRIDGE
 from trilat_net.net.arm_client import ArmClient, Hand
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection
@@ -32,6 +31,7 @@ from trilat_net.net.ros2_graph import (
     TopicPublisher,
 )
 from trilat_net.net.zenoh_bus import RouterSilent
+from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 

@@ -12,7 +12,6 @@ from typing import Any
 
 from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.net.access_rules import OPERATOR
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
@@ -27,6 +26,7 @@ from trilat_net.net.discovery import (
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 

@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilat_net import process
-from trilat_net.core.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
+from trilat_net.net.clock import NS_PER_S, Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import open_playback_bus, refuse_running_session
 
 from .batch import MessageBatch
 from .message_source import MessageSource
-from .pace import LatenessSummary, Pace
-from .player import Player, PlayProgress
+from .player import LatenessSummary, Pace, Player, PlayProgress
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
@@ -127,7 +125,7 @@ class Playback:
         begun_ns = clock.monotonic_ns() + AHEAD_NS
         if first_ns is not None:
             pace = Pace(begun_ns, first_ns if start_ns is None else start_ns, options.rate)
-            self._stand_ins.begin(pace)
+            self._stand_ins.begin(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
         took_ns = max(0, clock.monotonic_ns() - begun_ns)
         self._stand_ins.attend()

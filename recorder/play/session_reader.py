@@ -15,7 +15,6 @@ from typing import Literal, cast, get_args
 import msgspec
 
 from trilat_net import process
-from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, ScenarioError, UsageError
 from trilat_net.files import open_regular
 from trilat_net.log.log_layout import (
@@ -28,6 +27,7 @@ from trilat_net.log.log_layout import (
 )
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
+from trilat_net.net.clock import NS_PER_S
 from trilat_net.net.topics import number_message
 from trilat_net.scenario import Scenario, parse_embedded
 

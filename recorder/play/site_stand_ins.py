@@ -25,7 +25,6 @@ from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillR
 from trilat_net.net.wire import decode, encode
 
 from .batch import MessageBatch
-from .pace import Pace
 from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 _PlayedRun = tuple[Ints, Ints, MessageBatch]
@@ -128,9 +127,8 @@ class SiteStandIns:
             answer_pings(bus, clock, session, info)
             bus.announce(liveliness_token(session, site, info.boot))
 
-    def begin(self, pace: Pace) -> None:
-        """Shows the session as running, with tick 0 at the instant that the pace gives it."""
-        epoch_mono_ns = pace.due_ns(0)
+    def begin(self, epoch_mono_ns: int) -> None:
+        """Shows the session as running, with tick 0 at an instant of the clock."""
         running = {
             "running": True,
             "epoch_mono_ns": epoch_mono_ns,

@@ -7,8 +7,8 @@ import pytest
 from tests.net.certificates import Certificates
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.log.log_reader import open_log
-from trilat_net.net.access_rules import OPERATOR, RECORDER, ROUTER
 from trilat_net.net.member_keys import create_keys
+from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
 
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 from mcap.reader import make_reader
 
-from recorder.inbound_queue import InboundQueue
 from recorder.session_recording import RecorderReport, Recording
+from recorder.site_reception import InboundQueue
 from tests.net import parties
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock

@@ -237,8 +237,8 @@ def replay_command(
         low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
         preload: Largest log held in memory; another process reads a larger one during the replay.
     """
-    from recorder.play.pace import parse_rate
     from recorder.play.play_process import PlayOptions, play_log
+    from recorder.play.player import parse_rate
     from recorder.play.session_reader import parse_selection, preload_messages
 
     from ..net.connection import default_endpoint
@@ -393,9 +393,9 @@ def router_command(
     Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
     continues when the router is restarted. Routers that --connect to each other act as one.
     """
-    from ..net.access_rules import ROUTER
     from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
+    from ..net.zenoh_config import ROUTER
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
@@ -446,8 +446,8 @@ def ros2_command(
     from sites.ros2_topics import read_topic_table
     from sites.running_session import RunningSession
 
-    from ..net.access_rules import BRIDGE
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
+    from ..net.zenoh_config import BRIDGE
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")

@@ -28,7 +28,6 @@ from ..core.live_hand import GRIP_NS, SILENCE_NS, HandInForce
 from ..core.ticks import LifeReason
 from ..errors import UsageError, WireError
 from . import topics
-from .access_rules import OPERATOR
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
@@ -36,6 +35,7 @@ from .membership import new_boot, read_events
 from .messages import State
 from .requests import ArmEnable, ArmMeasurement, HandMessage, Request
 from .wire import decode, encode, split_states
+from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
 """Age at which a record is no longer the present: the site is late, or gone."""

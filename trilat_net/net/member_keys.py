@@ -24,7 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
 from ..files import find_rights_of_others, make_folder, open_regular, stage_output
-from .access_rules import MOST_SESSIONS, PROTOCOLS, make_access_rules
+from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
     "authority.pem",

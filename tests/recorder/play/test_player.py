@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from recorder.play.batch import BatchBuilder, MessageBatch
 from recorder.play.message_source import MessageSource
-from recorder.play.pace import Pace
-from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Player, PlayProgress
+from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Pace, Player, PlayProgress
 from recorder.play.session_reader import SessionHeader
 from recorder.play.site_stand_ins import PlayedHistory
 from trilat_net.scenario import load_scenario
