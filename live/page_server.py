@@ -136,8 +136,6 @@ class Page:
     """One connected page.
 
     Attributes:
-        hands: what it holds.
-        takes_part: true if its orders count.
         asks: the pages that it has asked whether it may take part, and when, ns.
         wake: set when there is a frame that it has not got.
         excess: how many messages it has sent that were too many.
@@ -162,7 +160,6 @@ class PageOptions:
     """How a page is served.
 
     Attributes:
-        host: address to listen at.
         port: 0: any.
         insecure: true: another address than this machine's is allowed, though nothing is encrypted.
         opens: true: a browser is opened where there is one.
@@ -195,7 +192,6 @@ class PageServer:
     """Serves one session's page; a context, inside of which the server's thread runs.
 
     Args:
-        bus: a connection of its own to the session.
         options: how it is served; at another address than this machine's it needs the token.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
@@ -203,7 +199,6 @@ class PageServer:
     Attributes:
         address: where a browser finds the page, token included.
         end_requested: set once a page has asked for the end.
-        refused: what was refused, by reason.
     """
 
     def __init__(

@@ -69,11 +69,8 @@ class SiteView:
     Attributes:
         record, stats: the newest; None before the first.
         holds_from: its first tick that was seen.
-        hand: the live hand that its scenario has there; None without one.
         holder: who took hold of its arm last.
-        glides: true: its rule for stale peers is "glide".
         layout: of its records, if it may go on without a lost one of its peers; else None.
-        peers: its peers, in scenario order.
     """
 
     def __init__(
@@ -113,12 +110,9 @@ class SessionView:
     Attributes:
         scenario: the session's; None until a member has told it.
         sites: its running sites by name; {} until all of them run.
-        met: identities of the members that have answered.
         links: every link as it is at present, as tables.
         dominance: the dominance matrix that was asked for last, by site.
-        energy: V of the session.
         events: what happened, oldest first.
-        dropped: messages that do not belong to the session, by reason.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:

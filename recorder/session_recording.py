@@ -39,9 +39,7 @@ class Recording:
     """One log and its accounts.
 
     Attributes:
-        dropped: messages that do not belong to the session, by reason.
         accounts: messages of every channel, by its key.
-        epoch: tick 0 of the session, and its members.
         publisher: the recorder's own events; it keeps them in the same queue as other messages.
     """
 

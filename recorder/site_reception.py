@@ -45,11 +45,7 @@ class InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """A queue between the bus's thread, which takes, and the writer's, which drains.
-
-    Attributes:
-        overflowed: messages lost because the queue was full, by key.
-    """
+    """A queue between the bus's thread, which takes, and the writer's, which drains."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -100,9 +96,7 @@ class SiteMessage(NamedTuple):
 
     Attributes:
         number: its number in its channel; -1 without one.
-        sequence: its sequence number in the file.
         t_ns: time of sending, ns since the epoch on the sender's clock; negative before it.
-        content: the message itself.
     """
 
     number: int
@@ -115,19 +109,15 @@ class SiteReception:
     """The messages received from one start of one site, and those missing.
 
     Args:
-        scenario: what it runs.
-        name: the site.
         boot: its start; None: it is not there yet.
         before: the reception of the start before, whose ticks this one continues.
 
     Attributes:
-        name: the site.
         accounts: its messages by channel; those of events begin anew with every start.
         event_accounts: those of the starts before.
         made: number of its ticks, once its end event has arrived; else None.
         heard_ns: arrival of its last message, on the recorder's clock; None before.
         since_ns: time since the epoch on that clock: what claims to be later is not believed.
-        period_ns: its tick period.
     """
 
     def __init__(

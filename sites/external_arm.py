@@ -44,7 +44,6 @@ class ExternalArm:
     """The measurements of one arm.
 
     Attributes:
-        newest: the newest measurement, None before the first.
         taken: number of measurements taken; the others are counted in `dropped`, by reason.
     """
 

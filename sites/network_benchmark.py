@@ -201,7 +201,6 @@ class ScenarioNeeds(NamedTuple):
 
     Attributes:
         sample_bytes: of a sample of its largest arm.
-        rate_hz: the fastest rate of its sites.
         playout_ms: the least play-out of its links.
         held_ms: for how long every link holds its samples at least, by play-out or a constant delay.
         in_use_ms: the age of samples in use that its own links make; None if theory does not know.

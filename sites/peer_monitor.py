@@ -21,12 +21,10 @@ class PeerMonitor:
 
     Attributes:
         boots: the members of the session and their boots.
-        recorders: boots of the recorders that are present.
         stored: boots of the recorders that have stored all messages of this site.
         ended_by: text of the event with which a member ended the run for all; "" while none has.
         ended_member: that member.
         away: the sites that have left, by name: when, ns since the epoch, and a sentence.
-        changed: True once a peer has taken in a change.
         admitted: what sites said that were admitted and that the loop has still to take in.
     """
 

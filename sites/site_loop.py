@@ -156,7 +156,6 @@ class StateBlock:
     """The records of a site's latest ticks, which recorders get together, and after peers have their samples.
 
     Args:
-        send: publishes the payloads of some records.
         turn: the site's place among those of the scenario, so that sites of one processor take turns.
         single: True if every record is sent with its tick, for the program of an external arm.
 

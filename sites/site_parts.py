@@ -50,8 +50,6 @@ class SiteOptions:
 
     Attributes:
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
-        clock_offset_s: injected offset of the clock from the machine's, s.
-        clock_drift_ppm: injected drift of the clock, ppm.
         without: sites without which the session begins; they may join it while it runs.
         leave_timeout_s: how long to go on after a site has left that does not come back, s; None: to the end.
     """
@@ -115,7 +113,8 @@ class SiteParts:
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
-        self.changes = ChangeServer(scenario, name, asked, lambda: self.site.mode, self._is_held, stops)
+        inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
+        self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
         warm_up(scenario, name, clock)
 
     def _meet_outside_arm(self) -> None:
@@ -130,9 +129,6 @@ class SiteParts:
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             self.switch = DeadManSwitch(name, ring, self.clock, dropped)
-
-    def _is_held(self) -> bool:
-        return self.switch is None or self.switch.held
 
     def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
         keep = self.buffer.channels[channel].keep

@@ -41,7 +41,6 @@ class PlayOptions:
     """How a log is played.
 
     Attributes:
-        session: name of the session that others see.
         rate: seconds of the log per second; `math.inf`: as fast as all receivers take it.
         low_cpu: whether to sleep to the deadlines.
     """
@@ -58,16 +57,13 @@ class PlaybackSummary(NamedTuple):
 
     Attributes:
         counts: messages published, by topic of the file.
-        rounds: rounds begun.
         lateness: their lateness; None if they had no deadline.
-        took_s: time from the first message to the last, s.
         held_s: time spent waiting for receivers that did not keep up, s.
         cut: how often a receiver took nothing for 5 s and was cut off.
         strays: messages that stood so far from their turn in the file that they were not played in it.
         recorders: recorders that were present after the last message.
         stored: whether all of them reported that they have everything.
         refilled: messages given again to recorders that had missed them.
-        torn: files that are not whole, and why.
     """
 
     counts: dict[str, int]

@@ -148,8 +148,6 @@ class Player:
         counts: messages published, by channel.
         stalls: number of publications that took so long that a receiver lost its connection.
         held_ns: time that publishers waited for others, ns.
-        rounds: rounds begun.
-        lateness: of the messages.
     """
 
     def __init__(

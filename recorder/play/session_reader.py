@@ -45,7 +45,6 @@ class PlaySelection:
         channels: the channels that are played; if it includes none by name: those that sites published.
         start_ns: messages before this are not played, ns since the epoch; None: from the first one on.
         stop_ns: messages after this are not played; None: to the last one.
-        time: the time that orders messages.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -127,11 +126,8 @@ class SessionHeader:
     """The session that files hold.
 
     Attributes:
-        scenario_text: the scenario as the files have it.
         version: schema version of the messages; 0 if unknown.
-        boots: the sites' boots, as far as read.
         topics: topics of the channels that are played, by number.
-        torn: unfinished or damaged files, with the reason.
         first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the latest one.
     """
 

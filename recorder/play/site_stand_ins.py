@@ -99,7 +99,6 @@ class SiteStandIns:
     """The stand-ins for all sites of a session, and the recorders that listen.
 
     Attributes:
-        recorders: boots of the recorders that are present.
         refilled: number of messages given to recorders that had missed them.
     """
 

@@ -57,7 +57,6 @@ class SiteSender:
     """Sends a site numbered messages of one kind, under one of its keys.
 
     Attributes:
-        boot: names this start of the sender.
         number: of the newest message; -1 before the first.
     """
 

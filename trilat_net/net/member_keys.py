@@ -48,8 +48,6 @@ class MemberKeys(NamedTuple):
     """A member's keys.
 
     Attributes:
-        member: whose they are.
-        members: all that were made with them.
         ends: when the certificate ends, in UTC.
         settings: of Zenoh, see `make_zenoh_config`.
     """

@@ -132,7 +132,6 @@ class LateSites(NamedTuple):
     Attributes:
         returns: True if this site may: every one of the scenario waits for its peers and aligns with them.
         without: sites without which the session begins, if this one leads.
-        rate_hz: its tick rate.
     """
 
     returns: bool = False
@@ -288,7 +287,6 @@ class Epoch(NamedTuple):
     Attributes:
         mono_ns: on this process's monotonic clock.
         unix_ns: in Unix time, as the leader read it.
-        boots: the members and their boots.
         epochs: the same instant on every member's own clock; empty for a recorder that joins late.
         first: the first tick of this site.
         coming: what it says who joins late, until all acknowledge its samples.

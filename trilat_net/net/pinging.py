@@ -101,7 +101,6 @@ class RoundTrips:
 
     Attributes:
         rtts_ns: the latest round trips, without the time that the member held them.
-        latest: the latest estimate, None before the first.
     """
 
     def __init__(self, enough: int) -> None:

@@ -80,7 +80,6 @@ class Attachment(NamedTuple):
 
     Attributes:
         number: of the message, from 1 on.
-        sent_unix_ns: when it was sent.
         gid: 16 bytes that name the sender; of a reply, who asked.
     """
 
@@ -236,7 +235,6 @@ class Ros2Graph:
         refusals: takes what comes and cannot be taken.
         routers: endpoints of ROS's router, of which the first that answers is taken.
         namespace, name: of the node.
-        clock: tells when a message is sent.
         domain: ROS_DOMAIN_ID.
         distro: of `DISTROS`, the distribution of ROS 2 whose form it writes.
 

@@ -112,9 +112,7 @@ class LinkTimingMonitor:
 
     Attributes:
         newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
-        faults: impossible stamps since the start.
         worst_ns: largest time by which a sample arrived before it was sent, since the last report.
-        contradicted: whether windows contradicted each other since then.
         unheard: True once the peer was found not to hear this site, until it hears it again.
     """
 

@@ -171,13 +171,9 @@ class ArmModel(NamedTuple):
 
     Attributes:
         theta: its true parameters: Eq. (24) for the planar arm, ten a link for a chain.
-        counts: how many numbers the vectors of its site have.
-        joint_names: of its joints.
-        link_names: of the links that these move.
         efforts: largest effort that its file states for each joint, N m or N; inf where it states none.
         speeds: largest speed so, rad/s or m/s.
         lengths_m: of the two links of the planar arm; (0, 0) of a chain.
-        chain: the chain, or None for the planar arm.
     """
 
     theta: Array

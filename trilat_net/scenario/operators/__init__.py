@@ -24,10 +24,8 @@ class Holding(NamedTuple):
     """What an operator who takes hold of an arm meets.
 
     Attributes:
-        counts: how many numbers the vectors of the site have.
         q0_rad: the arm's start pose, as far as it is one.
         end_effector_m: returns the end effector's place in that pose.
-        draws: gives the numbers of distributions.
     """
 
     counts: fields.VectorCounts
