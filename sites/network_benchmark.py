@@ -60,15 +60,8 @@ _HEADER = struct.Struct("<QQqB")
 """Who measures, number of the sample, time of its departure, ns; 1 in an answer."""
 
 
-class _Arrival(NamedTuple):
-    owner: int
-    number: int
-    sent_ns: int
-    answer: int
-
-
-def _read(payload: bytes) -> _Arrival | None:
-    return _Arrival(*_HEADER.unpack_from(payload)) if len(payload) >= _HEADER.size else None
+def _read(payload: bytes) -> tuple[int, ...] | None:
+    return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
@@ -76,9 +69,8 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        sample = _read(payload)
-        if sample is not None and not sample.answer:
-            put(_HEADER.pack(*sample[:3], 1) + payload[_HEADER.size :])
+        if (header := _read(payload)) is not None and not header[-1]:
+            put(_HEADER.pack(*header[:-1], 1) + payload[_HEADER.size :])
 
     bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
 
@@ -90,7 +82,7 @@ class NearEnd:
         self._clock, self._owner, self._number = clock, int.from_bytes(os.urandom(8), "little"), 0
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
-        self._inbox: StampedInbox[_Arrival | None] = bus.stamped(key, clock.monotonic_ns, _read)
+        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(key, clock.monotonic_ns, _read)
 
     def _send(self, size_bytes: int) -> None:
         sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
@@ -99,9 +91,11 @@ class NearEnd:
 
     def _answers(self) -> Iterator[tuple[int, int]]:
         while (entry := self._inbox.poll()) is not None:
-            sample, arrived_ns = entry
-            if sample is not None and sample.answer and sample.owner == self._owner:
-                yield sample.number, arrived_ns - sample.sent_ns
+            header, arrived_ns = entry
+            if header is not None:
+                owner, number, sent_ns, answer = header
+                if answer and owner == self._owner:
+                    yield number, arrived_ns - sent_ns
 
     def meet(self) -> bool:
         """Returns True if the far end answers in time."""

@@ -153,9 +153,7 @@ class FaultyNetwork(LocalNetwork):
     def _tell_presence(self, tokens: frozenset[str], receiver: str, alive: bool) -> None:
         for token in sorted(tokens):
             for member in self._named(receiver):
-                for expression, ring in member._presence_rings:
-                    if matches_key(expression, token):
-                        ring.put((token, alive))
+                member.tell_presence(token, alive)
 
     def _named(self, name: str) -> Iterator["FaultyBus"]:
         return (one for one in self.members if isinstance(one, FaultyBus) and one.name == name)
@@ -219,9 +217,7 @@ class FaultyBus(LocalBus):
     def _notify(self, token: str, alive: bool) -> None:
         for member in self._faulty.members:
             if member is not self and self._faulty.open(self.name, _name(member)):
-                for expression, ring in member._presence_rings:
-                    if matches_key(expression, token):
-                        ring.put((token, alive))
+                member.tell_presence(token, alive)
 
 
 def _name(member: LocalBus) -> str:

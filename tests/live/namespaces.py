@@ -82,13 +82,7 @@ class Machines:
         Raises:
             NoNamespaces: there is no `iptables`, or it may not.
         """
-        rule = ("iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
-        try:
-            done = subprocess.run([*self.on(name), *rule], capture_output=True, text=True, timeout=30)
-        except FileNotFoundError as error:
-            raise NoNamespaces(str(error)) from None
-        if done.returncode:
-            raise NoNamespaces(f"{' '.join(rule)}: {done.stderr.strip()}")
+        self._use(name, "iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
 
     def shape(self, name: str, *queue: str) -> None:
         """Puts all that a machine sends into a queue of the tool `tc`; nothing of it is lost by another one.
@@ -96,7 +90,9 @@ class Machines:
         Raises:
             NoNamespaces: there is no `tc`, or its kernel has no such queue.
         """
-        words = ("tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
+        self._use(name, "tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
+
+    def _use(self, name: str, *words: str) -> None:
         try:
             done = subprocess.run([*self.on(name), *words], capture_output=True, text=True, timeout=30)
         except FileNotFoundError as error:

@@ -112,6 +112,10 @@ class LocalBus:
 
     def _notify(self, token: str, alive: bool) -> None:
         for member in self._network.members:
-            for expression, ring in member._presence_rings:
-                if member is not self and matches_key(expression, token):
-                    ring.put((token, alive))
+            if member is not self:
+                member.tell_presence(token, alive)
+
+    def tell_presence(self, token: str, alive: bool) -> None:
+        for expression, ring in self._presence_rings:
+            if matches_key(expression, token):
+                ring.put((token, alive))
