@@ -76,20 +76,28 @@ def driving(
     sent: list[list[float]],
     torques: list[tuple[float, ...]],
     until_ns: int = 2**62,
-    start: tuple[float, ...] = (0.3, -0.1),
+    arm: Pendulum | None = None,
     senses: bool = False,
+    poses: list[tuple[int, list[float]]] | None = None,
 ) -> Act:
+    """The program of an arm; with `poses`, which it notes with their times, one that has brakes."""
+    body = arm or Pendulum((0.3, -0.1))
+
     def drive(bus: Bus, clock: RelayClock) -> None:
-        arm = Pendulum(start)
         with ArmClient(bus, clock, SESSION, "s") as port:
             next_ns = clock.monotonic_ns()
             while not port.over and next_ns < until_ns:
-                felt = [math.sin(7.0 * q) for q in arm.q] if senses else []
-                port.send(arm.q, arm.qd, felt)
-                sent.append([*arm.q, *arm.qd, *felt])
+                felt = [math.sin(7.0 * q) for q in body.q] if senses else []
+                port.send(body.q, body.qd, felt)
+                sent.append([*body.q, *body.qd, *felt])
                 tau = port.torque()
                 torques.extend([] if tau is None else [tau])
-                arm.move(tau)
+                if tau is None and poses is not None:
+                    body.qd = [0.0] * len(body.q)
+                else:
+                    body.move(tau)
+                if poses is not None:
+                    poses.append((clock.monotonic_ns(), list(body.q)))
                 next_ns += PERIOD_NS
                 clock.sleep_until(next_ns)
 
@@ -141,7 +149,7 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
     sent: list[list[float]] = []
     session = Session.whole(six(**changes), tmp_path, ends={})
     start = six().sites["s"].q0_rad
-    session.stranger(driving(sent, [], start=start, senses=True), at_ns=A_SECOND + 200_250_000)
+    session.stranger(driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000)
     log = session.run()
     assert set(session.ends.values()) == {0}
     records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
@@ -153,7 +161,7 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
 def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
     scenario = six(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
-    session.stranger(driving([], [], until_ns=3 * A_SECOND, start=(0.0,) * 7), at_ns=A_SECOND)
+    session.stranger(driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND)
 
     def alone(clock: RelayClock) -> None:
         with pytest.raises(SessionError, match=r"dropped: \d+ of 7 joints; the scenario has 6"):
@@ -181,24 +189,6 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
     whole(log)
 
 
-def braked(
-    bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]], arm: Pendulum | None = None
-) -> None:
-    arm = arm or Pendulum((0.3, -0.1))
-    with ArmClient(bus, clock, SESSION, "s") as port:
-        next_ns = clock.monotonic_ns()
-        while not port.over:
-            port.send(arm.q, arm.qd)
-            tau = port.torque()
-            if tau is None:
-                arm.qd = [0.0, 0.0]
-            else:
-                arm.move(tau)
-            poses.append((clock.monotonic_ns(), list(arm.q)))
-            next_ns += PERIOD_NS
-            clock.sleep_until(next_ns)
-
-
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
@@ -207,7 +197,7 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_p
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(lambda bus, clock: braked(bus, clock, poses), at_ns=A_SECOND + 200_250_000)
+    session.stranger(driving([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
@@ -352,11 +342,7 @@ def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     scenario = load_scenario("two_sites", {**OUTSIDE, **glide, "duration_s": 6.0, "link.delay_ms": 50.0})
     session = Session.whole(scenario, tmp_path, ends={})
     poses: list[tuple[int, list[float]]] = []
-    arm = Pendulum((0.3, -0.1))
-
-    def drive(bus: Bus, clock: RelayClock) -> None:
-        braked(bus, clock, poses, arm)
-
+    drive = driving([], [], poses=poses)
     session.stranger(drive, at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].dies_ns = 3 * A_SECOND
     session.stranger(drive, at_ns=4 * A_SECOND + 250_000)

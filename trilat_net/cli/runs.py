@@ -207,7 +207,9 @@ def figure_command(
     from ..reporting.figures.registry import write_figures, write_overlay
 
     place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
-    kinds = _formats(formats)
+    kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
+    if not kinds:
+        raise UsageError("--format names no format, as in --format pdf,png")
     shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
     if others:
         if names:
@@ -223,13 +225,6 @@ def figure_command(
         terminal.print_json([path.as_posix() for path in paths])
         return
     terminal.print_paths(paths)
-
-
-def _formats(text: str) -> list[str]:
-    kinds = [kind.strip().lower() for kind in text.split(",") if kind.strip()]
-    if not kinds:
-        raise UsageError("--format names no format, as in --format pdf,png")
-    return kinds
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
