@@ -181,11 +181,7 @@ class PageHands:
 
 
 class OrderDesk:
-    """The orders of all pages to the sites; `replies` are the answers that nobody has read yet.
-
-    Attributes:
-        refused: messages of pages that were dropped, by reason.
-    """
+    """The orders of all pages to the sites; `replies` are the answers that nobody has read yet."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
         self._bus, self._clock, self._session = bus, clock, session

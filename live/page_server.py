@@ -97,7 +97,6 @@ _POLICY = (
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns every file of the page by its path, with its kind."""
     plots = (resources.files("trilat_net.reporting") / "assets").iterdir()
     files = {}
     for file in [*(resources.files("live") / "assets").iterdir(), *plots]:
@@ -137,8 +136,6 @@ class Page:
     """One connected page.
 
     Attributes:
-        hands: what it holds.
-        takes_part: true if its orders count.
         asks: the pages that it has asked whether it may take part, and when, ns.
         wake: set when there is a frame that it has not got.
         excess: how many messages it has sent that were too many.
@@ -163,7 +160,6 @@ class PageOptions:
     """How a page is served.
 
     Attributes:
-        host: address to listen at.
         port: 0: any.
         insecure: true: another address than this machine's is allowed, though nothing is encrypted.
         opens: true: a browser is opened where there is one.
@@ -196,9 +192,6 @@ class PageServer:
     """Serves one session's page; a context, inside of which the server's thread runs.
 
     Args:
-        bus: a connection of its own to the session.
-        clock: the time.
-        session: the session's name.
         options: how it is served; at another address than this machine's it needs the token.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
@@ -206,7 +199,6 @@ class PageServer:
     Attributes:
         address: where a browser finds the page, token included.
         end_requested: set once a page has asked for the end.
-        refused: what was refused, by reason.
     """
 
     def __init__(
@@ -356,7 +348,6 @@ class PageServer:
         return Response(HTTPStatus.OK, "OK", headers, content)
 
     def _problem_of(self, request: Request, query: str) -> str | None:
-        """Returns why a request is refused; None if it is not."""
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
         if not self._token and name not in LOOPBACK:
@@ -500,7 +491,6 @@ class PageServer:
         return {"hello": {**self._frames.describe(), "n": self._n, "ends": self._ends}}
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
-        """Returns the newest frame with what is new to a page."""
         frames, view = self._frames, self.view
         first = page.points == 0 and page.energies == 0
         most = 100_000 if first else POINTS_PER_FRAME

@@ -104,7 +104,6 @@ class ArmFrames:
         return now, [float(e.max()), float(tau.max()), *map(float, sizes)]
 
     def _describe_grip(self, own: AlignedRecords, force: Array) -> Json:
-        """Returns who holds the arm, where to, and whether the force is at its limit."""
         if not own.hand.size:
             return {}
         held = HandInForce.read(own.hand[-1].tolist())

@@ -11,8 +11,7 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from recorder.backfill import GapRepair
-from recorder.inbound_queue import InboundMessage, InboundQueue
-from recorder.site_reception import SiteReception
+from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
 from trilat_net.analysis.certificate.running_energy import (
     EnergyCourse,
     RecordWindow,
@@ -68,16 +67,10 @@ class SiteView:
     """One running site: its reception, its newest record and statistics.
 
     Attributes:
-        reception: what came in, and what is missing.
-        window: its records.
-        record: the newest; None before the first.
-        stats: the newest; None before the first.
+        record, stats: the newest; None before the first.
         holds_from: its first tick that was seen.
-        hand: the live hand that its scenario has there; None without one.
         holder: who took hold of its arm last.
-        glides: true: its rule for stale peers is "glide".
         layout: of its records, if it may go on without a lost one of its peers; else None.
-        peers: its peers, in scenario order.
     """
 
     def __init__(
@@ -117,12 +110,9 @@ class SessionView:
     Attributes:
         scenario: the session's; None until a member has told it.
         sites: its running sites by name; {} until all of them run.
-        met: identities of the members that have answered.
         links: every link as it is at present, as tables.
         dominance: the dominance matrix that was asked for last, by site.
-        energy: V of the session.
         events: what happened, oldest first.
-        dropped: messages that do not belong to the session, by reason.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
@@ -266,7 +256,6 @@ class SessionView:
                 self._change(name, content.command)
 
     def _change(self, site: str, text: str) -> None:
-        """Notes a change that a site has taken in, once."""
         if (site, text) in self._changes or self.scenario is None or self.energy is None:
             return
         self._changes.add((site, text))

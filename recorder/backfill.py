@@ -9,7 +9,6 @@ statistics are noticed. Time is an argument; nothing waits.
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from trilat_net.errors import WireError
 from trilat_net.log.log_layout import SITE_CHANNELS
@@ -38,12 +37,6 @@ RepairedMessage = tuple[str, SiteMessage, bytes]
 """One message out of a site's retransmission buffer: its channel, the message, its payload."""
 
 
-class _OpenRequest(NamedTuple):
-    wanted: BackfillRequest
-    answers: Inbox
-    asked_ns: int
-
-
 class GapRepair:
     """The requests to one site; `dropped` counts its invalid answers by reason."""
 
@@ -58,7 +51,7 @@ class GapRepair:
         self._probed_ns = now_ns
         self._next = dict.fromkeys(SITE_CHANNELS, 0)
         self._vain = dict.fromkeys(SITE_CHANNELS, 0)
-        self._open: _OpenRequest | None = None
+        self._open: tuple[BackfillRequest, Inbox, int] | None = None  # its answers, when it was sent
         self._due_ns: int | None = None
         # fewer messages per request while answers do not arrive
         self._timeout_ns, self._chunk = ANSWER_NS[0], BACKFILL_MESSAGES
@@ -71,7 +64,7 @@ class GapRepair:
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
         """Yields missing messages that have arrived; requests more."""
         if self._open is not None:
-            yield from self._read_answers(self._open, now_ns)
+            yield from self._read_answers(*self._open, now_ns)
         if alive:
             silent_ns = now_ns - max(self._reception.heard_ns or 0, self._probed_ns)
             if self._reception.made is None and silent_ns > max(SILENT_NS, 3 * self._reception.period_ns):
@@ -95,10 +88,9 @@ class GapRepair:
         if now_ns >= self._due_ns:
             self._turns.remove(wanted.channel)
             self._turns.append(wanted.channel)
-            self._open = _OpenRequest(wanted, self._bus.ask(self._key, encode(wanted)), now_ns)
+            self._open = wanted, self._bus.ask(self._key, encode(wanted)), now_ns
 
     def _next_request(self) -> BackfillRequest | None:
-        """Returns the next request: channel by channel in turn, gap by gap."""
         for channel in self._turns:
             account = self._reception.accounts[channel]
             gap = account.wanted(self._next[channel]) or account.wanted()
@@ -109,21 +101,22 @@ class GapRepair:
                 return BackfillRequest(channel=channel, first=gap[0], last=last)  # type: ignore[arg-type]
         return None
 
-    def _read_answers(self, request: _OpenRequest, now_ns: int) -> Iterator[RepairedMessage]:
+    def _read_answers(
+        self, wanted: BackfillRequest, answers: Inbox, asked_ns: int, now_ns: int
+    ) -> Iterator[RepairedMessage]:
         """Takes a valid answer if it has arrived; closes the request if it should have."""
-        while (reply := request.answers.poll()) is not None:
+        while (reply := answers.poll()) is not None:
             try:
-                past = self._decode(reply[1], request.wanted)
+                past = self._decode(reply[1], wanted)
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
-            trip_ns = now_ns - request.asked_ns
-            self._timeout_ns = min(max(ANSWER_NS[0], 4 * trip_ns), ANSWER_NS[1])
+            self._timeout_ns = min(max(ANSWER_NS[0], 4 * (now_ns - asked_ns)), ANSWER_NS[1])
             self._chunk = min(2 * self._chunk, BACKFILL_MESSAGES)
             self._open = None
-            yield from self._take(past, request.wanted, now_ns)
+            yield from self._take(past, wanted, now_ns)
             return
-        if now_ns - request.asked_ns >= self._timeout_ns:
+        if now_ns - asked_ns >= self._timeout_ns:
             self._timeout_ns = min(2 * self._timeout_ns, ANSWER_NS[1])
             self._chunk = max(1, self._chunk // 2)
             self._open = None
@@ -136,7 +129,6 @@ class GapRepair:
         return past
 
     def _take(self, past: Backfill, wanted: BackfillRequest, now_ns: int) -> Iterator[RepairedMessage]:
-        """Takes the messages of an answer, and what it implies of the others."""
         channel = past.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)

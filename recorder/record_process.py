@@ -26,8 +26,8 @@ from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt
 from trilat_net.scenario import embedded_names_reader, parse_embedded
 
-from .inbound_queue import InboundQueue
 from .session_recording import RecorderReport, Recording
+from .site_reception import InboundQueue
 
 POLL_NS = 10_000_000
 FLUSH_NS = 80_000_000
@@ -121,7 +121,6 @@ class Recorder:
         return recording
 
     def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Reports that the session begins, or that the recorder joins late."""
         own, now_ns = self._publisher.info, self._clock.monotonic_ns()
         self._publisher.update(running=True)
         text = "the session begins"

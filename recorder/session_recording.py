@@ -21,8 +21,7 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
-from .inbound_queue import InboundQueue
-from .site_reception import SiteMessage, SiteReception
+from .site_reception import InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""
@@ -40,9 +39,7 @@ class Recording:
     """One log and its accounts.
 
     Attributes:
-        dropped: messages that do not belong to the session, by reason.
         accounts: messages of every channel, by its key.
-        epoch: tick 0 of the session, and its members.
         publisher: the recorder's own events; it keeps them in the same queue as other messages.
     """
 
@@ -165,7 +162,6 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Notes another start of a site that a site admits, and how much that heard of the one before."""
         if (
             not isinstance(event, Event)
             or event.kind not in ("admit", LAST)
@@ -291,10 +287,7 @@ class Recording:
             f"/{key}": f"{account.as_text(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
             for key, account in self.accounts.items()
         }
-        return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self._dropped_counts()}}
-
-    def _dropped_counts(self) -> list[tuple[str, int]]:
-        return [(reason, count) for reason, count in self.dropped.items() if count]
+        return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()}}
 
     def summary(self) -> list[str]:
         """Returns a line for every site, and for messages turned away or dropped."""
@@ -315,7 +308,7 @@ class Recording:
         if self._overflowed:
             lines.append(f"recorder: {self._overflowed} messages turned away because the queue was full")
         return lines + [
-            f"recorder: {count} messages dropped: {reason}" for reason, count in self._dropped_counts()
+            f"recorder: {count} messages dropped: {reason}" for reason, count in self.dropped.items()
         ]
 
     def problem(self) -> str | None:

@@ -1,12 +1,16 @@
-"""Reception state of one site at the recorder: messages received, and messages still missing.
+"""What comes to a recorder: the bounded queue of messages, and per site those received and those missing.
 
-Invariant: a message counts only when it is decoded, of this site, of this boot, and has a number that the
-scenario and the clock allow; each such message may imply that others exist. Records and statistics are as
-many as the scenario has ticks, and none is of a tick still to come; of events a log takes so many bytes, and
-the first word of an end all the same.
+Invariant (L6): the queue is bounded, in messages and in bytes, and each key in its share of the bytes, so
+that one member's flood does not displace what the others send; overflow is counted and reported. A message
+counts only when it is decoded, of this site, of this boot, and has a number that the scenario and the clock
+allow; each such message may imply that others exist. Records and statistics are as many as the scenario has
+ticks, and none is of a tick still to come; of events a log takes so many bytes, and the first word of an end
+all the same.
 """
 
 import math
+import threading
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
@@ -14,12 +18,69 @@ from trilat_net.errors import WireError
 from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import CHANNEL_TYPES, SITE_CHANNELS
 from trilat_net.net import topics
+from trilat_net.net.clock import Clock
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
 from trilat_net.net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
+
+CAPACITY = 60_000
+"""Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""
+CAPACITY_BYTES, KEY_BYTES = 96 << 20, 32 << 20
+"""Capacity in bytes, and of messages of one key: a planar arm at 1 kHz makes half a megabyte a second."""
+OVERHEAD_BYTES = 200
+"""What a message takes besides its payload."""
+KEYS = 1_000
+"""Keys whose losses, and whose shares, are counted separately."""
+
+
+class InboundMessage(NamedTuple):
+    """One message: its key, its bytes, and its arrival on the monotonic clock."""
+
+    key: str
+    payload: bytes
+    mono_ns: int
+
+
+class InboundQueue:
+    """A queue between the bus's thread, which takes, and the writer's, which drains."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._queue: deque[InboundMessage] = deque()
+        self._taken, self._drained = Counter[str](), Counter[str]()  # each of one thread, bytes by key
+        self._taken_bytes = self._drained_bytes = 0
+        self._taking = threading.Lock()  # a bus may have several threads
+        self.overflowed: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def take(self, key: str, payload: bytes) -> None:
+        """Stamps and appends one message; called by the bus."""
+        size = len(payload) + OVERHEAD_BYTES
+        with self._taking:
+            of = key if key in self._taken or len(self._taken) < KEYS else "others"
+            waiting = self._taken_bytes - self._drained_bytes, self._taken[of] - self._drained[of]
+            if len(self._queue) >= CAPACITY or waiting[0] >= CAPACITY_BYTES or waiting[1] >= KEY_BYTES:
+                self.overflowed[of] += 1
+                return
+            self._taken[of] += size
+            self._taken_bytes += size
+            self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
+
+    def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
+        """Yields the waiting messages that arrived until an instant, oldest first; all without one."""
+        queue = self._queue
+        while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
+            message = queue.popleft()
+            size = len(message.payload) + OVERHEAD_BYTES
+            self._drained[message.key if message.key in self._taken else "others"] += size
+            self._drained_bytes += size
+            yield message
+
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
 _LEAD_NS, _DRIFT = 2_000_000_000, 1e-3
@@ -35,9 +96,7 @@ class SiteMessage(NamedTuple):
 
     Attributes:
         number: its number in its channel; -1 without one.
-        sequence: its sequence number in the file.
         t_ns: time of sending, ns since the epoch on the sender's clock; negative before it.
-        content: the message itself.
     """
 
     number: int
@@ -50,19 +109,15 @@ class SiteReception:
     """The messages received from one start of one site, and those missing.
 
     Args:
-        scenario: what it runs.
-        name: the site.
         boot: its start; None: it is not there yet.
         before: the reception of the start before, whose ticks this one continues.
 
     Attributes:
-        name: the site.
         accounts: its messages by channel; those of events begin anew with every start.
         event_accounts: those of the starts before.
         made: number of its ticks, once its end event has arrived; else None.
         heard_ns: arrival of its last message, on the recorder's clock; None before.
         since_ns: time since the epoch on that clock: what claims to be later is not believed.
-        period_ns: its tick period.
     """
 
     def __init__(

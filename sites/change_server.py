@@ -86,18 +86,17 @@ class ChangeServer:
                     self._held_up = query
                     break
                 if request.stop_s is not None:
-                    reply = self._stop(k, request.stop_s)
+                    text, tick = self._stop(k, request.stop_s)
                 elif request.mark:
-                    reply = self._mark(k, request.mark)
+                    text, tick = self._mark(k, request.mark), k
                 elif request.order:
                     changes.append(self._order(k, request.order))
                     ordered = True
-                    text = f"{self._site}: {request.order} at tick {k}"
-                    reply = ChangeReply(member=self._site, accepted=True, text=text, tick=k)
+                    text, tick = f"{self._site}: {request.order} at tick {k}", k
                 else:
                     changes.append(self._resolve(request, first))
-                    text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
-                    reply = ChangeReply(member=self._site, accepted=True, text=text, tick=first)
+                    text, tick = f"{self._site} takes it in at tick {k}; it holds from tick {first} on", first
+                reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
             query.answer(encode(reply))
@@ -118,15 +117,13 @@ class ChangeServer:
             query.answer(encode(ChangeReply(member=self._site, accepted=False, text=text)))
         return None
 
-    def _mark(self, k: int, text: str) -> ChangeReply:
+    def _mark(self, k: int, text: str) -> str:
         if len(self.marks) >= MARKS_WAITING:
             raise ScenarioError(f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms")
         self.marks.append((k, text))
-        text = f"{self._site} marks tick {k}"
-        return ChangeReply(member=self._site, accepted=True, text=text, tick=k)
+        return f"{self._site} marks tick {k}"
 
     def _order(self, k: int, order: SiteOrder) -> CoreChange:
-        """Returns an order to the site; refuses one that would have no effect."""
         mode, needed = self._mode(), _NEEDED_MODES.get(order)
         if needed is not None and mode is not needed:
             doing = mode.name.lower()
@@ -136,12 +133,11 @@ class ChangeServer:
         change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
         return to_core_change(self._scenario, change)
 
-    def _stop(self, k: int, stop_s: float) -> ChangeReply:
+    def _stop(self, k: int, stop_s: float) -> tuple[str, int]:
         asked = first_tick_at(round(stop_s * 1e9), self._rate_hz)
         self._stop_tick = min(max(asked, k + 1), self._stop_tick or self._ticks)
         self.stopped = k + 1 >= self._stop_tick
-        text = f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s"
-        return ChangeReply(member=self._site, accepted=True, text=text, tick=self._stop_tick)
+        return f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s", self._stop_tick
 
     def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)

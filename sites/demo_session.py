@@ -53,8 +53,6 @@ class SessionResult:
 
 
 class _Child:
-    """One process of the session; its output goes into a file."""
-
     def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
         self.name = name
         self._signalled = False
@@ -136,7 +134,6 @@ def run_demo(
 
 
 def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interrupt) -> None:
-    """Compiles the code of a tick once for all children, if it must be."""
     layouts = {arm.counts: name for name, arm in scenario.arms.items()}
     chains = any(arm.chain is not None for arm in scenario.arms.values())
     if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
@@ -149,7 +146,6 @@ def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interr
 def _start(
     scenario: Scenario, folder: Path, session: str, endpoints: list[str]
 ) -> tuple[list[_Child], _Child]:
-    """Starts every site and the recorder; their output goes into `processes/`."""
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
     file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)

@@ -14,7 +14,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -75,18 +75,11 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields all findings, one after the other.
-
-    Args:
-        connection: the endpoints of a member, as given.
-        keys: the folder of its keys.
-        folder: where results go.
-        session: a session whose members are asked for their clocks, if any.
-        clock: this machine's.
-        insecure: whether it is known that everybody on the network is trusted.
-    """
+    """Yields all findings, one after the other, by the arguments of `doctor`."""
     yield from examine_keys(keys)
-    owned = _read_keys(keys)
+    owned: MemberKeys | None = None
+    with suppress(UsageError):
+        owned = None if keys is None else read_member_keys(keys)
     yield from examine_links(connection, keys, owned, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
@@ -96,13 +89,6 @@ def examine_machine(
     yield from examine_rights()
     yield examine_rate()
     yield from examine_room(folder)
-
-
-def _read_keys(folder: Path | None) -> MemberKeys | None:
-    try:
-        return None if folder is None else read_member_keys(folder)
-    except UsageError:
-        return None
 
 
 def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
@@ -125,9 +111,8 @@ def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
         yield DoctorFinding("keys", "warn", f"others can look into {folder}: chmod 700 {folder}")
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
-        yield DoctorFinding(
-            "keys", "warn", f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
-        )
+        text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+        yield DoctorFinding("keys", "warn", text)
 
 
 def examine_links(
@@ -139,21 +124,22 @@ def examine_links(
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
-    for place in find_endpoint_addresses(safe.reach(safe.listen)):
-        yield _examine_listening(place)
-    for place in find_endpoint_addresses(safe.reach(safe.connect or ())):
-        if place.startswith("quic/"):
+    sides = [(place, True) for place in find_endpoint_addresses(safe.reach(safe.listen))]
+    sides += [(place, False) for place in find_endpoint_addresses(safe.reach(safe.connect or ()))]
+    for place, listens in sides:
+        if not listens and place.startswith("quic/"):
             yield _examine_quic(place, owned)
+        elif (address := _split_address(place)) is None:
+            yield DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
+        elif listens:
+            yield _examine_listening(place, address)
         else:
-            yield _examine_reaching(place, folder if owned else None)
+            yield _examine_reaching(place, address, folder if owned else None)
     if not safe.listen and not safe.connect:
         yield DoctorFinding("links", "ok", "no endpoints given: --listen and --connect are tried if given")
 
 
-def _examine_listening(place: str) -> DoctorFinding:
-    address = _split_address(place)
-    if address is None:
-        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
+def _examine_listening(place: str, address: tuple[str, int]) -> DoctorFinding:
     try:
         family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         quic = place.startswith("quic/")
@@ -170,10 +156,7 @@ def _examine_listening(place: str) -> DoctorFinding:
     return DoctorFinding("links", "warn", f"{place} would listen unencrypted, to anybody who reaches it")
 
 
-def _examine_reaching(place: str, folder: Path | None) -> DoctorFinding:
-    address = _split_address(place)
-    if address is None:
-        return DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
+def _examine_reaching(place: str, address: tuple[str, int], folder: Path | None) -> DoctorFinding:
     try:
         with socket.create_connection(address, CONNECT_S) as link:
             if not place.startswith("tls/"):
@@ -270,9 +253,8 @@ def examine_rights() -> Iterator[DoctorFinding]:
     for name, start in good.items():
         got = obtained[name].startswith(start)
         help_ = "" if got else "; ticks will be late by milliseconds under load: see compose.realtime.yaml"
-        yield DoctorFinding(
-            "rights", "ok" if got else "warn", f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
-        )
+        text = f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
+        yield DoctorFinding("rights", "ok" if got else "warn", text)
 
 
 def examine_system() -> DoctorFinding:
@@ -316,29 +298,24 @@ class Rehearsal(LoopStats):
     publish_sample = publish_link = report = should_stop = use_slack = attend
 
 
-class HeldRate(NamedTuple):
-    """A rate (Hz), the lateness (us) within which `HELD_SHARE` of its ticks began, and the largest."""
+def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
+    """Runs a site at one rate after the other until one is held, or none.
 
-    rate_hz: int
-    late_us: int
-    largest_us: int
-
-    @property
-    def held(self) -> bool:
-        """True if that is within `HELD_PERIODS`."""
-        return self.late_us <= HELD_PERIODS * 1e6 / self.rate_hz
-
-
-def rehearse_rates(clock: Clock) -> list[HeldRate]:
-    """Runs a site at one rate after the other until one is held, the last is held, or none."""
-    found: list[HeldRate] = []
+    Returns for each its rate, Hz, the lateness within which `HELD_SHARE` of its ticks began, and the largest.
+    """
+    found: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
-        if not found or not found[-1].held:
+        if not found or not is_held(*found[-1][:2]):
             scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
             warm_up(scenario, "s", clock)
             late_us = sorted(Rehearsal(scenario, "s").run(clock))
-            found.append(HeldRate(rate_hz, late_us[int(HELD_SHARE * len(late_us))], late_us[-1]))
+            found.append((rate_hz, late_us[int(HELD_SHARE * len(late_us))], late_us[-1]))
     return found
+
+
+def is_held(rate_hz: int, late_us: int) -> bool:
+    """True if a lateness is within `HELD_PERIODS` of a rate."""
+    return late_us <= HELD_PERIODS * 1e6 / rate_hz
 
 
 _RATES = (
@@ -354,16 +331,15 @@ def examine_rate() -> DoctorFinding:
     done = subprocess.run([sys.executable, "-c", _RATES], capture_output=True, encoding="utf-8", check=False)
     if done.returncode:
         return DoctorFinding("rate", "warn", "could not be measured")
-    *missed, last = (HeldRate(*one) for one in json.loads(done.stdout.splitlines()[-1]))
-    within = f"{HELD_SHARE:.0%} of the ticks began within {last.late_us / 1e3:.2f} ms of their time"
-    text = f"{within}, all within {last.largest_us / 1e3:.1f} ms"
-    if not last.held:
-        return DoctorFinding(
-            "rate", "fail", f"a site alone holds not even {last.rate_hz} Hz: {text}; end other programs"
-        )
-    text = f"a site alone holds {last.rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
+    *missed, (rate_hz, late_us, largest_us) = json.loads(done.stdout.splitlines()[-1])
+    within = f"{HELD_SHARE:.0%} of the ticks began within {late_us / 1e3:.2f} ms of their time"
+    text = f"{within}, all within {largest_us / 1e3:.1f} ms"
+    if not is_held(rate_hz, late_us):
+        text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
+        return DoctorFinding("rate", "fail", text)
+    text = f"a site alone holds {rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
     if missed:
-        text += f"; at {missed[-1].rate_hz} Hz within {missed[-1].late_us / 1e3:.2f} ms: lower rate_hz"
+        text += f"; at {missed[-1][0]} Hz within {missed[-1][1] / 1e3:.2f} ms: lower rate_hz"
     return DoctorFinding("rate", "warn" if missed else "ok", text)
 
 
@@ -379,12 +355,8 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{cores} processors, of which {load:.1f} are busy"
     yield DoctorFinding("processors", "warn" if cores < 2 or load >= cores else "ok", text)
-    if is_core_cached():
-        yield DoctorFinding("core", "ok", "compiled")
-    else:
-        yield DoctorFinding(
-            "core", "warn", "not yet compiled: the first session here begins half a minute later"
-        )
+    cached, late = is_core_cached(), "not yet compiled: the first session here begins half a minute later"
+    yield DoctorFinding("core", "ok" if cached else "warn", "compiled" if cached else late)
 
 
 @dataclass(frozen=True, repr=False)

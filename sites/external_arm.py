@@ -44,7 +44,6 @@ class ExternalArm:
     """The measurements of one arm.
 
     Attributes:
-        newest: the newest measurement, None before the first.
         taken: number of measurements taken; the others are counted in `dropped`, by reason.
     """
 
@@ -153,7 +152,6 @@ class ExternalArm:
         self.taken += 1
 
     def _is_plausible(self, q: Sequence[float], passed_s: float) -> bool:
-        """True if the arm can have gone to `q` in a time from where it was measured last."""
         if self.newest is None:
             return True
         way = [limit * passed_s + STEP_MARGIN_RAD for limit in self._speed_limits]

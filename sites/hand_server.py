@@ -29,17 +29,8 @@ STRONGEST = 10.0
 class HandServer:
     """The live hand of one site.
 
-    Args:
-        site: name of the site.
-        rate_hz: its tick rate.
-        hand: the operator.
-        arm: the site's arm.
-        inbox: the messages.
-        dropped: counts what is refused.
-        angles: returns the joint angles at the tick that is about to be made, rad.
-
-    Attributes:
-        news: who has taken hold and let go that no event names yet: ticks, and sentences.
+    `angles` returns the joint angles at the tick that is about to be made, rad; `news` are ticks, and
+    sentences on who has taken hold and let go that no event names yet.
     """
 
     def __init__(
@@ -82,7 +73,6 @@ class HandServer:
         return step.vector
 
     def _read(self, payload: bytes) -> HandCommand | None:
-        """Returns a message as the state machine takes it; None if it is refused, which is counted."""
         try:
             message = decode(payload, HandMessage)
         except WireError as error:

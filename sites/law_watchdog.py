@@ -48,8 +48,6 @@ class LawWatchdog:
 
     Attributes:
         hiccups: number of ticks at which the law took longer than a tick period.
-        longest_ns: the longest of all ticks.
-        longest_tick: its number.
     """
 
     def __init__(

@@ -131,12 +131,7 @@ class SessionDisplay:
 
 
 class SessionMonitor:
-    """What the sites of a session that is started here say of themselves, on a display.
-
-    Attributes:
-        latest: the newest statistics of each site.
-        records: its newest record.
-    """
+    """What the sites of a session that is started here say of themselves, on a display."""
 
     def __init__(self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay) -> None:
         self.latest: dict[str, LinkStats] = {}

@@ -24,7 +24,6 @@ from trilat_net.core.vectors import Array
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
 from trilat_net.files import require_libraries
 from trilat_net.net import topics
-from trilat_net.net.access_rules import ROLES, ROUTER
 from trilat_net.net.bus import Bus, StampedInbox
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
@@ -36,6 +35,7 @@ from trilat_net.net.connection import (
 from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
 from trilat_net.net.messages import VERSION, PeerSample
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.zenoh_config import ROLES, ROUTER
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
@@ -60,15 +60,8 @@ _HEADER = struct.Struct("<QQqB")
 """Who measures, number of the sample, time of its departure, ns; 1 in an answer."""
 
 
-class _Arrival(NamedTuple):
-    owner: int
-    number: int
-    sent_ns: int
-    answer: int
-
-
-def _read(payload: bytes) -> _Arrival | None:
-    return _Arrival(*_HEADER.unpack_from(payload)) if len(payload) >= _HEADER.size else None
+def _read(payload: bytes) -> tuple[int, ...] | None:
+    return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
@@ -76,9 +69,8 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        sample = _read(payload)
-        if sample is not None and not sample.answer:
-            put(_HEADER.pack(*sample[:3], 1) + payload[_HEADER.size :])
+        if (header := _read(payload)) is not None and not header[-1]:
+            put(_HEADER.pack(*header[:-1], 1) + payload[_HEADER.size :])
 
     bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
 
@@ -90,7 +82,7 @@ class NearEnd:
         self._clock, self._owner, self._number = clock, int.from_bytes(os.urandom(8), "little"), 0
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
-        self._inbox: StampedInbox[_Arrival | None] = bus.stamped(key, clock.monotonic_ns, _read)
+        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(key, clock.monotonic_ns, _read)
 
     def _send(self, size_bytes: int) -> None:
         sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
@@ -99,9 +91,11 @@ class NearEnd:
 
     def _answers(self) -> Iterator[tuple[int, int]]:
         while (entry := self._inbox.poll()) is not None:
-            sample, arrived_ns = entry
-            if sample is not None and sample.answer and sample.owner == self._owner:
-                yield sample.number, arrived_ns - sample.sent_ns
+            header, arrived_ns = entry
+            if header is not None:
+                owner, number, sent_ns, answer = header
+                if answer and owner == self._owner:
+                    yield number, arrived_ns - sent_ns
 
     def meet(self) -> bool:
         """Returns True if the far end answers in time."""
@@ -138,7 +132,6 @@ class NearEnd:
 
 
 def _open(endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool) -> tuple[ZenohBus, str]:
-    """Returns the bus at an endpoint, and the name that an end has there."""
     encrypted = endpoint.startswith(ENCRYPTED)
     if encrypted and keys is None:
         raise UsageError(f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site")
@@ -202,7 +195,6 @@ class ScenarioNeeds(NamedTuple):
 
     Attributes:
         sample_bytes: of a sample of its largest arm.
-        rate_hz: the fastest rate of its sites.
         playout_ms: the least play-out of its links.
         held_ms: for how long every link holds its samples at least, by play-out or a constant delay.
         in_use_ms: the age of samples in use that its own links make; None if theory does not know.
@@ -354,7 +346,6 @@ def ping_benchmark(
 def _measure_endpoint(
     endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, share_s: float
 ) -> Iterator[dict[str, Any]]:
-    """Yields a row per size and rate."""
     bus, member = _open(endpoint, keys, listens=False, insecure=False)
     with closing(bus):
         near = NearEnd(bus, SystemClock(), member)

@@ -21,12 +21,10 @@ class PeerMonitor:
 
     Attributes:
         boots: the members of the session and their boots.
-        recorders: boots of the recorders that are present.
         stored: boots of the recorders that have stored all messages of this site.
         ended_by: text of the event with which a member ended the run for all; "" while none has.
         ended_member: that member.
         away: the sites that have left, by name: when, ns since the epoch, and a sentence.
-        changed: True once a peer has taken in a change.
         admitted: what sites said that were admitted and that the loop has still to take in.
     """
 
@@ -110,7 +108,6 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits another start of a site, or says why not."""
         member, before = event.member, self.boots.get(event.member)
         if event.boots.get(member) != event.boot or self._firsts.get(event.boot) == event.ticks:
             return

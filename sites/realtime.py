@@ -44,7 +44,6 @@ def _set_affinity(cpu: int | None) -> str:
 
 
 def _call_libc(obtained: str, function: str, *arguments: int) -> str:
-    """Calls a function of the C library; returns what it obtained."""
     if not sys.platform.startswith("linux"):
         raise AttributeError
     libc = ctypes.CDLL(None, use_errno=True)
@@ -55,7 +54,6 @@ def _call_libc(obtained: str, function: str, *arguments: int) -> str:
 
 
 def _set_scheduling() -> str:
-    """Requests SCHED_FIFO for this thread, else a better nice value."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError):

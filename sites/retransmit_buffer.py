@@ -27,10 +27,6 @@ class ChannelBuffer:
     """The last messages of one channel; their numbers count from 0. `size_bytes` holds any one message.
 
     The memory is allocated at the start: nothing is allocated while the loop runs.
-
-    Attributes:
-        made: number of messages so far.
-        oldest: number of the oldest message kept.
     """
 
     def __init__(self, capacity: int, size_bytes: int) -> None:

@@ -10,13 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from trilat_net.core.chain import build_chain, place_end_effector, place_joints
-from trilat_net.core.vectors import Vector
 from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.net.access_rules import OPERATOR
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
@@ -31,8 +26,8 @@ from trilat_net.net.discovery import (
 from trilat_net.net.membership import read_records
 from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
-from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .session_ping import PingReport, ping_session
@@ -49,8 +44,11 @@ class RunningSession:
     With a `bus` that reaches it, they use that one and connect no more.
     """
 
-    def __init__(self, name: str, connection: Connection, bus: Bus | None = None) -> None:
-        self.name, self._connection, self._clock, self._bus = name, connection, SystemClock(), bus
+    def __init__(
+        self, name: str, connection: Connection, bus: Bus | None = None, clock: Clock | None = None
+    ) -> None:
+        self.name, self._connection, self._bus = name, connection, bus
+        self._clock = clock or SystemClock()
 
     @contextmanager
     def reach(self, member: str = OPERATOR, timeout_s: float = REPLY_TIMEOUT_S) -> Iterator[Bus]:
@@ -69,26 +67,75 @@ class RunningSession:
             assert bus is not None  # nothing stops it
             yield bus
 
-    def _order(self, sites: Sequence[str], order: OrderName) -> list[str]:
-        with self.reach("" if order == "stop" else OPERATOR) as bus:
-            return read_replies(order_sites(bus, self._clock, self.name, sites, order))
-
     def stop(self, *sites: str) -> list[str]:
         """Stops arms at once, all or some, while the session goes on; as `trilat stop`."""
-        return self._order(sites, "stop")
+        return _read_replies(self.order(sites, "stop"))
 
     def enable(self, *sites: str) -> list[str]:
         """Lets arms that were stopped follow again; as `trilat enable`."""
-        return self._order(sites, "enable")
+        return _read_replies(self.order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
         """Ends the fault of sites, unless its reason is still there; as `trilat reset`."""
-        return self._order(sites, "reset")
+        return _read_replies(self.order(sites, "reset"))
+
+    def order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
+        """Gives some sites an order; () stands for all of them, under `glide` for those that are there.
+
+        Raises:
+            SessionError: the session has not begun or has no such site, or a site does not answer.
+        """
+        with self.reach("" if order == "stop" else OPERATOR) as bus:
+            scenario, found = self._meet_sites(bus)
+            for name in sites:
+                if name not in scenario.names:
+                    known = f"its sites are {', '.join(scenario.names)}"
+                    raise SessionError(f"session {self.name!r} has no site {name!r}; {known}")
+            asked = list(sites) or _list_present(scenario, found)
+            for name in asked:
+                if name not in found or not found[name].running:
+                    state = "has not begun" if name in found else "did not answer"
+                    raise SessionError(f"session {self.name!r}: {name} {state}")
+            request = ChangeRequest(order=order)
+            return [send_change(bus, self._clock, self.name, name, request) for name in asked]
 
     def end(self) -> list[str]:
-        """Ends the session in order; as `trilat stop --end`."""
+        """Ends the session in order, all sites at one time; as `trilat stop --end`.
+
+        Raises:
+            SessionError: the session has not begun, or a site does not answer.
+        """
         with self.reach() as bus:
-            return stop_session(bus, self._clock, self.name)
+            scenario, found = self._meet_sites(bus)
+            asked = _list_present(scenario, found)
+            if lacking := [name for name in asked if name not in found]:
+                raise SessionError(f"session {self.name!r}: {', '.join(lacking)} of its sites did not answer")
+            if waiting := [name for name in asked if not found[name].running]:
+                who = f"{', '.join(waiting)} waits for the others"
+                raise SessionError(f"session {self.name!r} has not begun: {who}")
+            stop_s = max(found[name].ticks / scenario.sites[name].rate_hz for name in asked) + AHEAD_S
+            request = ChangeRequest(stop_s=stop_s)
+            return [send_change(bus, self._clock, self.name, name, request).text for name in asked]
+
+    def _meet_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
+        clock, session = self._clock, self.name
+        found: dict[str, Info] = {}
+        scenario: Scenario | None = None
+        begun_ns = 0
+        for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
+            if scenario is None and info.scenario:
+                scenario = parse_embedded(info.scenario, session)
+            if scenario is not None and info.member in scenario.sites:
+                found[info.member] = info
+                begun_ns = begun_ns or clock.monotonic_ns()
+                gathered = scenario.sites_may_return and clock.monotonic_ns() - begun_ns > GATHER_NS
+                if len(found) == len(scenario.names) or gathered:
+                    return scenario, found
+        if scenario is None:
+            raise SessionError(
+                f"no site of session {session!r} answers; other endpoints are named with --connect"
+            )
+        return scenario, found
 
     def set_link(self, link: str, **to: Any) -> str:
         """Changes keys of a link such as "m1->s", as in `delay_ms=350`; as `trilat set link`."""
@@ -244,101 +291,17 @@ def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenari
         raise UsageError(
             f"nobody can take hold of {site}: the scenario has no operator of kind 'live' there{others}"
         )
-    place = _find_place(scenario.arms[site]) if live.mode != "joint" else tuple
+    place = scenario.arms[site].end_effector if live.mode != "joint" else tuple
     return Hand(bus, clock, session, site, live.actor, place, source)
 
 
-def _find_place(arm: ArmModel) -> Callable[[Vector], Sequence[float]]:
-    """Returns the function that places an arm's end effector by its joint angles."""
-    if arm.chain is None:
-        return arm.end_effector
-    rows, tip = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
-
-    def place(q: Vector) -> Sequence[float]:
-        place_joints(rows, np.asarray(q, dtype=np.float64))
-        return place_end_effector(rows, tip)
-
-    return place
-
-
-def read_replies(replies: Sequence[ChangeReply]) -> list[str]:
-    """Returns what sites replied to an order.
-
-    Raises:
-        RunFailed: one of them refused it.
-    """
+def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
     if refused := [reply.text for reply in replies if not reply.accepted]:
         raise RunFailed("; ".join([*refused, *(reply.text for reply in replies if reply.accepted)]))
     return [reply.text for reply in replies]
-
-
-def order_sites(
-    bus: Bus, clock: Clock, session: str, sites: Sequence[str], order: OrderName
-) -> list[ChangeReply]:
-    """Gives some sites of a session an order, "stop", "enable" or "reset"; () stands for all of them.
-
-    Under `glide` these are the ones that are there: others may have left.
-
-    Raises:
-        SessionError: the session has not begun or has no such site, or a site does not answer.
-    """
-    scenario, found = meet_sites(bus, clock, session)
-    for name in sites:
-        if name not in scenario.names:
-            raise SessionError(
-                f"session {session!r} has no site {name!r}; its sites are {', '.join(scenario.names)}"
-            )
-    asked = list(sites) or _list_present(scenario, found)
-    for name in asked:
-        if name not in found or not found[name].running:
-            raise SessionError(
-                f"session {session!r}: {name} {'has not begun' if name in found else 'did not answer'}"
-            )
-    request = ChangeRequest(order=order)
-    return [send_change(bus, clock, session, name, request) for name in asked]
 
 
 def _list_present(scenario: Scenario, found: dict[str, Info]) -> list[str]:
     """Returns the sites of a session; of one that sites may leave, those that run, if there are any."""
     running = [name for name in scenario.names if name in found and found[name].running]
     return running if running and scenario.sites_may_return else list(scenario.names)
-
-
-def stop_session(bus: Bus, clock: Clock, session: str) -> list[str]:
-    """Asks every site of a session to end at one time; returns what each answers.
-
-    Raises:
-        SessionError: the session has not begun, or a site does not answer.
-    """
-    scenario, found = meet_sites(bus, clock, session)
-    asked = _list_present(scenario, found)
-    lacking = [name for name in asked if name not in found]
-    waiting = [name for name in asked if name in found and not found[name].running]
-    if lacking:
-        raise SessionError(f"session {session!r}: {', '.join(lacking)} of its sites did not answer")
-    if waiting:
-        raise SessionError(f"session {session!r} has not begun: {', '.join(waiting)} waits for the others")
-    stop_s = max(found[name].ticks / scenario.sites[name].rate_hz for name in asked) + AHEAD_S
-    request = ChangeRequest(stop_s=stop_s)
-    return [send_change(bus, clock, session, name, request).text for name in asked]
-
-
-def meet_sites(bus: Bus, clock: Clock, session: str) -> tuple[Scenario, dict[str, Info]]:
-    """Returns a session's scenario, and the sites that have answered."""
-    found: dict[str, Info] = {}
-    scenario: Scenario | None = None
-    begun_ns = 0
-    for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
-        if scenario is None and info.scenario:
-            scenario = parse_embedded(info.scenario, session)
-        if scenario is not None and info.member in scenario.sites:
-            found[info.member] = info
-            begun_ns = begun_ns or clock.monotonic_ns()
-            gathered = scenario.sites_may_return and clock.monotonic_ns() - begun_ns > GATHER_NS
-            if len(found) == len(scenario.names) or gathered:
-                break
-    if scenario is None:
-        raise SessionError(
-            f"no site of session {session!r} answers; other endpoints are named with --connect"
-        )
-    return scenario, found

@@ -40,22 +40,13 @@ class PingReport(Result):
     members: list[dict[str, Any]]
     links: list[dict[str, Any]]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat ping --json`."""
-        return {"session": self.session, "members": self.members, "links": self.links}
-
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per member."""
         return self.members
 
 
 class SessionPing:
-    """One measurement of a session, of `count` round trips to each member; call `poll` until `over`.
-
-    Attributes:
-        infos: identities of the members that answered, by name.
-        links: latest statistics of every running site.
-    """
+    """One measurement of a session, of `count` round trips to each member; call `poll` until `over`."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
         self.infos: dict[str, Info] = {}
@@ -185,10 +176,6 @@ class TopicDelays(Result):
     topic: str
     lasted_s: float
     publishers: list[dict[str, Any]]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat ping --ros2 --json`."""
-        return {"topic": self.topic, "lasted_s": self.lasted_s, "publishers": self.publishers}
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per publisher."""

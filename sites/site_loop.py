@@ -120,7 +120,6 @@ class PeerInbox:
         return Arrival(index, sample.tick, sample.q, sample.qd, delay_us, sample.tau_x, ch)
 
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
-        """True if a peer's arm can be where a sample says, and as fast, after the newest one so far."""
         limits, newest = self._links[index].speed_limit, self._newest[index]
         for speed, limit in zip(sample.qd, limits, strict=True):
             if not abs(speed) <= limit:
@@ -157,9 +156,6 @@ class StateBlock:
     """The records of a site's latest ticks, which recorders get together, and after peers have their samples.
 
     Args:
-        site: the site.
-        boot: its process start.
-        send: publishes the payloads of some records.
         turn: the site's place among those of the scenario, so that sites of one processor take turns.
         single: True if every record is sent with its tick, for the program of an external arm.
 

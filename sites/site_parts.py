@@ -49,11 +49,7 @@ class SiteOptions:
     """How a site takes part in a session.
 
     Attributes:
-        join_timeout_s: how long to wait for the others, s.
-        cpu: the processor to stay on, or None.
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
-        clock_offset_s: injected offset of the clock from the machine's, s.
-        clock_drift_ppm: injected drift of the clock, ppm.
         without: sites without which the session begins; they may join it while it runs.
         leave_timeout_s: how long to go on after a site has left that does not come back, s; None: to the end.
     """
@@ -71,20 +67,7 @@ class SiteOptions:
 
 
 class SiteParts:
-    """One site's parts; attributes of the same names as the arguments, and those made here.
-
-    Attributes:
-        setup: what the site is built from.
-        site: the site, at its start.
-        rings: the peers' records as they arrive.
-        watchdog: steps the site under a user's law; None without one.
-        arm: measurements of its external arm; None without one.
-        switch: its dead-man switch; None without one.
-        hand: whoever holds its arm; None without a live hand.
-        publish_sample: publishes what peers need of a tick.
-        states: the records that recorders have still to get.
-        publish_link: publishes statistics, and keeps them.
-    """
+    """One site's parts; those that its scenario does not ask for are None."""
 
     def __init__(
         self,
@@ -130,7 +113,8 @@ class SiteParts:
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
-        self.changes = ChangeServer(scenario, name, asked, lambda: self.site.mode, self._is_held, stops)
+        inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
+        self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
         warm_up(scenario, name, clock)
 
     def _meet_outside_arm(self) -> None:
@@ -145,9 +129,6 @@ class SiteParts:
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             self.switch = DeadManSwitch(name, ring, self.clock, dropped)
-
-    def _is_held(self) -> bool:
-        return self.switch is None or self.switch.held
 
     def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
         keep = self.buffer.channels[channel].keep

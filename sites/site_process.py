@@ -305,7 +305,6 @@ class RunningSite:
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
-        """Takes in who has come, and gives up where somebody has been away for too long."""
         parts, monitor = self._parts, self._parts.monitor
         monitor.watch(self._publisher, t_ns)
         if monitor.changed:  # 100 ms ago at most: no sample so far is due sooner than before
@@ -344,7 +343,6 @@ class RunningSite:
             self._publisher.publish("last", text, t_ns=t_ns, **about)
 
     def _describe_status(self, output: TickRecord) -> str:
-        """Returns how the site does, in a line."""
         shared = output.shared()[0]
         apart = max(abs(a - b) for a, b in zip(shared, output.q_des, strict=True))
         unit = "m or rad" if output.x else "rad"

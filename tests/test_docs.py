@@ -10,7 +10,7 @@ from typing import get_args
 import pytest
 
 from recorder import backfill, record_process, session_recording
-from recorder.play import pace
+from recorder.play import player
 from sites import change_server, external_arm, law_watchdog, retransmit_buffer, site_process
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
@@ -157,7 +157,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("log-tools.md", "links of a site up to 64 MiB", 64, site_arrays.MAX_LINKS_BYTES / 2**20),
     ("log-tools.md", "of more than 65 536 only", 65_536, site_log.MAX_DECODED_RECORDS),
     ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, difference.TOLERANCE),
-    ("log-tools.md", "sleeps until 150 us before", 150, pace.SPIN_NS / 1e3),
+    ("log-tools.md", "sleeps until 150 us before", 150, player.SPIN_NS / 1e3),
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),
     ("maps/README.md", "took at most 60 s", 60, live_confirmation.MAX_SESSION_S),

@@ -43,7 +43,6 @@ def _open(log: AnyLog) -> Log:
 
 
 def _texts(overrides: Overrides, duration_s: float | None) -> list[str]:
-    """Returns overrides as the command line takes them."""
     from .studies.trials import list_assignments
 
     listed = overrides if isinstance(overrides, list | tuple) else [overrides]

@@ -145,6 +145,12 @@ def is_distribution(value: Any) -> bool:
     return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
+def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
+    """Returns the problem of a refused value, and the path of its key below what was converted."""
+    problem, _, place = str(error).partition(" - at ")
+    return problem, place.strip("`$")
+
+
 def reword_problem(problem: str) -> str:
     """Returns a validation message in the words of a scenario's author."""
     words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))

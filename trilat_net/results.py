@@ -19,11 +19,11 @@ _REPR_LENGTH = 200
 
 
 class Result:
-    """What a command found. A type states `to_dict`, and where a table has more than one row `to_rows`."""
+    """What a command found. A type states `to_dict` where that is not its fields; `to_rows` for many rows."""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of the command's --json."""
-        raise NotImplementedError
+        return dict(vars(self))
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
         """Returns the rows of `to_frame`."""

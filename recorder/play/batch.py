@@ -56,7 +56,6 @@ class MessageBatch:
 
     Attributes:
         rows: time in ns since the epoch, channel, number in the channel, bounds of the payload; shape (K, 5).
-        data: the payloads.
     """
 
     rows: Ints

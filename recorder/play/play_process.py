@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilat_net import process
-from trilat_net.core.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.clock import Clock
+from trilat_net.net.clock import NS_PER_S, Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import open_playback_bus, refuse_running_session
 
 from .batch import MessageBatch
 from .message_source import MessageSource
-from .pace import LatenessSummary, Pace
-from .player import Player, PlayProgress
+from .player import LatenessSummary, Pace, Player, PlayProgress
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
@@ -43,11 +41,8 @@ class PlayOptions:
     """How a log is played.
 
     Attributes:
-        session: name of the session that others see.
         rate: seconds of the log per second; `math.inf`: as fast as all receivers take it.
-        loop: whether to play it round after round.
         low_cpu: whether to sleep to the deadlines.
-        needs_recorder: whether to wait for a recorder.
     """
 
     session: str
@@ -62,16 +57,13 @@ class PlaybackSummary(NamedTuple):
 
     Attributes:
         counts: messages published, by topic of the file.
-        rounds: rounds begun.
         lateness: their lateness; None if they had no deadline.
-        took_s: time from the first message to the last, s.
         held_s: time spent waiting for receivers that did not keep up, s.
         cut: how often a receiver took nothing for 5 s and was cut off.
         strays: messages that stood so far from their turn in the file that they were not played in it.
         recorders: recorders that were present after the last message.
         stored: whether all of them reported that they have everything.
         refilled: messages given again to recorders that had missed them.
-        torn: files that are not whole, and why.
     """
 
     counts: dict[str, int]
@@ -129,7 +121,7 @@ class Playback:
         begun_ns = clock.monotonic_ns() + AHEAD_NS
         if first_ns is not None:
             pace = Pace(begun_ns, first_ns if start_ns is None else start_ns, options.rate)
-            self._stand_ins.begin(pace)
+            self._stand_ins.begin(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
         took_ns = max(0, clock.monotonic_ns() - begun_ns)
         self._stand_ins.attend()
@@ -150,7 +142,6 @@ class Playback:
         )
 
     def _await_recorders(self) -> None:
-        """Waits for announced recorders, and for at least one if the options ask for it."""
         clock, stand_ins = self.clock, self._stand_ins
         if self.options.needs_recorder:
             self.say("waiting for a recorder")
@@ -166,7 +157,6 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
-        """Answers recorders until they have everything, or have asked nothing for a while."""
         clock, stand_ins = self.clock, self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
         while clock.monotonic_ns() < give_up_ns and not self.stopped():

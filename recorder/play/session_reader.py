@@ -10,12 +10,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import msgspec
 
 from trilat_net import process
-from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, ScenarioError, UsageError
 from trilat_net.files import open_regular
 from trilat_net.log.log_layout import (
@@ -28,6 +27,7 @@ from trilat_net.log.log_layout import (
 )
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
+from trilat_net.net.clock import NS_PER_S
 from trilat_net.net.topics import number_message
 from trilat_net.scenario import Scenario, parse_embedded
 
@@ -45,7 +45,6 @@ class PlaySelection:
         channels: the channels that are played; if it includes none by name: those that sites published.
         start_ns: messages before this are not played, ns since the epoch; None: from the first one on.
         stop_ns: messages after this are not played; None: to the last one.
-        time: the time that orders messages.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -72,13 +71,15 @@ def parse_selection(
     start_s: float | None,
     stop_s: float | None,
     duration_s: float | None,
-    time: PlayTime,
+    time: str,
 ) -> PlaySelection:
     """Returns the selection that a user's options describe.
 
     Raises:
         UsageError: the options contradict each other, or one is not valid.
     """
+    if time not in get_args(PlayTime):
+        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {time!r}")
     for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
         if seconds is not None and not (math.isfinite(seconds) and abs(seconds) <= 1e9):
             raise UsageError(f"{name} is a number of seconds, not {seconds:g}")
@@ -91,7 +92,7 @@ def parse_selection(
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
     start_ns, stop_ns = (None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s))
-    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, time)
+    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, cast(PlayTime, time))
 
 
 HORIZON_NS = 70 * NS_PER_S
@@ -125,11 +126,8 @@ class SessionHeader:
     """The session that files hold.
 
     Attributes:
-        scenario_text: the scenario as the files have it.
         version: schema version of the messages; 0 if unknown.
-        boots: the sites' boots, as far as read.
         topics: topics of the channels that are played, by number.
-        torn: unfinished or damaged files, with the reason.
         first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the latest one.
     """
 

@@ -25,7 +25,6 @@ from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillR
 from trilat_net.net.wire import decode, encode
 
 from .batch import MessageBatch
-from .pace import Pace
 from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 _PlayedRun = tuple[Ints, Ints, MessageBatch]
@@ -100,7 +99,6 @@ class SiteStandIns:
     """The stand-ins for all sites of a session, and the recorders that listen.
 
     Attributes:
-        recorders: boots of the recorders that are present.
         refilled: number of messages given to recorders that had missed them.
     """
 
@@ -128,9 +126,8 @@ class SiteStandIns:
             answer_pings(bus, clock, session, info)
             bus.announce(liveliness_token(session, site, info.boot))
 
-    def begin(self, pace: Pace) -> None:
-        """Shows the session as running, with tick 0 at the instant that the pace gives it."""
-        epoch_mono_ns = pace.due_ns(0)
+    def begin(self, epoch_mono_ns: int) -> None:
+        """Shows the session as running, with tick 0 at an instant of the clock."""
         running = {
             "running": True,
             "epoch_mono_ns": epoch_mono_ns,
@@ -162,7 +159,6 @@ class SiteStandIns:
         return False
 
     def _identity(self, site: str) -> bytes:
-        """Returns a site's identity, encoded a little while ago at most."""
         encoded_ns, answer = self._encoded.get(site, (0, b""))
         now_ns = self._clock.monotonic_ns()
         if not answer or now_ns - encoded_ns >= REFRESH_NS:
@@ -175,7 +171,7 @@ class SiteStandIns:
         """Asks the present recorders for their identities; True once all have answered."""
         while (reply := self._recorder_query.poll()) is not None:
             try:
-                self._met.add(str(decode(reply.payload, Info).boot))
+                self._met.add(str(decode(reply[2], Info).boot))
             except WireError:
                 continue  # a stranger's
         if self.recorders - self._met:

@@ -65,20 +65,17 @@ def parses(words: list[str]) -> None:
 
 
 def started(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
-    """Starts a command as a process of its own, with pipes for what it prints."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([*COMMAND, *arguments], cwd=cwd, env=PLAIN, text=True, **pipes)
 
 
 def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -> str:
-    """Makes a log in a folder, with these overrides; returns its name."""
     options = [word for setting in settings for word in ("--set", setting)]
     trilat("sim", scenario, "--duration", seconds, "-o", "run.mcap", *options, cwd=folder)
     return "run.mcap"
 
 
 def trilat(*arguments: str | Path, cwd: Path) -> Done:
-    """Runs a command in a folder to its end; laws that another command may run it may not."""
     allowed_laws.clear()
     out, err = io.StringIO(), io.StringIO()
     code: object = None

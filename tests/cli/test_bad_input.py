@@ -122,7 +122,6 @@ TAKERS = [
 
 
 def write_arms(kind: str, folder: Path) -> list[str]:
-    """Writes a scenario of bad arms; returns its name and overrides, as arguments."""
     text, changes, _ = ARMS[kind]
     written = {"planar": planar_task()}.get(text, six_joints(1.0))
     (folder / "arms.toml").write_text(

@@ -79,7 +79,6 @@ CASES += [(words, code, "beside the log") for words, code in READING]
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a log for every law; where it is no law, the log names the hash of that file."""
     folder = tmp_path_factory.mktemp("logs")
     (folder / "mylaws.py").write_text(LAW)
     with pytest.MonkeyPatch.context() as patch:
@@ -166,13 +165,11 @@ def test_the_table_has_all_that_was_asked_for() -> None:
 
 
 def imports(place: Path) -> list[str]:
-    """The files that were imported."""
     witness = place / "witness"
     return witness.read_text().split(";")[:-1] if witness.exists() else []
 
 
 def test_the_named_file_runs_and_no_other_of_its_name(place: Path) -> None:
-    """Not the module of the working directory, and nothing that Python keeps of the file."""
     (place / "mylaws.py").write_text(FILES["foreign"]["mylaws.py"])
     (place / "kept").mkdir()
     file = place / "kept" / "spring-v1.py"

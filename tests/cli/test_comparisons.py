@@ -13,7 +13,6 @@ from .running import trilat
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two runs of one scenario, one that hangs, and one of another scenario."""
     folder = tmp_path_factory.mktemp("logs")
     quick = ["--set", "rate_hz=100", "--duration"]
     trilat("sim", "free", "-o", "a.mcap", *quick, "2", cwd=folder)

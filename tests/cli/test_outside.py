@@ -19,7 +19,6 @@ SHORT = ("--duration", "0.1")
 
 
 def block(language: str) -> str:
-    """The first block of the page in a language."""
     found = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
     assert found is not None
     return found[1]
@@ -70,7 +69,6 @@ def test_what_page_says_of_law_is_what_law_gets() -> None:
 
 @pytest.fixture
 def law(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """A law in the folder, its module this test's own, and a log of it."""
     name = "".join(letter for letter in request.node.name if letter.isalnum())
     file = tmp_path / f"cli_{name}.py"
     file.write_text("from tests.laws import Adaptive\nclass Law(Adaptive):\n    pass\n")

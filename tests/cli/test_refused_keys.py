@@ -41,7 +41,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def keys(made: Path, tmp_path: Path) -> Path:
-    """A copy of them, whose modes are theirs, that a case may spoil."""
     shutil.copytree(made, tmp_path / "made")
     return tmp_path / "made" / "k"
 
@@ -131,13 +130,10 @@ def test_ones_own_zenoh_settings_do_not_loosen_keys(
 
 
 def take(name: str, source: str) -> Change:
-    """Puts a file of another folder in the place of one's own."""
     return lambda keys: (keys / "m1" / name).write_bytes((keys.parent / source / name).read_bytes())
 
 
 def say(**facts: object) -> Change:
-    """Says something else in the list of members."""
-
     def change(keys: Path) -> None:
         listed = json.loads((keys / "m1" / MEMBERS).read_text())
         (keys / "m1" / MEMBERS).write_text(json.dumps({**listed, **facts}))
@@ -150,8 +146,6 @@ def mode(name: str, bits: int) -> Change:
 
 
 def whole(source: str) -> Change:
-    """Puts another folder in the place of one's own."""
-
     def change(keys: Path) -> None:
         shutil.rmtree(keys / "m1")
         (keys.parent / source / "m1").rename(keys / "m1")

@@ -21,7 +21,6 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1"}
 
 
 def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.CompletedProcess[str]":
-    """Runs a command that may take so much of something."""
     return subprocess.run(
         [*COMMAND, *map(str, words)],
         cwd=cwd,

@@ -16,7 +16,6 @@ OVER = ("--over", "link.delay_ms=0:40:20", "--over", "control.Kd=1:4:1")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a quick scenario and the results of a sweep of it."""
     path = tmp_path_factory.mktemp("sweeps")
     (path / "trio.toml").write_text(SHORT)
     trilat("sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path).succeeds()

@@ -22,7 +22,6 @@ TOO_MUCH = ("--set", "expect.mean_age_max_ms=1.0")
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the quick scenario in it."""
     (tmp_path / "quick.toml").write_text(QUICK)
     return tmp_path
 

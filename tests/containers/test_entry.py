@@ -21,7 +21,6 @@ needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root gives files 
 
 @pytest.fixture
 def mark(tmp_path: Path) -> Path:
-    """A file of the person who starts the containers."""
     path = tmp_path / "compose.yaml"
     path.touch()
     return path

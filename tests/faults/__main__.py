@@ -34,18 +34,15 @@ class Seeds(NamedTuple):
 
     @property
     def failed(self) -> list[tuple[int, Judged]]:
-        """Those in which an invariant did not hold."""
         return [(seed, one) for seed, one in enumerate(self.judged) if one.violations]
 
     def of(self, kind: str) -> list[Judged]:
-        """Those in which a kind of fault happened, or several."""
         if kind == "several":
             return [one for one in self.judged if len(one.faults) > 1]
         return [one for one in self.judged if kind in {fault.kind for fault in one.faults}]
 
 
 def judge_seeds(count: int, jobs: int | None) -> Seeds:
-    """Judges the first seeds, each run twice; says which failed as it comes."""
     judged, took_s = [], 0.0
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         for seed, (one, seed_s) in enumerate(pool.map(time_seed, range(count), chunksize=4)):
@@ -57,7 +54,6 @@ def judge_seeds(count: int, jobs: int | None) -> Seeds:
 
 
 def find_tests(wanted: Sequence[str]) -> list[str]:
-    """The tests of some names, with the files in which they are."""
     files = {
         path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in (ROOT / LIVE).glob("test_*.py")
     }
@@ -72,7 +68,6 @@ def find_tests(wanted: Sequence[str]) -> list[str]:
 
 
 def run_tests(names: Sequence[str]) -> dict[str, str]:
-    """Runs tests; by name how they ended: passed, failed, or skipped."""
     command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", *dict.fromkeys(names)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     ends: dict[str, set[str]] = {}
@@ -85,7 +80,6 @@ def run_tests(names: Sequence[str]) -> dict[str, str]:
 
 
 def describe_row(row: Row, seeds: Seeds, ends: dict[str, str]) -> str:
-    """A row of the page."""
     sessions = [one for kind in row.kinds for one in seeds.of(kind)]
     broken = sum(bool(one.violations) for one in sessions)
     virtual = [f"{len(sessions)} sessions, {broken} violations"] if row.kinds else []
@@ -100,7 +94,6 @@ def describe_row(row: Row, seeds: Seeds, ends: dict[str, str]) -> str:
 
 
 def describe_seeds(seeds: Seeds) -> list[str]:
-    """Figures of all seeds, and what they came by."""
     visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
     holds = [ticks for one in seeds.judged for ticks in one.holds]
     each_s = seeds.took_s / len(seeds.judged)
@@ -138,7 +131,6 @@ def describe_torques(seeds: Seeds) -> str:
 
 
 def main() -> int:
-    """Prints the violations of the seeds; the exit code is 1 if there is one."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=200, help="how many")
     parser.add_argument(

@@ -55,7 +55,6 @@ class ArmSettings(NamedTuple):
 
 
 def draw_settings(seed: int) -> ArmSettings:
-    """What the arms of a seed are given; of two in three, what the matrix says."""
     rng = Random(f"settings {seed}")
     if rng.random() < 2.0 / 3.0:
         return ArmSettings()
@@ -131,7 +130,6 @@ KINDS = {
 
 
 def draw_faults(seed: int, timetable: Timetable = WHOLE) -> list[Fault]:
-    """The faults of a seed, in time."""
     rng = Random(seed)
     names = [name for name in KINDS if name not in timetable.without]
     weights = [KINDS[name].weight for name in names]
@@ -146,7 +144,6 @@ def draw_faults(seed: int, timetable: Timetable = WHOLE) -> list[Fault]:
 
 
 def order_of(fault: Fault) -> tuple[str, ChangeRequest]:
-    """What somebody asks of a site: another delay of a link, or other shares."""
     (site,) = fault.of
     first, second = (name for name in SITES if name != site)
     share = round(0.1 + 0.8 * fault.size, 3)
@@ -173,7 +170,6 @@ def storm_of(fault: Fault) -> list[tuple[float, str, ChangeRequest]]:
 
 
 def describe(faults: Sequence[Fault]) -> str:
-    """The faults in words, one to a line."""
     return "\n".join(
         f"  {fault.at_s:.3f} s: {fault.kind} {' -> '.join(fault.of)} for {fault.for_s:g} s, {fault.size:g}"
         for fault in faults

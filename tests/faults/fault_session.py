@@ -93,11 +93,9 @@ class FaultSession(Session):
         self._stats: dict[str, bytes] = {}
 
     def join(self, name: str) -> Bus:
-        """See `Session`."""
         return self.network.join_as(name)
 
     def live(self, name: str, clock: RelayClock, *parts: Any, **options: Any) -> int:
-        """See `Session`; the next start of a site begins no sooner than this one has ended."""
         try:
             return super().live(name, clock, *parts, **options)
         finally:
@@ -126,7 +124,6 @@ class FaultSession(Session):
                 self._returns(fault)
 
     def _returns(self, fault: Fault) -> None:
-        """Adds a site that will be started again; when is known once the session begins."""
         (name,) = fault.of
         clock, interrupt = self.clocks[name], self.interrupts[name]
         self.site(name, needs_recorder=False, at_ns=NEVER_NS)
@@ -249,17 +246,14 @@ class FaultSession(Session):
             self.relay.happens(at_ns, lambda site=site, asked=asked: self._ask(site, asked))
 
     def _let_go(self) -> None:
-        """What was latched is let go, as an operator does who looks, and looks again."""
         for site in SITES:
             for order in ("reset", "enable"):
                 self._ask(site, ChangeRequest(order=order))
 
     def payloads(self) -> Iterator[bytes]:
-        """All records and events that were published, as they were sent."""
         return chain(*self._payloads.values(), self._events)
 
     def dropped(self) -> Iterator[str]:
-        """Why sites dropped messages, by the last that each said."""
         for payload in self._stats.values():
             yield from decode(payload, LinkStats).dropped
 
@@ -284,7 +278,6 @@ class FaultSession(Session):
 
     @cached_property
     def published(self) -> Published:
-        """What the sites published."""
         published = Published()
         for name, payloads in self._payloads.items():
             for payload in payloads:

@@ -63,7 +63,6 @@ class FaultyNetwork(LocalNetwork):
         """How often somebody has joined, left or subscribed."""
 
     def join_as(self, name: str) -> "FaultyBus":
-        """The connection of a member that has a name."""
         member = FaultyBus(self, name)
         self.changes += 1
         self.members.append(member)
@@ -81,7 +80,6 @@ class FaultyNetwork(LocalNetwork):
         return self._ways[sender, receiver]
 
     def open(self, sender: str, receiver: str) -> bool:
-        """True if messages pass."""
         return self._way(sender, receiver).cut_ns is None
 
     def find_takers(self, sender: LocalBus, name: str, key: str) -> Iterator[tuple[Way, Deliver]]:
@@ -93,7 +91,6 @@ class FaultyNetwork(LocalNetwork):
                         yield self._way(name, _name(member)), sink
 
     def carry(self, way: Way, key: str, payload: bytes, sink: Deliver) -> None:
-        """Takes a message over a way, or does to it what the way does."""
         chance = self._chance
         if way.cut_ns is not None:
             if not way.ended:
@@ -141,7 +138,6 @@ class FaultyNetwork(LocalNetwork):
         way.tokens = frozenset()
 
     def mend(self, sender: str, receiver: str) -> None:
-        """Everything passes again, and first what was kept."""
         way = self.way(sender, receiver)
         kept, now, known = list(way.kept), self._tokens_of(sender), way.tokens
         way.kept.clear()
@@ -157,9 +153,7 @@ class FaultyNetwork(LocalNetwork):
     def _tell_presence(self, tokens: frozenset[str], receiver: str, alive: bool) -> None:
         for token in sorted(tokens):
             for member in self._named(receiver):
-                for expression, ring in member._presence_rings:
-                    if matches_key(expression, token):
-                        ring.put((token, alive))
+                member.tell_presence(token, alive)
 
     def _named(self, name: str) -> Iterator["FaultyBus"]:
         return (one for one in self.members if isinstance(one, FaultyBus) and one.name == name)
@@ -173,30 +167,24 @@ class FaultyBus(LocalBus):
         self.name, self._faulty = name, network
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """See `Bus`."""
         self._faulty.changes += 1
         return super().inbox(key, capacity)
 
     def stamped(
         self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
     ) -> StampedInbox[T]:
-        """See `Bus`."""
         self._faulty.changes += 1
         return super().stamped(key, now_ns, read, capacity)
 
     def tap(self, key: str, callback: Deliver) -> None:
-        """See `Bus`."""
         self._faulty.changes += 1
         super().tap(key, callback)
 
     def close(self) -> None:
-        """See `Bus`."""
         self._faulty.changes += 1
         super().close()
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
-        """See `Bus`."""
-
         takers: list[tuple[Way, Deliver]] = []
         known = -1
 
@@ -229,9 +217,7 @@ class FaultyBus(LocalBus):
     def _notify(self, token: str, alive: bool) -> None:
         for member in self._faulty.members:
             if member is not self and self._faulty.open(self.name, _name(member)):
-                for expression, ring in member._presence_rings:
-                    if matches_key(expression, token):
-                        ring.put((token, alive))
+                member.tell_presence(token, alive)
 
 
 def _name(member: LocalBus) -> str:

@@ -39,7 +39,6 @@ QUICK_ENOUGH_NM_S = 300.0
 
 
 def stretches(states: Sequence[State]) -> Iterator[list[State]]:
-    """The records of each start of a site."""
     for _, of_boot in groupby(states, key=lambda state: state.boot):
         yield list(of_boot)
 
@@ -243,7 +242,6 @@ TELEMETRY = {"late_us": 0, "busy_us": 0, "sent_ns": 0, "echo": []}
 
 
 def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int]:
-    """The ticks of records in a log that were not published so, telemetry aside."""
     made = {state.tick: state for state in published}
     others = [state for state in there if made.get(state.tick) != state]
     same = msgspec.structs.replace

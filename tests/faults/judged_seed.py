@@ -47,7 +47,6 @@ class Judged(NamedTuple):
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
-    """Judges the faults of a seed; `again` runs them twice and compares."""
     faults, arms = draw_faults(seed, timetable), draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS
     return judge_faults(faults, seed, again=again, timetable=timetable, arms=arms)
 
@@ -67,7 +66,6 @@ def judge_faults(
     timetable: Timetable = WHOLE,
     arms: ArmSettings = DEFAULT_ARMS,
 ) -> Judged:
-    """Judges some faults; chance in the network comes from the seed."""
     undisturbed_nm = find_undisturbed_step(timetable)
     with collector_at_rest():
         with tempfile.TemporaryDirectory() as folder:
@@ -122,7 +120,6 @@ def digest_session(session: FaultSession) -> str:
 
 
 def count_visited(session: FaultSession) -> Counter[str]:
-    """What happened in a session, by name."""
     visited: Counter[str] = Counter()
     for states in session.published.states.values():
         before = ""

@@ -31,27 +31,23 @@ def _with_records(change: Callable[[TickRecord], TickRecord]) -> AbstractContext
     return mock.patch.object(Site, "step", lambda site, inputs: change(step(site, inputs)))
 
 
-@contextmanager
-def waits_too_long() -> Iterator[None]:
+def waits_too_long() -> AbstractContextManager[Any]:
     """A silence of 60 ms is no silence yet."""
 
     def slower(setup: SiteSetup) -> SiteSetup:
         rule = setup.on_stale
         return setup._replace(on_stale=rule._replace(age_ns=3 * rule.age_ns))
 
-    with _with_setups(slower):
-        yield
+    return _with_setups(slower)
 
 
-@contextmanager
-def follows_at_once() -> Iterator[None]:
+def follows_at_once() -> AbstractContextManager[Any]:
     """Sites begin to follow without waiting or aligning."""
 
     def at_once(setup: SiteSetup) -> SiteSetup:
         return setup._replace(on_stale=setup.on_stale._replace(action=StaleAction.USE))
 
-    with _with_setups(at_once):
-        yield
+    return _with_setups(at_once)
 
 
 @contextmanager
@@ -66,16 +62,14 @@ def jumps_back() -> Iterator[None]:
         yield
 
 
-@contextmanager
-def learns_the_wrong_way() -> Iterator[None]:
+def learns_the_wrong_way() -> AbstractContextManager[Any]:
     """The estimate goes up the gradient."""
 
     def wrong(setup: SiteSetup) -> SiteSetup:
         gains = setup.gains
         return setup._replace(gains=gains._replace(Gamma=tuple(-gain for gain in gains.Gamma)))
 
-    with _with_setups(wrong):
-        yield
+    return _with_setups(wrong)
 
 
 def _with_rest(change: Callable[[RestGains], RestGains]) -> AbstractContextManager[Any]:
@@ -83,75 +77,60 @@ def _with_rest(change: Callable[[RestGains], RestGains]) -> AbstractContextManag
     return _with_setups(lambda setup: setup._replace(rest=change(setup.rest)))
 
 
-@contextmanager
-def feeds_what_moves() -> Iterator[None]:
+def feeds_what_moves() -> AbstractContextManager[Any]:
     """Of an arm that comes to rest the brake pushes."""
-    with _with_rest(lambda rest: rest._replace(damping=tuple(-0.1 * B for B in rest.damping))):
-        yield
+    return _with_rest(lambda rest: rest._replace(damping=tuple(-0.1 * B for B in rest.damping)))
 
 
 def _with_slower_rest(share: float) -> AbstractContextManager[Any]:
     return _with_rest(lambda rest: rest._replace(deceleration=tuple(share * a for a in rest.deceleration)))
 
 
-@contextmanager
-def creeps_on() -> Iterator[None]:
+def creeps_on() -> AbstractContextManager[Any]:
     """An arm comes to rest a hundred times as slowly as it is said to."""
-    with _with_slower_rest(0.01):
-        yield
+    return _with_slower_rest(0.01)
 
 
-@contextmanager
-def goes_too_far() -> Iterator[None]:
+def goes_too_far() -> AbstractContextManager[Any]:
     """An arm comes to rest over ten times the way that it is said to take."""
-    with _with_slower_rest(0.1):
-        yield
+    return _with_slower_rest(0.1)
 
 
-@contextmanager
-def exceeds_its_limit() -> Iterator[None]:
+def exceeds_its_limit() -> AbstractContextManager[Any]:
     """Now and then a torque leaves without its limit."""
 
     def beyond(record: TickRecord) -> TickRecord:
         return record._replace(tau=[1e4, 0.0]) if record.tick % 1500 == 1200 else record
 
-    with _with_records(beyond):
-        yield
+    return _with_records(beyond)
 
 
-@contextmanager
-def says_an_older_sample() -> Iterator[None]:
+def says_an_older_sample() -> AbstractContextManager[Any]:
     """Now and then a record names an older sample than the one before."""
 
     def older(record: TickRecord) -> TickRecord:
         used = [max(-1, tick - 100) for tick in record.used]
         return record._replace(used=used) if record.tick % 1500 == 1200 else record
 
-    with _with_records(older):
-        yield
+    return _with_records(older)
 
 
-@contextmanager
-def never_admits_again() -> Iterator[None]:
+def never_admits_again() -> AbstractContextManager[Any]:
     """A site that comes back stays a stranger to the others."""
-    with mock.patch.object(PeerMonitor, "_consider", return_value=None):
-        yield
+    return mock.patch.object(PeerMonitor, "_consider", return_value=None)
 
 
-@contextmanager
-def begins_at_zero() -> Iterator[None]:
+def begins_at_zero() -> AbstractContextManager[Any]:
     """A site that comes back counts its ticks from 0."""
     begin = RunningSite.__init__
 
     def at_zero(site: RunningSite, parts: Any, publisher: Any, pinger: Any, epoch: Epoch) -> None:
         begin(site, parts, publisher, pinger, epoch._replace(first=0))
 
-    with mock.patch.object(RunningSite, "__init__", at_zero):
-        yield
+    return mock.patch.object(RunningSite, "__init__", at_zero)
 
 
-@contextmanager
-def loses_records() -> Iterator[None]:
+def loses_records() -> AbstractContextManager[Any]:
     """The recorder forgets a message in a thousand."""
     add, count = LogParts.add, 0
 
@@ -160,12 +139,10 @@ def loses_records() -> Iterator[None]:
         count += 1
         return None if count % 1000 == 999 else add(log, *message)
 
-    with mock.patch.object(LogParts, "add", forgetful):
-        yield
+    return mock.patch.object(LogParts, "add", forgetful)
 
 
-@contextmanager
-def depends_on_chance() -> Iterator[None]:
+def depends_on_chance() -> AbstractContextManager[Any]:
     """The order of arrivals is another one in every run."""
     drain = PeerInbox.drain
 
@@ -174,11 +151,10 @@ def depends_on_chance() -> Iterator[None]:
         random.shuffle(arrivals)
         return arrivals
 
-    with mock.patch.object(PeerInbox, "drain", shuffled):
-        yield
+    return mock.patch.object(PeerInbox, "drain", shuffled)
 
 
-PLANTED: Sequence[tuple[Callable[[], AbstractContextManager[None]], str]] = (
+PLANTED: Sequence[tuple[Callable[[], AbstractContextManager[Any]], str]] = (
     (follows_at_once, "I1 edges"),
     (exceeds_its_limit, "I2 limits"),
     (waits_too_long, "I3, I7 silence"),

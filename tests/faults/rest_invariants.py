@@ -54,7 +54,6 @@ class Rest(NamedTuple):
     blend: int
 
     def rows(self, key: str) -> np.ndarray:
-        """A vector of every record."""
         return np.array([getattr(state, key) for state in self.states])
 
     @property

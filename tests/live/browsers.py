@@ -29,13 +29,11 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt
 
 
 def launch(playwright: Playwright, *, gl: bool = True) -> Browser:
-    """A browser without a window, with WebGL by software or without any."""
     drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if gl else ("--disable-3d-apis",)
     return playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *drawing])
 
 
 def chromium_pid() -> int:
-    """The first process of the browser that a test of this process has started."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -46,7 +44,6 @@ def chromium_pid() -> int:
 
 
 def _descends(pid: int) -> bool:
-    """True if a process is below this one."""
     while pid > 1:
         if pid == os.getpid():
             return True
@@ -56,7 +53,6 @@ def _descends(pid: int) -> bool:
 
 @contextmanager
 def browser_page(url: str, *, gl: bool = True, **options: Any) -> Iterator[Page]:
-    """A page of a browser at an address; it fails for every error that the page reports."""
     with sync_playwright() as playwright:
         browser = launch(playwright, gl=gl)
         try:
@@ -71,7 +67,6 @@ def browser_page(url: str, *, gl: bool = True, **options: Any) -> Iterator[Page]
 
 
 def page_address(process: Process) -> str:
-    """The address that a process of `trilat live` prints."""
     process.prints("the page: ")
     found = re.search(r"the page: (\S+)", process.text())
     assert found is not None
@@ -79,12 +74,10 @@ def page_address(process: Process) -> str:
 
 
 def shows(page: Page, expression: str, timeout_s: float = 30.0) -> Any:
-    """The first true value of a JavaScript expression."""
     return until(lambda: page.evaluate(expression), timeout_s)
 
 
 def tip_px(page: Page, arm: int) -> tuple[float, float]:
-    """Where an end effector is on the screen."""
     x, y = page.evaluate(
         """(n) => { const card = trilat.parts.arms.cards[n], box = card.canvas.getBoundingClientRect();
         const tip = card.project(trilat.frame.sites[card.name].points.at(-1));

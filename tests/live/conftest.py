@@ -26,7 +26,6 @@ def processes_find_the_laws_of_tests_and_no_sessions_but_their_own(
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    """Where a test starts processes; none of them outlives it."""
     made = Stage(tmp_path)
     yield made
     made.clear()
@@ -34,7 +33,6 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.fixture
 def apart() -> Iterator[Machines]:
-    """Machines; none of them, and no cable, outlives the test."""
     try:
         with machines() as made:
             yield made

@@ -27,7 +27,6 @@ class NoNamespaces(Exception):  # noqa: N818 - it names a reason
 
 
 def ip(*words: str) -> None:
-    """Runs the tool `ip`."""
     done = subprocess.run(["ip", *words], capture_output=True, text=True, timeout=30)
     if done.returncode:
         raise NoNamespaces(f"ip {' '.join(words)}: {done.stderr.strip()}")
@@ -49,18 +48,15 @@ class Machines:
         self._spaces: dict[str, str] = {}
 
     def add(self, name: str) -> None:
-        """Adds a machine with no cable in it."""
         space = f"trilat-{os.getpid()}-{next(_numbers)}"
         ip("netns", "add", space)
         self._spaces[name] = space
         self.ip(name, "link", "set", "lo", "up")
 
     def ip(self, name: str, *words: str) -> None:
-        """Runs `ip` on a machine."""
         ip("-n", self._spaces[name], *words)
 
     def cable(self, one: str, other: str) -> tuple[str, str]:
-        """Joins two machines; returns the names of both ends."""
         number = next(_numbers)
         ends = f"t{number}a", f"t{number}b"
         there = ("netns", self._spaces[other])
@@ -77,7 +73,6 @@ class Machines:
             self.ip(here, "route", "add", "blackhole", self.address[there])
 
     def mend(self, one: str, other: str) -> None:
-        """Ends `part`."""
         for here, there in ((one, other), (other, one)):
             self.ip(here, "route", "del", "blackhole", self.address[there])
 
@@ -87,13 +82,7 @@ class Machines:
         Raises:
             NoNamespaces: there is no `iptables`, or it may not.
         """
-        rule = ("iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
-        try:
-            done = subprocess.run([*self.on(name), *rule], capture_output=True, text=True, timeout=30)
-        except FileNotFoundError as error:
-            raise NoNamespaces(str(error)) from None
-        if done.returncode:
-            raise NoNamespaces(f"{' '.join(rule)}: {done.stderr.strip()}")
+        self._use(name, "iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
 
     def shape(self, name: str, *queue: str) -> None:
         """Puts all that a machine sends into a queue of the tool `tc`; nothing of it is lost by another one.
@@ -101,7 +90,9 @@ class Machines:
         Raises:
             NoNamespaces: there is no `tc`, or its kernel has no such queue.
         """
-        words = ("tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
+        self._use(name, "tc", "qdisc", "replace", "dev", self.end[name], "root", *queue)
+
+    def _use(self, name: str, *words: str) -> None:
         try:
             done = subprocess.run([*self.on(name), *words], capture_output=True, text=True, timeout=30)
         except FileNotFoundError as error:
@@ -177,7 +168,6 @@ def reaches(made: Machines, name: str, address: str) -> bool:
 
 
 def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """All pairs, both ways."""
     return [pair for two in combinations(names, 2) for pair in (two, two[::-1])]
 
 

@@ -15,7 +15,6 @@ PATIENCE_S = 60.0
 
 @contextmanager
 def page_client(address: str) -> Iterator["PageClient"]:
-    """A page at an address."""
     with connect(f"ws://{urlsplit(address).netloc}/socket", max_size=None) as socket:
         yield PageClient(socket)
 
@@ -33,18 +32,15 @@ class PageClient:
         self.hello: dict[str, Any] = {}
 
     def send(self, **message: Any) -> None:
-        """Sends a message."""
         self.socket.send(json.dumps(message))
 
     def take(self) -> dict[str, Any]:
-        """Takes the next frame, or greeting, and returns the newest frame."""
         message = json.loads(self.socket.recv(PATIENCE_S))
         self.hello, self.frame = (message["hello"], {}) if "hello" in message else (self.hello, message)
         self.send(do="seen", n=self.hello["n"] if "hello" in message else message["n"])
         return self.frame
 
     def shows(self, mode: str) -> None:
-        """Returns once every site is in a mode."""
         clock = SystemClock()
         give_up_ns = clock.monotonic_ns() + int(PATIENCE_S * 1e9)
         while {site["mode"] for site in self.take().get("sites", {}).values()} != {mode}:

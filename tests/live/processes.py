@@ -78,11 +78,9 @@ class Process:
         self.pid = self._process.pid
 
     def text(self) -> str:
-        """All that it has printed."""
         return self._printed.read_text(encoding="utf-8", errors="replace")
 
     def prints(self, sentence: str) -> None:
-        """Returns once it has printed a sentence."""
         until(lambda: sentence in self.text() or self.ended(), PATIENCE_S)
         assert sentence in self.text(), self
 
@@ -94,13 +92,11 @@ class Process:
             self._process.send_signal(number)
 
     def code(self, timeout_s: float = PATIENCE_S) -> int:
-        """Its exit code, once it has ended by itself."""
         until(self.ended, timeout_s)
         assert "Traceback" not in self.text(), self
         return int(self._process.returncode)
 
     def children(self) -> dict[int, str]:
-        """Its child processes: their command lines by their ids."""
         children = {}
         for pid in Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split():
             with contextlib.suppress(OSError):
@@ -110,7 +106,6 @@ class Process:
         return children
 
     def end(self) -> None:
-        """Ends it, whatever it is doing."""
         for number in (signal.SIGCONT, signal.SIGINT, signal.SIGKILL):
             self.signal(number)
             with contextlib.suppress(AssertionError):
@@ -122,7 +117,6 @@ class Process:
 
 
 def gone(pid: int) -> bool:
-    """True where no process has that id."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -131,8 +125,6 @@ def gone(pid: int) -> bool:
 
 
 class Stage:
-    """A folder and the processes that a test has started in it."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._started: list[Process] = []
@@ -172,12 +164,10 @@ class Session:
         return ["--listen", own, *connections(self.endpoints[:place])]
 
     def site(self, name: str, *more: str, called: str = "") -> Process:
-        """Starts a site."""
         words = ("site", name, "--scenario", self._scenario, *self._options)
         return self._start(name, words, more, called or name)
 
     def recorder(self, *more: str, called: str = "recorder", log: Path | None = None) -> Process:
-        """Starts the recorder, or one more of them."""
         return self._start("recorder", ("record", "-o", str(log or self.log)), more, called)
 
     def _start(self, name: str, words: Sequence[str], more: Sequence[str], called: str) -> Process:
@@ -186,7 +176,6 @@ class Session:
         return self.processes[called]
 
     def all(self, *order: str) -> None:
-        """Starts every member, in an order."""
         for name in order or ("recorder", *self.sites):
             if name == "recorder":
                 self.recorder()
@@ -194,11 +183,9 @@ class Session:
                 self.site(name, "--needs-recorder")
 
     def ends_well(self) -> None:
-        """Returns once every member has ended, each with 0."""
         assert self.codes() == dict.fromkeys(self.processes, 0)
 
     def is_reproduced(self) -> Log:
-        """Runs it to its end; its log, which is whole and executed again, equal to virtual time."""
         self.ends_well()
         log = whole(self.log)
         executed_again(log)
@@ -206,26 +193,21 @@ class Session:
         return log
 
     def begun(self) -> None:
-        """Returns once every member is in the session."""
         for process in self.processes.values():
             process.prints(BEGUN)
 
     def recording(self) -> None:
-        """Returns once records are in the log."""
         recorded(self.log)
 
     def codes(self) -> dict[str, int]:
-        """How every member ended."""
         return {name: process.code() for name, process in self.processes.items()}
 
 
 def recorded(log: Path) -> None:
-    """Returns once records are in a log."""
     until(lambda: size(log) > 60_000, PATIENCE_S)  # its head is a third of that
 
 
 def size(log: Path) -> int:
-    """Bytes of a log, finished or not; 0 where there is none."""
     for path in (active_path(log), log):
         with contextlib.suppress(FileNotFoundError):
             return path.stat().st_size
@@ -237,7 +219,6 @@ def connections(endpoints: Sequence[str]) -> list[str]:
 
 
 def whole(*paths: Path, in_full: bool = True) -> Log:
-    """The log of a session that ended in order: every record of every tick that was made is there."""
     log = open_log(*paths)
     assert log.complete
     for name in log.sites:
@@ -280,7 +261,6 @@ def equal_to_virtual_time(log: Log) -> None:
 
 
 def pause(time_s: float) -> None:
-    """Lets a session go on for a time."""
     clock = SystemClock()
     clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
 
@@ -324,7 +304,6 @@ class Holder:
         return b"holds" in self._printed.read_bytes()
 
     def end(self) -> None:
-        """Kills it."""
         self._process.kill()
         self._process.wait()
 

@@ -35,7 +35,6 @@ class SmallDisk:
         self.before = ("nsenter", f"--mount=/proc/{self._holder.pid}/ns/mnt", f"--wd={folder.parent}")
 
     def seen(self, path: Path) -> Path:
-        """Where a file on it is for everybody else."""
         return Path(f"/proc/{self._holder.pid}/root{path}")
 
     def remove(self) -> None:

@@ -24,12 +24,10 @@ def demo(stage: Stage, duration: str = "3") -> Process:
 
 
 def child(demo: Process, words: str) -> int:
-    """The id of the demo's child with these words in its command line."""
     return until(lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30)
 
 
 def recording(stage: Stage) -> Path:
-    """The demo's log, once records are in it."""
     log = stage.folder / "out" / "run.mcap"
     recorded(log)
     return log

@@ -69,7 +69,6 @@ def held(session: Session, seconds: float, orders: Sequence[Sequence[str]], page
 
 
 def hold_by_page(session: Session, moves: int) -> None:
-    """A pointer on a page takes the slave, leads it about and lets go."""
     server = session.stage.start(
         "page", "live", "--session", "t", "--no-browser", *connections(session.endpoints)
     )

@@ -72,8 +72,6 @@ requests = st.binary(max_size=60) | st.builds(
 
 
 def exhaust(strategy: st.SearchStrategy[Any], count: int, act: Callable[[Any], None]) -> None:
-    """Acts on so many examples."""
-
     @settings(max_examples=count, deadline=None, database=None)
     @given(strategy)
     def each(example: object) -> None:
@@ -92,7 +90,6 @@ def is_foreign(message: dict[str, Any]) -> bool:
 
 
 def answer_to(address: str, request: bytes) -> bytes:
-    """The first bytes of the answer to a request, which ends with it."""
     place = urlsplit(address)
     with socket.create_connection((place.hostname, place.port), 30.0) as there:
         there.sendall(request)
@@ -143,7 +140,6 @@ ANSWERS = [b"HTTP/1.1 " + code for code in (b"200", b"400", b"403", b"404", b"41
 
 
 def send_all(page: PageClient, count: int) -> int:
-    """Sends so many messages, no faster than a page may; returns how many named what is not there."""
     foreign = sent = 0
 
     def send(message: dict[str, Any]) -> None:

@@ -26,7 +26,6 @@ def many(folder: Path, count: int) -> Path:
 
 
 def demo(stage: Stage, *words: str) -> tuple[Process, Log]:
-    """What a person starts, to its end, and its log."""
     running = stage.start("demo", "demo", *words, "--duration", "10", "--out", str(stage.folder / "out"))
     assert running.code(PATIENCE_S) == 0, running
     return running, open_log(stage.folder / "out" / "run.mcap")

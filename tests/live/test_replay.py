@@ -60,7 +60,6 @@ def test_a_replayed_and_recorded_log_is_the_same_bytes(live: bool, stage: Stage)
 
 
 def virtual_log(folder: Path) -> Path:
-    """A second of two sites."""
     path = folder / "virtual.mcap"
     path.write_bytes(recorded("two_sites", {"duration_s": 1.0}))
     return path

@@ -7,8 +7,8 @@ import pytest
 from tests.net.certificates import Certificates
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.log.log_reader import open_log
-from trilat_net.net.access_rules import OPERATOR, RECORDER, ROUTER
 from trilat_net.net.member_keys import create_keys
+from trilat_net.net.zenoh_config import OPERATOR, RECORDER, ROUTER
 
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
@@ -16,8 +16,6 @@ SITES = ("m", "s")
 
 
 class Routed(Session):
-    """A session of two sites that go through a router."""
-
     def __init__(self, stage: Stage, duration: str, protocol: str = "tcp", *network: str) -> None:
         super().__init__(stage, "two_sites", SITES, "--duration", duration)
         self.endpoint = self.recorder_endpoint.replace("tcp", protocol)
@@ -35,8 +33,6 @@ class Routed(Session):
 
 
 class Keyed(Routed):
-    """The same with a key for each."""
-
     def __init__(self, stage: Stage, duration: str) -> None:
         super().__init__(stage, duration, "tls")
         create_keys(stage.folder / "keys", [*SITES, RECORDER, ROUTER], [], 1)

@@ -64,7 +64,6 @@ def live(stage: Stage, scenario: str, *options: str) -> Process:
 
 
 def run(stage: Stage, *words: str) -> Process:
-    """A command that ends with 0."""
     done = stage.start(f"{words[0]}-{len(list(stage.folder.iterdir()))}", *words)
     assert done.code() == 0, done
     return done

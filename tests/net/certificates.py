@@ -10,8 +10,6 @@ NAMES = "subjectAltName=DNS:localhost,IP:127.0.0.1"
 
 
 class Certificates:
-    """Files of an authority and of a machine, made by `openssl`."""
-
     def __init__(self, folder: Path) -> None:
         self.authority, self.certificate, self.key = (
             folder / name for name in ("ca.pem", "machine.pem", "machine.key")
@@ -34,7 +32,6 @@ class Certificates:
         )
 
     def zenoh_file(self) -> Path:
-        """Writes a configuration by which members prove to each other who they are."""
         file = self.authority.with_name("zenoh.json5")
         file.write_text(
             f"""{{ transport: {{ link: {{ tls: {{ // both show a certificate of the same authority

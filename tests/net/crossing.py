@@ -17,18 +17,14 @@ def queueing(floor_us: float, mean_us: float) -> Delay:
 
 @dataclass
 class Other:
-    """Another clock: what it reads when the own one reads t is t + offset + drift (t - 0) + wander."""
-
     offset_ns: int
     drift_ppb: float
     wander: Callable[[int], float] = field(default=lambda _: 0.0)
 
     def offset(self, own_ns: int) -> float:
-        """How far it is ahead at a reading of the own clock, ns."""
         return self.offset_ns + own_ns * self.drift_ppb / S + self.wander(own_ns)
 
     def reads(self, own_ns: int) -> int:
-        """What it reads when the own clock reads `own_ns`."""
         return round(own_ns + self.offset(own_ns))
 
 

@@ -18,8 +18,6 @@ from trilat_net.net.bus import (
 
 
 class _LocalQuery(NamedTuple):
-    """A query inside one process."""
-
     key: str
     payload: bytes
     replies: BoundedRing[tuple[str, bytes]]
@@ -29,21 +27,16 @@ class _LocalQuery(NamedTuple):
 
 
 class LocalNetwork:
-    """The network of the `LocalBus`es of one process."""
-
     def __init__(self) -> None:
         self.members: list[LocalBus] = []
 
     def join(self) -> "LocalBus":
-        """Returns the connection of a new member."""
         member = LocalBus(self)
         self.members.append(member)
         return member
 
 
 class LocalBus:
-    """A `Bus` inside one process, without delay and without loss; made by `LocalNetwork.join`."""
-
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
         self._sinks: list[tuple[str, Callable[[str, bytes], None]]] = []
@@ -63,7 +56,6 @@ class LocalBus:
         return publish
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """See `Bus`."""
         ring = BoundedRing[tuple[str, bytes]](capacity)
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
@@ -71,24 +63,19 @@ class LocalBus:
     def stamped(
         self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
     ) -> StampedInbox[T]:
-        """See `Bus`."""
         ring = StampingRing(now_ns, read, capacity)
         self._sinks.append((key, lambda _, payload: ring.take(payload)))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """See `Bus`."""
         self._sinks.append((key, callback))
 
     def questions(self, key: str) -> QueryInbox:
-        """See `Bus`."""
         ring = BoundedRing[Query]()
         self._responders.append((key, ring.put))
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """See `Bus`."""
-
         def answer_at_once(query: _LocalQuery) -> None:
             answered = answer(query.payload)
             if answered is not None:
@@ -97,7 +84,6 @@ class LocalBus:
         self._responders.append((key, answer_at_once))
 
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
-        """See `Bus`."""
         replies = BoundedRing[tuple[str, bytes]]()
         for member in self._network.members:
             for answered, take in member._responders:
@@ -106,12 +92,10 @@ class LocalBus:
         return replies
 
     def announce(self, key: str) -> None:
-        """See `Bus`."""
         self._tokens.append(key)
         self._notify(key, True)
 
     def presence(self, key: str) -> PresenceInbox:
-        """See `Bus`."""
         ring = BoundedRing[tuple[str, bool]]()
         for member in self._network.members:
             for token in member._tokens:
@@ -121,7 +105,6 @@ class LocalBus:
         return ring
 
     def close(self) -> None:
-        """See `Bus`."""
         if self in self._network.members:
             self._network.members.remove(self)
             for token in self._tokens:
@@ -129,6 +112,10 @@ class LocalBus:
 
     def _notify(self, token: str, alive: bool) -> None:
         for member in self._network.members:
-            for expression, ring in member._presence_rings:
-                if member is not self and matches_key(expression, token):
-                    ring.put((token, alive))
+            if member is not self:
+                member.tell_presence(token, alive)
+
+    def tell_presence(self, token: str, alive: bool) -> None:
+        for expression, ring in self._presence_rings:
+            if matches_key(expression, token):
+                ring.put((token, alive))

@@ -9,17 +9,13 @@ class ManualClock:
         self._epoch_unix_ns = epoch_unix_ns
 
     def monotonic_ns(self) -> int:
-        """See `Clock`."""
         return self._now_ns
 
     def unix_ns(self) -> int:
-        """See `Clock`."""
         return self._epoch_unix_ns + self._now_ns
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`."""
         self._now_ns = max(self._now_ns, deadline_ns)
 
     def identity(self) -> str:
-        """See `Clock`."""
         return "manual"

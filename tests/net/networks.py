@@ -24,8 +24,6 @@ class Network(Protocol):
 
 
 class Local:
-    """Members of one process."""
-
     def __init__(self) -> None:
         self._network = LocalNetwork()
 
@@ -38,8 +36,6 @@ class Local:
 
 
 class Connected:
-    """Zenoh sessions, each of which has met those before it."""
-
     def __init__(self) -> None:
         self._members: list[Bus] = []
 
@@ -54,8 +50,6 @@ class Connected:
 
 
 class Mesh(Connected):
-    """A full mesh on loopback, of at most SEATS members."""
-
     def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
         super().__init__()
         self.own = own
@@ -67,8 +61,6 @@ class Mesh(Connected):
 
 
 class Routed(Connected):
-    """Members that reach a router and nothing else."""
-
     def __init__(self) -> None:
         super().__init__()
         self._endpoints = find_free_endpoints(1)
@@ -78,7 +70,6 @@ class Routed(Connected):
         return self._enter(ZenohBus([], self._endpoints, "client"))
 
     def restart(self) -> None:
-        """The router ends, and another one begins at its place."""
         self._router.close()
         self._router = ZenohBus(self._endpoints, mode="router")
 

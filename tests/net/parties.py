@@ -43,8 +43,6 @@ class Elsewhere(ManualClock):
 
 
 class Member:
-    """One start of one member."""
-
     def __init__(self, bus: Bus, clock: Clock, sites: Sequence[str], info: Info) -> None:
         self.info = info
         self.bus = bus
@@ -89,7 +87,6 @@ class Party:
         return made
 
     def member(self, name: str, **facts: object) -> Member:
-        """A new start of a member, beside those that are there."""
         self._boot += 1
         clock = facts.pop("on_clock", self.clock)
         sites = () if name == topics.RECORDER else self.sites
@@ -97,20 +94,16 @@ class Party:
         return Member(self.network.join(), clock, sites, told(name, **facts))
 
     def start(self, *names: str, **facts: object) -> None:
-        """Starts members, in this order."""
         for name in names:
             self.members[name] = self.member(name, **facts)
 
     def kill(self, name: str) -> None:
-        """Ends a member without a word."""
         self.members.pop(name).bus.close()
 
     def say(self, key_member: str, payload: bytes, channel: str = topics.EVENT) -> None:
-        """A stranger publishes on a member's key."""
         self.stranger.publisher(topics.key(SESSION, key_member, channel))(payload)
 
     def listen(self) -> list[Event]:
-        """Everything that was said so far."""
         while (message := self._ear.poll()) is not None:
             with suppress(WireError):  # what strangers say
                 self.said.append(decode(message[1], Event))
@@ -120,7 +113,6 @@ class Party:
         return [event.kind for event in self.listen()]
 
     def round(self, *names: str) -> None:
-        """Lets members poll once each, then time go on."""
         for name in names or tuple(self.members):
             self.members[name].poll()
         for clock in self._clocks:

@@ -27,7 +27,6 @@ def pair(network: Network) -> tuple[Bus, Bus]:
 
 
 def opened(publish: Callable[[bytes], None], *inboxes: Inbox | StampedInbox[bytes]) -> None:
-    """Returns once every inbox hears the publisher, with nothing more under way and all of them empty."""
     deaf = list(inboxes)
 
     def heard() -> bool:

@@ -31,8 +31,6 @@ CLOCK = SystemClock()
 
 
 class Answering:
-    """A site `s` that does nothing but answer."""
-
     def __init__(self, *, running: bool, deaf: bool = False) -> None:
         (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
@@ -100,7 +98,6 @@ def test_whoever_gives_no_answer_is_named() -> None:
 
 
 def find(*payloads: bytes) -> list[Info]:
-    """The members found in half a second, of which each gives one of these answers."""
     network, clock = LocalNetwork(), ManualClock()
     for n, payload in enumerate(payloads):
         network.join().respond(topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent)

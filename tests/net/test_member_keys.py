@@ -16,7 +16,6 @@ import pytest
 
 from trilat_net.errors import UsageError
 from trilat_net.net import topics
-from trilat_net.net.access_rules import BRIDGE, OPERATOR, RECORDER, ROLES, ROUTER, make_access_rules
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
 from trilat_net.net.member_keys import (
@@ -28,7 +27,15 @@ from trilat_net.net.member_keys import (
     read_member_keys,
 )
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
-from trilat_net.net.zenoh_config import MOST_PUT_BYTES
+from trilat_net.net.zenoh_config import (
+    BRIDGE,
+    MOST_PUT_BYTES,
+    OPERATOR,
+    RECORDER,
+    ROLES,
+    ROUTER,
+    make_access_rules,
+)
 
 from .waiting import answered, drained, received, until
 
@@ -96,7 +103,6 @@ def key(member: str, channel: str) -> str:
 
 
 def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
-    """All that came until one's own word is heard, which is repeated until it is."""
     came: list[tuple[str, bytes]] = []
 
     def there() -> bool:

@@ -27,7 +27,6 @@ def running(*others: str) -> tuple[Party, Epoch]:
 
 
 def joined(session: Party, within_ns: int) -> Epoch | None:
-    """The epoch of the recorder, once it has one."""
     for _ in range(within_ns // STEP_NS):
         if session.members[RECORDER].epoch is not None:
             break

@@ -196,7 +196,6 @@ class Wire:
         self.graph = Ros2Graph(Refusals(self.said.append), [place], "play", "trilat", SystemClock())
 
     def say(self, key: str, data: bytes, attachment: bytes | None) -> None:
-        """The stranger publishes, once somebody listens."""
         with self.stranger.declare_publisher(key) as publisher:
             until(lambda: publisher.matching_status.matching)
             publisher.put(data, attachment=attachment)
@@ -216,7 +215,6 @@ class Wire:
 
 
 def opened(mode: ZenohMode, place: str) -> Any:
-    """A session of Zenoh: a client of a place, or what listens there."""
     ends = ([], [place]) if mode == "client" else ([place], [])
     return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(*ends, mode))))
 

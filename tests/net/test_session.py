@@ -24,7 +24,6 @@ RECORDER = topics.RECORDER
 
 
 def party(*names: str) -> Party:
-    """A session of three sites in which these members have been started."""
     made = Party(SITES)
     made.start(*names)
     return made
@@ -197,7 +196,6 @@ def test_a_refusal_is_said_once_for_each_start() -> None:
 
 
 def polled_until_refused(*members: Member, clock: ManualClock) -> list[str]:
-    """Polls members in turn; returns why those left that left."""
     left: dict[int, str] = {}
     for _ in range(100):
         for member in members:

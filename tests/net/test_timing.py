@@ -39,8 +39,6 @@ def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> Peer
 
 @dataclass
 class Site:
-    """One site of a simulated session: its clock, its time, and what it logged."""
-
     clock: SkewedClock
     timing: SiteTiming
     errors_ns: list[tuple[int, int, int]] = field(default_factory=list)
@@ -70,7 +68,6 @@ class Session:
             self.sites[-1].news += self.sites[-1].timing.opening()
 
     def run(self, seconds: float, cut: range = range(0)) -> None:
-        """Lets both tick; what is sent in the ticks of `cut` is lost."""
         queue: list[tuple[int, int, int, int, PeerSample | None]] = []
         order = iter(range(10**9))
         for n in (0, 1):
@@ -89,7 +86,6 @@ class Session:
                 heapq.heappush(queue, (self._due(n, k + 1), next(order), n, k + 1, None))
 
     def _due(self, n: int, k: int) -> int:
-        """When a tick is due, in true time."""
         site = self.sites[n]
         ahead_ns = site.timing.schedule.deadline(k) - site.clock.monotonic_ns()
         return self.true.monotonic_ns() + round(ahead_ns / (1 + site.clock._drift_ppb / S)) + 1

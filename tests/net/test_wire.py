@@ -84,7 +84,6 @@ def bits(numbers: Any) -> bytes:
 
 
 def payload(**changes: Any) -> bytes:
-    """A small record, changed."""
     vectors = {name: [0.5] * length for name, length in STATE_VECTORS.items()}
     output = TickRecord(
         tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, cmd=[], mem=[], **vectors
@@ -94,7 +93,6 @@ def payload(**changes: Any) -> bytes:
 
 
 def sample(**changes: Any) -> bytes:
-    """The sample of that record, changed."""
     record = decode(payload(), State)
     fields = {name: getattr(record, name) for name in PeerSample.__struct_fields__}
     return msgpack.packb({**fields, **changes})

@@ -11,7 +11,6 @@ STEP_NS = 2_000_000
 
 
 def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | None = None) -> T:
-    """Returns the first true result of `condition`; fails when none came in time."""
     clock = clock or SystemClock()
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     while not (result := condition()):
@@ -22,12 +21,10 @@ def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | No
 
 
 def drained(ring: PolledRing[T]) -> list[T]:
-    """Everything that waits in a ring, oldest first."""
     return list(iter(ring.poll, None))
 
 
 def answered(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
-    """The first answer to a question; None where nobody is known yet who answers."""
     replies = asker.ask(key, payload)
     try:
         return until(replies.poll, timeout_s=0.5)
@@ -36,7 +33,6 @@ def answered(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] |
 
 
 def received(inbox: Inbox, count: int) -> list[tuple[str, bytes]]:
-    """The next `count` messages of a ring."""
     messages: list[tuple[str, bytes]] = []
 
     def enough() -> bool:

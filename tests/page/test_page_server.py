@@ -55,7 +55,6 @@ def hears(client: ClientConnection) -> dict[str, object]:
 
 
 def raw(server: PageServer, request: bytes) -> bytes:
-    """The answer to bytes; what is no whole request ends with them."""
     with create_connection((urlsplit(server.address).hostname, urlsplit(server.address).port), 5) as there:
         there.sendall(request)
         if b"\r\n\r\n" not in request:

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 from mcap.reader import make_reader
 
-from recorder.inbound_queue import InboundQueue
 from recorder.session_recording import RecorderReport, Recording
+from recorder.site_reception import InboundQueue
 from tests.net import parties
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
@@ -35,13 +35,11 @@ TICKS = SCENARIO.ticks("m")
 
 
 def told(name: str, **facts: object) -> Info:
-    """What a member says of itself."""
     scenario = {"scenario_sha256": SCENARIO.sha256, "scenario": SCENARIO.text}
     return parties.told(name, BOOTS[name], **{**scenario, **facts})
 
 
 def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) -> list[bytes]:
-    """The records of a site that hears nobody."""
     site = Site(scenario.setup(name))
     boot = BOOTS[name] if boot is None else boot
     return [
@@ -51,7 +49,6 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
 
 
 def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
-    """What it says of its links after a tick."""
     site = Site(scenario.setup(name))
     stats = LoopStats(site, BOOTS[name], [1000]).take(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
@@ -59,13 +56,11 @@ def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes
 
 
 def happening(name: str, n: int, kind: str = "mode", **facts: object) -> bytes:
-    """The n-th event of a site."""
     event = Event(member=name, boot=BOOTS[name], kind=kind, text=kind, t_ns=n * MS, n=n)
     return encode(msgspec.structs.replace(event, **facts))
 
 
 def end(name: str, ticks: int = TICKS, boot: int | None = None, n: int = -1) -> bytes:
-    """Its last word."""
     boot = BOOTS[name] if boot is None else boot
     return happening(name, n, "end", boot=boot, t_ns=50 * MS, ticks=ticks)
 
@@ -89,7 +84,6 @@ class Memory:
         self._questions = network.join().questions(topics.key(SESSION, name, topics.PAST))
 
     def answer(self) -> None:
-        """Answers what it has been asked."""
         while (question := self._questions.poll()) is not None:
             wanted = decode(question.payload, BackfillRequest)
             self.asked.append(wanted)
@@ -97,7 +91,6 @@ class Memory:
                 question.answer(payload)
 
     def past(self, wanted: BackfillRequest) -> Backfill:
-        """What it still has of what is wanted."""
         made = self.made[wanted.channel]
         first = max(wanted.first, min(self.oldest[wanted.channel], len(made)))
         last = min(wanted.last, first + self.chunk - 1)
@@ -136,7 +129,6 @@ class Desk:
         self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)
 
     def take(self, name: str, channel: str, *payloads: bytes) -> None:
-        """Messages come in, a millisecond after each other, and are written."""
         for payload in payloads:
             self.wait(MS)
             self.tap.take(topics.key(SESSION, name, channel), payload)
@@ -154,7 +146,6 @@ class Desk:
                 site.answer()
 
     def whole(self, *names: str) -> None:
-        """Sites that send everything and say so."""
         for name in names:
             self.take(name, topics.STATE, *states(name))
             self.take(name, topics.LINK, statistics(name))
@@ -164,11 +155,9 @@ class Desk:
         return self.recording.over(self.clock.monotonic_ns())
 
     def said(self) -> list[Event]:
-        """What the recorder said since the last call."""
         return list(read_events(self._heard))
 
     def stored(self) -> list[tuple[str, int]]:
-        """What the recorder said it has: (site, ticks)."""
         heard = self.said()
         assert all(event.kind == "stored" for event in heard)
         return [(event.about, event.ticks) for event in heard]
@@ -179,14 +168,12 @@ class Desk:
         return open_log(self.stream)
 
     def written(self) -> dict[str, list[bytes]]:
-        """All payloads in the finished file, by topic."""
         payloads: dict[str, list[bytes]] = {}
         for topic, message in self.messages():
             payloads.setdefault(topic, []).append(message.data)
         return payloads
 
     def messages(self) -> Iterator[tuple[str, Any]]:
-        """Finishes the log: all its messages in the order of the file, each with its channel, "m/state"."""
         self.recording.finish(self.tap)
         reader = make_reader(io.BytesIO(self.stream.getvalue()))
         for _, channel, message in reader.iter_messages(log_time_order=False):

@@ -220,7 +220,6 @@ def test_one_request_at_a_time_asks_for_one_chunk() -> None:
 
 
 def test_a_silent_site_is_asked_and_its_lost_end_noticed() -> None:
-    """The last second is lost on the way, statistics, end and all."""
     run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
     run.live(3100 * MS)
     assert run.until_stored().text == "every record of m is stored"
@@ -280,7 +279,6 @@ def test_a_late_message_that_was_given_up_is_welcome() -> None:
 
 
 def vanish(run: Run) -> None:
-    """The tokens of both sites disappear."""
     for name in ("m", "s"):
         run.desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False)
 

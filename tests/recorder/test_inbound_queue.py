@@ -2,8 +2,8 @@
 
 import pytest
 
-from recorder import inbound_queue as module
-from recorder.inbound_queue import InboundQueue
+from recorder import site_reception as module
+from recorder.site_reception import InboundQueue
 from tests.net.manual_clock import ManualClock
 
 

@@ -7,7 +7,7 @@ import msgpack
 import msgspec
 import pytest
 
-from recorder import inbound_queue as tap_module
+from recorder import site_reception as tap_module
 from recorder.record_process import Recorder
 from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
 from recorder.site_reception import EVENT_BYTES

@@ -10,7 +10,6 @@ from .desk import MS, SESSION, Desk, S, states
 
 
 def heard(desk: Desk) -> list[RecorderStats]:
-    """What it has said since the last call."""
     return [decode(message[1], RecorderStats) for message in iter(desk.reports.poll, None)]
 
 

@@ -9,5 +9,4 @@ SIX = six_joints(20.0, delay_ms=200.0)
 
 
 def six(**changes: Any) -> Scenario:
-    """The scenario with changes by dotted keys."""
     return parse_scenario(SIX, overrides=changes)

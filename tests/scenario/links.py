@@ -83,7 +83,6 @@ _models: dict[str, st.SearchStrategy[dict[str, Any]]] = {
 
 @st.composite
 def links(draw: st.DrawFn, without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A complete link, or a preset with what it may have besides."""
     besides = draw(_besides())
     if draw(st.integers(0, 5)) == 0:
         preset = draw(st.sampled_from(sorted(PRESETS)))

@@ -17,7 +17,6 @@ def trip(number: int, lost: str = "false") -> dict[str, Any]:
 
 
 def irtt(folder: Path, *lost: int, zipped: bool = False) -> Path:
-    """The file in a folder, with some trips lost."""
     trips = [trip(n, "true_up" if n in lost else "false") for n in range(5)]
     text = json.dumps({"stats": {}, "round_trips": trips}).encode()
     path = folder / ("run.json.gz" if zipped else "run.json")

@@ -39,7 +39,6 @@ def rows(draw: st.DrawFn, site: str) -> dict[str, float]:
 
 @st.composite
 def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
-    """A timeline: links and shares, in order, as an author may write them."""
     times = sorted(draw(st.lists(st.floats(0, 100) | st.integers(0, 100), max_size=4)))
     made = []
     for at_s in times:

@@ -10,7 +10,7 @@ from tests.scenario.round_trips import RTT_NS, SENT_NS, irtt
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import TraceDelay
-from trilat_net.scenario.measured_traces import import_trace
+from trilat_net.scenario.delay_traces import import_trace
 
 IRTT_MEAN_NS, IRTT_DEVIATION_NS = 16616803, 488290
 """Of five round trips that irtt measured, and its own statistics of them (README of clarkzjw/LENS)."""

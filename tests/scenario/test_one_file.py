@@ -114,13 +114,11 @@ bodies = st.builds(
 
 
 def force_of_kernel(body: HuntCrossley, q: tuple, qd: tuple) -> np.ndarray:
-    """The torque ON a planar arm with links of 1 m, by the kernel."""
     rows, table = torque_source_rows((body.actor,))
     return np.array(torque_on_arm(1.0, q, qd, (1.0, 1.0), rows, table, 0)[:2])
 
 
 def tip(q: tuple, qd: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Place, velocity and Jacobian of the same arm, by its geometry."""
     a, b = q[0], q[0] + q[1]
     J = np.array([[-math.sin(a) - math.sin(b), -math.sin(b)], [math.cos(a) + math.cos(b), math.cos(b)]])
     return np.array([math.cos(a) + math.cos(b), math.sin(a) + math.sin(b)]), J @ qd, J

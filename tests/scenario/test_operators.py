@@ -25,7 +25,6 @@ GROUPS = {
 
 
 def refused(group: str, entry: Any) -> str:
-    """What is said of one table of the last site; the sites before it have none."""
     with pytest.raises(ScenarioError) as error:
         load_scenario("free", {f"sites.s.{group}": [entry]})
     path, _, problem = str(error.value).removeprefix("free: ").partition(": ")

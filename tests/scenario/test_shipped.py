@@ -14,7 +14,6 @@ def ran(name: str, overrides: dict[str, Any] | None = None) -> Run:
 
 
 def ages(run: Run) -> np.ndarray:
-    """Age of the samples in use, ticks, from the first ones on."""
     used = run.stack("used")
     ticks = np.arange(used.shape[1])[None, :, None]
     made: np.ndarray = (ticks - used)[used >= 0]

@@ -104,7 +104,6 @@ def test_the_references_are_one_power_balance_and_one_position() -> None:
 
 
 def walk(chain: UrdfChain, q: Array) -> tuple[Array, Array, list]:
-    """Pose of the end link in the base, and axis and place of every joint."""
     R, x, axes = np.eye(3), np.zeros(3), []
     for j, qi in zip(chain.joints, q, strict=True):
         x, R = x + R @ j.origin_m, R @ np.array(j.rotation)
@@ -131,7 +130,6 @@ def rpy(angles: Array) -> Array:
 
 
 def points(random: np.random.Generator) -> tuple[Array, Array]:
-    """Masses and places of a body."""
     return random.uniform(0.1, 1.0, 6), random.normal(0.0, 0.2, (6, 3))
 
 
@@ -144,7 +142,6 @@ def six(I: Array) -> list[float]:  # noqa: E741 - the symbol of an inertia
 
 
 def stated(masses: Array, places: Array, angles: Array) -> str:
-    """An <inertial>, its tensor in a turned frame at the centre of mass."""
     c, R = masses @ places / masses.sum(), rpy(angles)
     moments = six(R.T @ tensor(masses, places - c) @ R)
     keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")

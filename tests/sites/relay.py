@@ -46,12 +46,10 @@ class Relay:
         return clock
 
     def happens(self, at_ns: int, act: Callable[[], None]) -> None:
-        """Does something at a time, before the runners that wake then."""
         self._numbered += 1
         heapq.heappush(self._happenings, (max(at_ns, self.now_ns), self._numbered, act))
 
     def run(self) -> dict[str, object]:
-        """Runs all to their end; returns what each returned, or raises what one raised."""
         while self._deadlines:
             self._runners[self._next()].switch()
         if self._failed:
@@ -59,7 +57,6 @@ class Relay:
         return self.results
 
     def set_start(self, seat: int, at_ns: int) -> None:
-        """Sets when a runner begins that has not."""
         self._deadlines[seat] = max(at_ns, self.now_ns)
 
     def _pass_time(self, seat: int) -> None:
@@ -92,8 +89,6 @@ class Killed(Exception):  # noqa: N818 - it is no error of the program
 
 
 class RelayClock:
-    """One runner's `Clock`."""
-
     def __init__(self, relay: Relay, seat: int) -> None:
         self._relay, self._seat = relay, seat
         self._stalls: list[tuple[int, int]] = []
@@ -104,7 +99,6 @@ class RelayClock:
         """How far its wall clock was set ahead; the monotonic one is not."""
 
     def begins(self, at_ns: int) -> None:
-        """Its runner, which has not begun, begins at a time."""
         self._relay.set_start(self._seat, at_ns)
 
     def stall(self, at_ns: int, for_ns: int) -> None:
@@ -112,7 +106,6 @@ class RelayClock:
         self._stalls.append((at_ns, for_ns))
 
     def at(self, at_ns: int, act: Callable[[], None]) -> None:
-        """Does something in the first sleep that ends at a time or after it."""
         self._acts.append((at_ns, act))
 
     def monotonic_ns(self) -> int:

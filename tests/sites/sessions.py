@@ -10,6 +10,7 @@ import msgpack
 
 from recorder.record_process import Recorder
 from sites import realtime
+from sites.running_session import RunningSession
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import take_part
 from tests.net.local_bus import LocalNetwork
@@ -36,8 +37,6 @@ Stranger = Callable[[Bus, RelayClock], None]
 
 @dataclass
 class Session:
-    """A session in one process: its parts before it runs, and what came of it."""
-
     scenario: Scenario
     path: Path
     relay: Relay = field(default_factory=Relay)
@@ -63,7 +62,6 @@ class Session:
 
     @classmethod
     def whole(cls, scenario: Scenario, folder: Path, **fields: Any) -> "Session":
-        """A session of a recorder and all sites."""
         session = cls(scenario, folder / "run.mcap", **fields)
         session.recorder()
         for name in scenario.names:
@@ -71,7 +69,6 @@ class Session:
         return session
 
     def site(self, name: str, *, needs_recorder: bool = True, at_ns: int = 0) -> None:
-        """Adds a site."""
         interrupt = self.interrupts[name] = Interrupt()
 
         def run(clock: RelayClock) -> object:
@@ -99,7 +96,6 @@ class Session:
         needs_recorder: bool = False,
         timeout_s: float = 10.0,
     ) -> int:
-        """A site's life, from its connection to its exit code."""
         options = SiteOptions(
             SESSION, Connection(), timeout_s, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
         )
@@ -113,7 +109,6 @@ class Session:
             self.left_ns[name] = clock.monotonic_ns()
 
     def join(self, name: str) -> Bus:  # noqa: ARG002 - for networks that know their members
-        """The connection of a member."""
         return self.network.join()
 
     def _own(self, name: str, clock: RelayClock) -> Clock:
@@ -122,8 +117,6 @@ class Session:
     def recorder(
         self, stopped: Callable[[], bool] = lambda: False, at_ns: int = 0, boot: int = RECORDER_BOOT
     ) -> None:
-        """Adds the recorder."""
-
         def run(clock: RelayClock) -> Sequence[str]:
             bus = self.join("recorder")
             try:
@@ -152,7 +145,6 @@ class Session:
         self.relay.add("recorder", run, at_ns)
 
     def interrupt(self, name: str, at_ns: int, number: int = 2) -> None:
-        """Sends a site a signal at a time."""
         interrupt = self.interrupts[name]
         self.clocks[name].at(at_ns, lambda: setattr(interrupt, "number", number))
 
@@ -168,7 +160,6 @@ class Session:
         self.clocks[by].at(from_ns, begin)
 
     def lose_token(self, name: str) -> None:
-        """Lets the liveliness token of a site disappear, which lives on."""
         for member in self.network.members:
             for token in [one for one in member._tokens if f"/{name}/alive/" in one]:
                 member._tokens.remove(token)
@@ -182,7 +173,6 @@ class Session:
         return take
 
     def stranger(self, act: Stranger, at_ns: int = 0) -> None:
-        """Adds somebody who does what `act` does."""
         self.relay.add(f"stranger {len(self.clocks)}", lambda clock: act(self.join("stranger"), clock), at_ns)
 
     def play(self) -> None:
@@ -192,13 +182,11 @@ class Session:
             self.relay.run()
 
     def run(self) -> Log:
-        """Runs it, and returns its log."""
         self.play()
         return open_log(self.path)
 
 
 def computed(state: State) -> bytes:
-    """All that a tick computed, as bytes: what must not depend on when its samples came."""
     return msgpack.packb(
         [
             *(state.site, state.tick, state.t_ns, state.mode, state.q, state.qd, state.q_des, state.qd_des),
@@ -208,7 +196,6 @@ def computed(state: State) -> bytes:
 
 
 def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
-    """Per site what every tick computes in plain virtual time."""
     ticks: dict[str, list[bytes]] = {name: [] for name in scenario.names}
     for site, arrivals, output in virtual.execute_virtual(scenario):
         payload = encode_state(site.name, 0, site.peers, output, arrivals, 0, 0)
@@ -217,10 +204,12 @@ def in_virtual_time(scenario: Scenario) -> dict[str, list[bytes]]:
 
 
 def in_log(log: Log) -> dict[str, list[bytes]]:
-    """Per site what every tick of a log computed."""
     return {name: [computed(state) for state in log[name].states] for name in log.sites}
 
 
 def gliding(duration_s: float, scenario: str = "two_sites", **keys: Any) -> Scenario:
-    """A shipped scenario under `glide`, at 200 Hz."""
     return load_scenario(scenario, {"duration_s": duration_s, **GLIDE, **keys})
+
+
+def reached(bus: Bus, clock: Clock) -> RunningSession:
+    return RunningSession(SESSION, Connection(), bus, clock)

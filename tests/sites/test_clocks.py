@@ -20,7 +20,6 @@ SKEWS = {"m2": (3 * S, 100_000), "s": (-500_000_000, -100_000), "recorder": (86_
 def run(
     folder: Path, skews: dict[str, tuple[int, int]], duration_s: float, relay: Relay | None = None
 ) -> tuple[Session, Log]:
-    """A session of `asymmetric` in which members are on clocks of their own."""
     scenario = load_scenario("asymmetric", {"duration_s": duration_s})
     session = Session.whole(scenario, folder, relay=relay or Relay(), skews=skews)
     return session, session.run()
@@ -28,7 +27,6 @@ def run(
 
 @pytest.fixture(scope="module")
 def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Log]:
-    """A session of all members on clocks of their own but the leader."""
     return run(tmp_path_factory.mktemp("skewed"), SKEWS, 2.5)
 
 

@@ -21,7 +21,6 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
-from sites.running_session import order_sites
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
@@ -40,7 +39,7 @@ from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session
+from .sessions import SESSION, Session, reached
 
 ARM = {
     "sites.s.plant": "external",
@@ -77,22 +76,28 @@ def driving(
     sent: list[list[float]],
     torques: list[tuple[float, ...]],
     until_ns: int = 2**62,
-    start: tuple[float, ...] = (0.3, -0.1),
+    arm: Pendulum | None = None,
     senses: bool = False,
+    poses: list[tuple[int, list[float]]] | None = None,
 ) -> Act:
-    """The program of an arm, every millisecond, a quarter of one before the site's tick."""
+    """The program of an arm; with `poses`, which it notes with their times, one that has brakes."""
+    body = arm or Pendulum((0.3, -0.1))
 
     def drive(bus: Bus, clock: RelayClock) -> None:
-        arm = Pendulum(start)
         with ArmClient(bus, clock, SESSION, "s") as port:
             next_ns = clock.monotonic_ns()
             while not port.over and next_ns < until_ns:
-                felt = [math.sin(7.0 * q) for q in arm.q] if senses else []
-                port.send(arm.q, arm.qd, felt)
-                sent.append([*arm.q, *arm.qd, *felt])
+                felt = [math.sin(7.0 * q) for q in body.q] if senses else []
+                port.send(body.q, body.qd, felt)
+                sent.append([*body.q, *body.qd, *felt])
                 tau = port.torque()
                 torques.extend([] if tau is None else [tau])
-                arm.move(tau)
+                if tau is None and poses is not None:
+                    body.qd = [0.0] * len(body.q)
+                else:
+                    body.move(tau)
+                if poses is not None:
+                    poses.append((clock.monotonic_ns(), list(body.q)))
                 next_ns += PERIOD_NS
                 clock.sleep_until(next_ns)
 
@@ -100,7 +105,6 @@ def driving(
 
 
 def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
-    """A session with that arm, and what became of its sites once it has run."""
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     session = Session.whole(scenario, folder, ends={})
     if act is not None:
@@ -145,7 +149,7 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
     sent: list[list[float]] = []
     session = Session.whole(six(**changes), tmp_path, ends={})
     start = six().sites["s"].q0_rad
-    session.stranger(driving(sent, [], start=start, senses=True), at_ns=A_SECOND + 200_250_000)
+    session.stranger(driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000)
     log = session.run()
     assert set(session.ends.values()) == {0}
     records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
@@ -157,7 +161,7 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
 def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
     scenario = six(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
-    session.stranger(driving([], [], until_ns=3 * A_SECOND, start=(0.0,) * 7), at_ns=A_SECOND)
+    session.stranger(driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND)
 
     def alone(clock: RelayClock) -> None:
         with pytest.raises(SessionError, match=r"dropped: \d+ of 7 joints; the scenario has 6"):
@@ -185,25 +189,6 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
     whole(log)
 
 
-def braked(
-    bus: Bus, clock: RelayClock, poses: list[tuple[int, list[float]]], arm: Pendulum | None = None
-) -> None:
-    """The program of an arm with brakes, every millisecond."""
-    arm = arm or Pendulum((0.3, -0.1))
-    with ArmClient(bus, clock, SESSION, "s") as port:
-        next_ns = clock.monotonic_ns()
-        while not port.over:
-            port.send(arm.q, arm.qd)
-            tau = port.torque()
-            if tau is None:
-                arm.qd = [0.0, 0.0]
-            else:
-                arm.move(tau)
-            poses.append((clock.monotonic_ns(), list(arm.q)))
-            next_ns += PERIOD_NS
-            clock.sleep_until(next_ns)
-
-
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
@@ -212,7 +197,7 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_p
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
     session = Session.whole(scenario, tmp_path, ends={})
-    session.stranger(lambda bus, clock: braked(bus, clock, poses), at_ns=A_SECOND + 200_250_000)
+    session.stranger(driving([], [], poses=poses), at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].stall(at_ns, int(frozen_s * A_SECOND))
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
@@ -249,7 +234,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
                     clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-            told.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, ["s"], "enable"))
+            told.extend((one.accepted, one.text) for one in reached(bus, clock).order(["s"], "enable"))
 
     session.stranger(hold, at_ns=A_SECOND)
     log = session.run()
@@ -357,11 +342,7 @@ def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     scenario = load_scenario("two_sites", {**OUTSIDE, **glide, "duration_s": 6.0, "link.delay_ms": 50.0})
     session = Session.whole(scenario, tmp_path, ends={})
     poses: list[tuple[int, list[float]]] = []
-    arm = Pendulum((0.3, -0.1))
-
-    def drive(bus: Bus, clock: RelayClock) -> None:
-        braked(bus, clock, poses, arm)
-
+    drive = driving([], [], poses=poses)
     session.stranger(drive, at_ns=A_SECOND + 200_250_000)
     session.clocks["s"].dies_ns = 3 * A_SECOND
     session.stranger(drive, at_ns=4 * A_SECOND + 250_000)
@@ -421,8 +402,6 @@ def measurement(**changed: object) -> bytes:
 
 
 class Heard:
-    """An arm's measurements, by hand."""
-
     def __init__(self) -> None:
         self.clock = ManualClock()
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)

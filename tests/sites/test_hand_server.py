@@ -35,8 +35,6 @@ Say = Callable[[Hand, int], object]
 
 
 class Felt:
-    """What the program of a hand noted: of each record its tick, and the force and the pose that it told."""
-
     def __init__(self) -> None:
         self.ticks: list[int] = []
         self.forces: list[tuple[float, ...]] = []
@@ -64,7 +62,6 @@ def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) ->
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
-    """A session in which two programs hold the masters, and a third one wants one of them as well."""
     made, felt = Session.whole(SCENARIO, tmp_path_factory.mktemp("held")), Felt()
     made.stranger(holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt))
     made.stranger(holding("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt()))
@@ -93,7 +90,6 @@ def test_its_events_say_who_held_and_counts_who_was_refused(session: tuple[Log, 
 
 
 def test_what_a_hand_feels_is_what_acts_on_the_arm(session: tuple[Log, Felt]) -> None:
-    """J' of the force that the program was told is the torque of that tick's record; its pose the tip's."""
     log, felt = session
     part = log["m1"]
     (l1, l2), seen = SCENARIO.arms["m1"].lengths_m, 0
@@ -119,8 +115,6 @@ def test_a_hand_does_what_its_mode_says() -> None:
 
 
 class Served:
-    """A server of hands without its site, whose arm stays where it is."""
-
     def __init__(self) -> None:
         network = LocalNetwork()
         self.dropped: Counter[str] = Counter()
@@ -133,7 +127,6 @@ class Served:
         self.k = -1
 
     def take(self, *messages: bytes) -> HandInForce:
-        """Returns what is in force in the next tick, before which these messages come."""
         for message in messages:
             self.publish(message)
         self.k += 1
@@ -141,7 +134,6 @@ class Served:
 
 
 def message(**fields: Any) -> bytes:
-    """A message of a hand at m1."""
     return encode(
         HandMessage(**{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields})
     )

@@ -39,7 +39,6 @@ class Steps:
 
 
 def ended(steps: Steps, overtime: LawWatchdog | None = None) -> int | None:
-    """At which tick the law is too slow; None where it never is."""
     overtime = overtime or steps.overtime()
     for k in range(TICKS):
         try:

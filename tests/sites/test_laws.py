@@ -15,7 +15,6 @@ from .sessions import Session, in_log, in_virtual_time
 
 
 def lived(folder: Path, name: str, **overrides: object) -> tuple[Log, dict[str, object]]:
-    """The log of a session, and per site its exit code or what it was ended by."""
     scenario = load_scenario(name, {"duration_s": 0.5, **overrides})
     session = Session.whole(scenario, folder, ends={})
     return session.run(), session.ends or {}

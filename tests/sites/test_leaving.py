@@ -22,7 +22,6 @@ S = 1_000_000_000
 
 
 def engaged_after_s(log: Log, site: str, tick: int) -> float:
-    """How long after a tick a site follows its peers, s."""
     part = log[site]
     after = (part.tick >= tick) & (part.mode == "run")
     return float(part.tick[np.argmax(after)] - tick) / part.rate_hz

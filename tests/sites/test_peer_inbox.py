@@ -62,7 +62,6 @@ class Desk:
         self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, links)
 
     def wait(self, until_ns: int) -> None:
-        """Time goes on, to an instant since the epoch."""
         self.clock.sleep_until(EPOCH_NS + until_ns)
 
 

@@ -21,7 +21,6 @@ print(json.dumps([obtained, gc.isenabled(), sorted(os.sched_getaffinity(0))]))
 
 
 def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool, list[int]]:
-    """What a process of its own obtains: it would not be given back."""
     program = PROGRAM.format(before=before, cpu=cpu)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

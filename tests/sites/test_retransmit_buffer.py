@@ -16,8 +16,6 @@ BOOT = 7
 
 
 class Desk:
-    """A site's memory, and somebody who asks."""
-
     def __init__(self, rate_hz: int = 1000) -> None:
         network = LocalNetwork()
         self._asker = network.join()

@@ -23,18 +23,14 @@ from sites.ros2_bridge import (
     SAFE_NS,
     SILENCE_NS,
     DominanceTopic,
-    Ends,
     RobotArm,
-    RobotTable,
-    ShareHistory,
-    SiteTopics,
     TargetTopic,
     read_joint_target,
     read_place_target,
-    read_topic_table,
     refuse_other_robots,
     show_session,
 )
+from sites.ros2_topics import Ends, RobotTable, ShareHistory, SiteTopics, read_topic_table
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
@@ -266,7 +262,6 @@ class Listener:
 
 
 def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
-    """Where all links of a site are in `world`, by the transforms alone; rotations by SciPy."""
     found = {"world": (np.zeros(3), Rotation.identity())}
     for one in frames:
         (at, turned), move, turn = (
@@ -406,14 +401,12 @@ class Robot:
         return [decode(payload, ArmMeasurement) for _, payload in drained(self._measured)]
 
     def ticks(self, k: int, *tau: float, mode: Mode = Mode.RUN, since_ns: int = 0) -> None:
-        """The site publishes the record of a tick."""
         zeros, mem = [0.0, 0.0], [0.0, 0.0, float(since_ns)]
         motion = zeros, zeros, zeros, zeros, list(tau), zeros, []
         record = TickRecord(k, k * 10**6, mode, *motion, [-1], 0, [], mem)
         self._state(encode_state("s", 1, ["m"], record, (), 0, 0))
 
     def driven(self, after_ns: int = 0) -> list[list[float]]:
-        """What its controller gets in a look of the bridge."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.commands.clear()
         self.arm.drive()
@@ -547,7 +540,6 @@ class Sites:
 
     @contextmanager
     def shown(self) -> Iterator[threading.Thread]:
-        """The bridge shows the session, and has shown a record."""
         over = threading.Event()
 
         def show() -> None:

@@ -10,7 +10,6 @@ from rich.console import Console
 from live.session_frames import SessionFrames, show_event
 from live.terminal_watch import SessionWatch
 from sites.monitor import SiteRow, describe_row, frame_alarms
-from sites.running_session import order_sites, stop_session
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.ticks import LifeAlarm, LifeReason
@@ -20,7 +19,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session
+from .sessions import SESSION, Session, reached
 
 LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 
@@ -33,7 +32,7 @@ def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
 
     def stop(bus: Bus, clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 2_500_000_000)
-        said.extend(stop_session(bus, clock, SESSION))
+        said.extend(reached(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)
@@ -71,7 +70,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     def order(bus: Bus, clock: RelayClock) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
             clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
-            said.extend((one.accepted, one.text) for one in order_sites(bus, clock, SESSION, sites, name))
+            said.extend((one.accepted, one.text) for one in reached(bus, clock).order(sites, name))
 
     raised: list[tuple[str, LifeAlarm]] = []
     frames: list[dict[str, Any]] = []
@@ -129,7 +128,7 @@ def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
 
     def order(bus: Bus, clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
-        said.extend(one.text for one in order_sites(bus, clock, SESSION, ["s"], "stop") if not one.accepted)
+        said.extend(one.text for one in reached(bus, clock).order(["s"], "stop") if not one.accepted)
 
     session.stranger(order)
     session.run()
@@ -138,7 +137,7 @@ def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
 
 def test_a_session_that_is_not_there_is_not_stopped() -> None:
     with pytest.raises(SessionError, match="no site of session"):
-        stop_session(LocalNetwork().join(), ManualClock(), "t")
+        reached(LocalNetwork().join(), ManualClock()).end()
 
 
 @pytest.mark.long
@@ -152,7 +151,7 @@ def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> Non
     seen: dict[str, int] = {}
 
     def stop(bus: Bus, clock: RelayClock) -> None:
-        said.extend(stop_session(bus, clock, SESSION))
+        said.extend(reached(bus, clock).end())
 
     def look(bus: Bus, clock: RelayClock) -> None:
         watch = SessionWatch(bus, clock, SESSION)

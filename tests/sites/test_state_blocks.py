@@ -106,7 +106,6 @@ def test_a_lost_block_is_filled_with_its_records(tmp_path: Path) -> None:
 
 
 def ticks_that_hear(log: Log, name: str) -> list[int]:
-    """The ticks of a site in which a sample of a peer came."""
     return [state.tick for state in log[name].states if state.rx]
 
 

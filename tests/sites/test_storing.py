@@ -29,7 +29,6 @@ def session_of(folder: Path, duration_s: float, storage: LogStorage | None = Non
 
 
 def records(path: Path) -> dict[str, int]:
-    """How many messages of each topic a file has, whole or not."""
     with path.open("rb") as stream:
         return Counter(item.topic for item in McapReader(stream, str(path)).messages())
 

@@ -16,15 +16,12 @@ S = 1_000_000_000
 
 
 class Visit:
-    """A probe of a party, on the party's clock."""
-
     def __init__(self, party: Party, count: int = 10) -> None:
         self._party = party
         self.begun_ns = party.clock.monotonic_ns()
         self.probe = SessionPing(party.network.join(), party.clock, SESSION, count)
 
     def look(self, timeout_ns: int = S) -> SessionPing:
-        """Looks until it is over, while the members do what they do."""
         for n in range(2_000_000_000):
             if self.probe.over(timeout_ns, self.begun_ns):
                 break
@@ -37,7 +34,6 @@ class Visit:
 
 
 def link_stats() -> LinkStats:
-    """Statistics of the site m, which hears s."""
     counts = {name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")}
     zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
     own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
@@ -45,7 +41,6 @@ def link_stats() -> LinkStats:
 
 
 def ping_sites() -> PingReport:
-    """Returns what `trilat ping` finds of two sites, one of them on another clock."""
     party = Party(("m", "s"))
     party.start("m")
     party.start("s", on_clock=SkewedClock(party.clock, 3 * S, 50_000))

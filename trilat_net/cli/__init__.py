@@ -92,7 +92,6 @@ _WITHIN = {"set": "--session paper "}
 
 
 def _add_command(group: typer.Typer, words: str, run: Any) -> None:
-    """Adds a command: `words` stand before the arguments of its examples."""
     epilog = "\n\n".join(f"Example: trilat {words} {one}".rstrip() for one in run.examples)
     text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
     paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do

@@ -104,7 +104,7 @@ def trace_import_command(
         way: Half a round trip, one way of irtt (send or receive), or delays as they are. Default: half of a
             round trip, a one-way delay as it is.
     """
-    from ..scenario.measured_traces import import_trace
+    from ..scenario.delay_traces import import_trace
 
     place = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
     refuse_existing(place, force=force)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -85,7 +85,6 @@ def site_command(
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
-    """Refuses sites that cannot come late."""
     from ..scenario import find_site
 
     for late in without:
@@ -173,7 +172,6 @@ def record_command(
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
-    """Returns where the log goes; the folder of a log with a report is made."""
     from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
@@ -239,15 +237,15 @@ def replay_command(
         low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
         preload: Largest log held in memory; another process reads a larger one during the replay.
     """
-    from recorder.play.pace import parse_rate
     from recorder.play.play_process import PlayOptions, play_log
+    from recorder.play.player import parse_rate
     from recorder.play.session_reader import parse_selection, preload_messages
 
     from ..net.connection import default_endpoint
 
     if preload < 0:
         raise UsageError(f"--preload is a number of MiB, not {preload}")
-    selection = parse_selection(include or (), exclude or (), start, stop, duration, _parse_time(time))
+    selection = parse_selection(include or (), exclude or (), start, stop, duration, time)
     speed = parse_rate(rate)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload * _MIB, progress)
@@ -278,12 +276,6 @@ def replay_command(
         raise typer.Exit(1)
 
 
-def _parse_time(text: str) -> Literal["publish", "log"]:
-    if text not in ("publish", "log"):
-        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {text!r}")
-    return "publish" if text == "publish" else "log"
-
-
 def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]) -> None:
     from ..net.messages import VERSION
 
@@ -297,7 +289,6 @@ def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Cal
 
 
 def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
-    """Returns a function that shows the position on one line of a terminal."""
     before: list[tuple[int, int]] = []
 
     def show(progress: "PlayProgress") -> None:
@@ -362,7 +353,6 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 
 
 def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
-    """Warns of damage that was not `reported` before, and of messages that did not arrive or arrived late."""
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
         terminal.print_error(
@@ -403,9 +393,9 @@ def router_command(
     Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
     continues when the router is restarted. Routers that --connect to each other act as one.
     """
-    from ..net.access_rules import ROUTER
     from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
     from ..net.zenoh_bus import read_zenoh_file
+    from ..net.zenoh_config import ROUTER
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
@@ -452,11 +442,12 @@ def ros2_command(
         rate: Messages a second of each topic.
         names: Names of topics, or a TOML file of them and of robots.
     """
-    from sites.ros2_bridge import read_topic_table, serve_ros2
+    from sites.ros2_bridge import serve_ros2
+    from sites.ros2_topics import read_topic_table
     from sites.running_session import RunningSession
 
-    from ..net.access_rules import BRIDGE
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
+    from ..net.zenoh_config import BRIDGE
 
     if distro not in DISTROS:
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")

@@ -346,7 +346,7 @@ class Reach(NamedTuple):
 
     def resolve(self, *, operates: bool = True) -> "Connection":
         """Returns the connection; its keys are the operator's, unless `operates` is False."""
-        from ..net.access_rules import OPERATOR
+        from ..net.zenoh_config import OPERATOR
 
         connection = MemberOptions(None, *self).resolve()
         return connection.require(OPERATOR) if operates else connection

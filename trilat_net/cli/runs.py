@@ -207,7 +207,9 @@ def figure_command(
     from ..reporting.figures.registry import write_figures, write_overlay
 
     place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
-    kinds = _formats(formats)
+    kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
+    if not kinds:
+        raise UsageError("--format names no format, as in --format pdf,png")
     shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
     if others:
         if names:
@@ -225,15 +227,7 @@ def figure_command(
     terminal.print_paths(paths)
 
 
-def _formats(text: str) -> list[str]:
-    kinds = [kind.strip().lower() for kind in text.split(",") if kind.strip()]
-    if not kinds:
-        raise UsageError("--format names no format, as in --format pdf,png")
-    return kinds
-
-
 def _list_figures(log: "Log", *, as_json: bool) -> None:
-    """Prints every figure, and for which of them a log has nothing to show."""
     from ..reporting.figures.registry import FIGURES
 
     absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
@@ -313,7 +307,6 @@ def rerun_command(
 
 
 def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
-    """Refuses a file that may not be written, before anything is executed."""
     from ..files import refuse_existing
     from ..log.log_layout import active_path
 

@@ -1,7 +1,6 @@
 """Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run here."""
 
 import re
-import tomllib
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,10 +102,7 @@ def live_command(
     run_and_report(run.load(scenario, LONGEST_S), run, partial(attend_with_page, page, clock))
 
 
-def _check_count(value: int) -> int:
-    if not 5 <= value <= 10_000:
-        raise UsageError(f"--count is a number from 5 to 10000, not {value}")
-    return value
+_check_count = options.check_range(5, 10_000, "a number")
 
 
 @options.command("--session paper")
@@ -115,7 +111,12 @@ def ping_command(
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
     *,
     reach: options.Reach,
-    count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
+    count: Annotated[
+        int,
+        value(
+            "--count", "N", "Round trips to each member.", callback=options.check_range(5, 10_000, "a number")
+        ),
+    ] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
         str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)
@@ -187,7 +188,6 @@ _OF_ROS2 = {"--ros2", "--ros", "--domain", "--seconds", "--json"}
 
 
 def _refuse_others(context: typer.Context, way: str) -> None:
-    """Refuses options that have no meaning beside --benchmark, --answer, --ros2, or none of them."""
     given = set(options.given_options(context))
     own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER, "--ros2": _OF_ROS2}.get(way)
     alone = {"--set", "--seconds", "--figure", "--force", "--insecure", "--ros", "--domain"}
@@ -342,16 +342,14 @@ def parse_share(text: str) -> float:
 
 def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
     """Returns KEY=VALUE texts as a table; a value is TOML or a bare word."""
-    table: dict[str, Any] = {}
+    from ..scenario.override import split_assignment
+
+    pairs = []
     for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals or not key.strip():
+        if (pair := split_assignment(text)) is None:
             raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
-        try:
-            table[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
-            table[key.strip()] = value.strip()
-    return table
+        pairs.append(pair)
+    return dict(pairs)
 
 
 def set_command(

@@ -107,7 +107,6 @@ def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: 
 
 
 def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
-    """Runs trials in virtual time; shows a bar on a terminal, elsewhere a line per scenario that is done."""
     from rich.progress import Progress
 
     from ..studies.trials import run_trials
@@ -187,7 +186,6 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
 def _run_tuning(
     asked: "TuningPlan", folder: Path | None, jobs: int | None, on: str | None, *, force: bool, as_json: bool
 ) -> None:
-    """Runs a comparison, writes it into a folder, by default the next free one, and prints it."""
     from ..files import make_results_folder
     from ..studies.executor import count_workers
     from ..studies.sweep.sweep_run import format_wall_time
@@ -277,7 +275,6 @@ def compare_command(
 
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
-    """Tunes laws of a study at all delays, and writes their gains into the file of the suite."""
     from ..studies.bench.bench_plan import GAINS_FILE, tune_laws, write_gains
     from ..studies.bench.bench_tasks import STUDIES
 

@@ -30,7 +30,6 @@ _option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
 def _check_modes(given: Sequence[str]) -> Sequence[str]:
-    """Returns options; refuses those of two modes at once, and those of a mode that is not chosen."""
     chosen = [name for name in ("--map", "--margin", "--confirm", "--cell") if name in given]
     if len(chosen) > 1:
         raise UsageError(f"{' and '.join(chosen)} exclude each other: give one at a time")
@@ -87,7 +86,6 @@ def _search_margins(
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
-    """Runs `count` cells on each side of the edges of a sweep live, and compares verdicts."""
     from ..studies.sweep.live_confirmation import (
         choose_cells_near_edges,
         confirm_cell,
@@ -170,7 +168,6 @@ def _print_results(results: "SweepResults", more: list[str], path: Path) -> None
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
-    """Prints the commands that make logs of a cell, one per seed."""
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_run import build_reproduce_command
 
@@ -299,7 +296,6 @@ _OF_A_PLAN = ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--met
 
 
 def _refuse_beside_results(given: Sequence[str]) -> None:
-    """Refuses options that a sweep was planned with where it is finished or continued."""
     for name in _OF_A_PLAN:
         if name in given:
             raise UsageError(f"{name} is of the sweep already: leave it out")

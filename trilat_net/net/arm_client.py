@@ -28,7 +28,6 @@ from ..core.live_hand import GRIP_NS, SILENCE_NS, HandInForce
 from ..core.ticks import LifeReason
 from ..errors import UsageError, WireError
 from . import topics
-from .access_rules import OPERATOR
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
@@ -36,6 +35,7 @@ from .membership import new_boot, read_events
 from .messages import State
 from .requests import ArmEnable, ArmMeasurement, HandMessage, Request
 from .wire import decode, encode, split_states
+from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
 """Age at which a record is no longer the present: the site is late, or gone."""
@@ -57,7 +57,6 @@ class SiteSender:
     """Sends a site numbered messages of one kind, under one of its keys.
 
     Attributes:
-        boot: names this start of the sender.
         number: of the newest message; -1 before the first.
     """
 
@@ -247,10 +246,6 @@ class Hand(SiteClient):
     """Somebody at one arm; a context, which lets go at its end.
 
     Args:
-        bus: connection to the site.
-        clock: of this process.
-        session: the session's name.
-        site: the site of the arm.
         operator: the live hand of the scenario, as the core has it.
         place: returns where the arm is by its joint angles, in the coordinates of the target.
         source: who this is, for people.

@@ -135,7 +135,6 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
 
 
 def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
-    """Returns the first answer to a request; None if there is none in time."""
     replies, give_up_ns = bus.ask(key, encode(request)), clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)

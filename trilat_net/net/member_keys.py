@@ -24,7 +24,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
 from ..files import find_rights_of_others, make_folder, open_regular, stage_output
-from .access_rules import MOST_SESSIONS, PROTOCOLS, make_access_rules
+from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
     "authority.pem",
@@ -48,8 +48,6 @@ class MemberKeys(NamedTuple):
     """A member's keys.
 
     Attributes:
-        member: whose they are.
-        members: all that were made with them.
         ends: when the certificate ends, in UTC.
         settings: of Zenoh, see `make_zenoh_config`.
     """
@@ -94,7 +92,6 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Returns why these cannot be the members of a session, "" if they can."""
     for name in members:
         of_letters = isinstance(name, str) and all(c.isalnum() or c in "_-" for c in name)
         if not of_letters or not 0 < len(name) <= MOST_LETTERS or name == _AUTHORITY_FOLDER:
@@ -242,7 +239,6 @@ def read_member_keys(folder: str | Path) -> MemberKeys:
 def _find_fault(
     folder: Path, member: str, members: Sequence[str], certificate: x509.Certificate, key: Any
 ) -> str:
-    """Returns why the files of a member do not belong together, or do not hold now; "" if they do."""
     common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)

@@ -112,11 +112,12 @@ class MemberQuery:
     def poll(self) -> Iterator[Info]:
         """Yields the answers that have arrived; repeats the query when it is due."""
         while (reply := self._query.poll()) is not None:
-            parts = topics.parse_key(reply.key)
+            _, key, payload = reply
+            parts = topics.parse_key(key)
             if parts is None:
                 continue
             try:
-                info = decode(reply.payload, Info)
+                info = decode(payload, Info)
             except WireError as error:  # another version of this program, or a stranger
                 self.unreadable[parts.member] = str(error)
                 continue
@@ -131,7 +132,6 @@ class LateSites(NamedTuple):
     Attributes:
         returns: True if this site may: every one of the scenario waits for its peers and aligns with them.
         without: sites without which the session begins, if this one leads.
-        rate_hz: its tick rate.
     """
 
     returns: bool = False
@@ -287,7 +287,6 @@ class Epoch(NamedTuple):
     Attributes:
         mono_ns: on this process's monotonic clock.
         unix_ns: in Unix time, as the leader read it.
-        boots: the members and their boots.
         epochs: the same instant on every member's own clock; empty for a recorder that joins late.
         first: the first tick of this site.
         coming: what it says who joins late, until all acknowledge its samples.

@@ -7,7 +7,7 @@ then knows that clock to half the round trip, however far the clocks differ.
 
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..core.ticks import NS_PER_S
 from ..errors import WireError
@@ -22,14 +22,6 @@ from .wire import decode, encode
 QUERIES_KEPT = 128
 QUERY_EVERY_NS = 200_000_000
 """Between two queries for identities."""
-
-
-class QueryReply(NamedTuple):
-    """An answer: the time of its query, ns of the own clock; its key; its payload."""
-
-    asked_ns: int
-    key: str
-    payload: bytes
 
 
 class RepeatedQuery:
@@ -52,11 +44,11 @@ class RepeatedQuery:
             self.ask()
         return due
 
-    def poll(self) -> QueryReply | None:
-        """Returns an answer that has arrived, or None; never waits."""
+    def poll(self) -> tuple[int, str, bytes] | None:
+        """Returns when a query was sent, ns, and key and payload of its answer; None without. Never waits."""
         for asked_ns, inbox in self._open:
             if (reply := inbox.poll()) is not None:
-                return QueryReply(asked_ns, *reply)
+                return asked_ns, *reply
         return None
 
 
@@ -109,7 +101,6 @@ class RoundTrips:
 
     Attributes:
         rtts_ns: the latest round trips, without the time that the member held them.
-        latest: the latest estimate, None before the first.
     """
 
     def __init__(self, enough: int) -> None:
@@ -166,15 +157,15 @@ class Pinger:
         if wanted and self._query.repeat(pace_ns):
             self._glance_until_ns = self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
         while (reply := self._query.poll()) is not None:
-            now_ns = self._clock.monotonic_ns()
-            parts = topics.parse_key(reply.key)
+            asked_ns, key, payload = reply
+            now_ns, parts = self._clock.monotonic_ns(), topics.parse_key(key)
             try:
-                pong = decode(reply.payload, Pong)
+                pong = decode(payload, Pong)
             except WireError:
                 continue  # a stranger's
             if parts is not None and parts.member == pong.member and pong.boot in wanted:
                 trips = self.trips.setdefault(pong.boot, RoundTrips(self._enough))
-                trips.take(reply.asked_ns, pong, now_ns)
+                trips.take(asked_ns, pong, now_ns)
 
     def know(self, boots: Collection[int]) -> bool:
         """True once the clocks of all these members are known."""

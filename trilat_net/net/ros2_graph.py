@@ -80,7 +80,6 @@ class Attachment(NamedTuple):
 
     Attributes:
         number: of the message, from 1 on.
-        sent_unix_ns: when it was sent.
         gid: 16 bytes that name the sender; of a reply, who asked.
     """
 
@@ -93,8 +92,9 @@ class Attachment(NamedTuple):
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
 
-def parse_attachment(data: bytes) -> Attachment | None:
-    """Returns an attachment; None if it is none."""
+def parse_attachment(found: Any) -> Attachment | None:
+    """Returns the attachment in some bytes, or in those of Zenoh; None if it is none."""
+    data = b"" if found is None else bytes(found)
     if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
         return None
     number, sent_unix_ns, _, gid = _ATTACHMENT.unpack(data)
@@ -236,7 +236,6 @@ class Ros2Graph:
         refusals: takes what comes and cannot be taken.
         routers: endpoints of ROS's router, of which the first that answers is taken.
         namespace, name: of the node.
-        clock: tells when a message is sent.
         domain: ROS_DOMAIN_ID.
         distro: of `DISTROS`, the distribution of ROS 2 whose form it writes.
 
@@ -334,10 +333,9 @@ class Ros2Graph:
         self._listen(f"{self._place.domain}/{topic}/*/*", topic, heard)
 
     def _listen(self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]) -> None:
-        """Gives the messages of a key to `take`, each with its attachment; refuses those without."""
 
         def heard(sample: zenoh.Sample) -> None:
-            attachment = _read_attachment(sample.attachment)
+            attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
@@ -351,7 +349,7 @@ class Ros2Graph:
 
         def reply(query: zenoh.Query) -> None:
             with query:  # it ends for its sender only when it is dropped
-                asked = _read_attachment(query.attachment)
+                asked = parse_attachment(query.attachment)
                 if asked is None or query.payload is None:
                     self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return
@@ -367,7 +365,3 @@ class Ros2Graph:
         token = self._place.endpoint_token(self._endpoints, end, name, kind, type_hash, qos)
         self._kept.append(self._session.liveliness().declare_token(token))
         return topic_key(self._place.domain, name, kind, type_hash), make_gid(token)
-
-
-def _read_attachment(found: Any) -> Attachment | None:
-    return None if found is None else parse_attachment(found.to_bytes())

@@ -213,7 +213,6 @@ class SessionJoin:
         return None
 
     def _consider(self, event: Event) -> None:
-        """Takes an announced epoch if it is the leader's and for this boot."""
         if self.membership.leads or (self._sites and event.member != self._sites[0]):
             return
         if not self._sites and not any(
@@ -238,7 +237,6 @@ class SessionJoin:
         )
 
     def _reply_ready(self) -> None:
-        """Sends `ready` for the offered epoch once every clock that it needs is known."""
         event = self._offered
         if event is None or not self.pinger.know(self._other_clocks(event.boots, event.clocks)):
             return

@@ -112,9 +112,7 @@ class LinkTimingMonitor:
 
     Attributes:
         newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
-        faults: impossible stamps since the start.
         worst_ns: largest time by which a sample arrived before it was sent, since the last report.
-        contradicted: whether windows contradicted each other since then.
         unheard: True once the peer was found not to hear this site, until it hears it again.
     """
 
@@ -350,7 +348,6 @@ def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotic
 
 
 def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
-    """Reports a sample that arrived before it was sent, or windows that contradict each other."""
     name, before_ns, bound_ns = meter.peer.name, meter.worst_ns, meter.offset.bound_ns
     what = f"its stamps contradict those before, beyond the bound of {bound_ns / 1000:.0f} us"
     if before_ns:

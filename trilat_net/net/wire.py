@@ -49,7 +49,6 @@ _MODE_NAMES = {mode: mode.name.lower() for mode in Mode}
 
 @cache
 def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
-    """Returns the lengths of a message's vectors."""
     if kind is State:
         return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:

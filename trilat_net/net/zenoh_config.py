@@ -1,4 +1,4 @@
-"""The Zenoh configuration of a session member, and checks of a user's own configuration file.
+"""The Zenoh configuration of a session member, what each may send and hear, and checks of a user's own file.
 
 Invariant: explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never
 meet by accident. No setting of a user's file is overruled silently: it is taken, or refused with its key,
@@ -8,6 +8,12 @@ Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batc
 catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never waits and the receiver counts
 drops), and `express`, which sends each message by itself; it stays off because batching makes bursts of
 thousands of small messages fit.
+
+What a member may send, hear, ask and answer are rules of Zenoh's access control: everything that is not named
+is denied, at every member and at routers. A member speaks under its own name alone: its links show a
+certificate, and the name in it is the one that stands in its keys. A router carries what others said; it is
+trusted with all of it. Sizes are limited here, rates are not: Zenoh would thin out bursts, in which samples
+of ticks that are made up for arrive, and events of one tick.
 """
 
 import difflib
@@ -20,6 +26,7 @@ from typing import Any, Literal, NamedTuple
 
 from ..errors import UsageError
 from ..files import open_regular
+from . import topics
 
 LEASE_MS = 5_000
 """A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
@@ -108,22 +115,19 @@ def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str,
     return both
 
 
-class _Requirement(NamedTuple):
-    """Condition on the value of a key in a user's file."""
-
-    holds: Callable[[Any], bool]
-    must: str
+_Requirement = tuple[Callable[[Any], bool], str]
+"""Whether the value of a key in a user's file will do, and what it must be."""
 
 
 def _exactly(value: object, must: str) -> _Requirement:
-    return _Requirement(lambda stated: stated == value and isinstance(stated, type(value)), must)
+    return (lambda stated: stated == value and isinstance(stated, type(value)), must)
 
 
 def _at_least(least: int, must: str) -> _Requirement:
-    return _Requirement(lambda stated: isinstance(stated, int) and stated >= least, must)
+    return (lambda stated: isinstance(stated, int) and stated >= least, must)
 
 
-_OURS = _Requirement(lambda _: False, "left out: a session sets it itself")
+_OURS: _Requirement = (lambda _: False, "left out: a session sets it itself")
 _NAMED = _exactly(False, "false: members meet at named endpoints and nowhere else")
 _UNTOUCHED = _exactly([], "empty: it would change or thin out a session's messages")
 _TX = "transport/link/tx"
@@ -152,9 +156,7 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
     "qos/publication": _UNTOUCHED,
     "qos/network": _UNTOUCHED,
     "downsampling": _UNTOUCHED,
-    "low_pass_filter": _Requirement(
-        lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"
-    ),
+    "low_pass_filter": (lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"),
 }
 """Requirements of a session by the path of the key in Zenoh's configuration."""
 
@@ -195,10 +197,10 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
         raise UsageError(f"{source}: {'/'.join(path)}: {_suggest_key(path, reason)}")
     for key, value in _leaves(settings, ()):
         need = REQUIREMENTS.get(key)
-        if need is not None and not need.holds(value):
+        if need is not None and not need[0](value):
             text = json.dumps(value)
             shown = text if len(text) <= 60 else f"{text[:57]}..."
-            raise UsageError(f"{source}: {key}: {shown} must be {need.must}")
+            raise UsageError(f"{source}: {key}: {shown} must be {need[1]}")
         if key.startswith("access_control/") and "enabled" not in settings["access_control"]:
             raise UsageError(
                 f"{source}: access_control: has no `enabled: true`, without which Zenoh lets everybody in"
@@ -238,7 +240,6 @@ def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tupl
 def _find_refused_key(
     settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
 ) -> tuple[tuple[str, ...], str] | None:
-    """Finds the key that Zenoh refuses, and its reason, by trying each key alone."""
     for key, value in settings.items():
         here = (*path, key)
         alone: Any = value
@@ -251,10 +252,123 @@ def _find_refused_key(
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    """Adds the most similar key to the refusal of an unknown key."""
     unknown = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
     if unknown is None or not path or unknown[1] != path[-1]:
         return reason
     near = difflib.get_close_matches(unknown[1], re.findall(r"`([^`]*)`", unknown[2]), 1)
     choice = f"did you mean {near[0]}?" if near else f"there are {unknown[2].replace('`', '')}"
     return f"no key of Zenoh's; {choice}"
+
+
+RECORDER, OPERATOR, ROUTER, BRIDGE = topics.RECORDER, "operator", "router", "bridge"
+PROTOCOLS = ("tls", "quic")
+
+MOST_REPLY_BYTES = 8_388_608
+"""The largest answer that a link takes: records sent again."""
+MOST_SESSIONS = 64
+
+
+class _Role(NamedTuple):
+    """The channels of a kind of member.
+
+    Attributes:
+        publishes: under its own name.
+        answers: questions to its own name.
+        hears: of everybody.
+        hears_own: what is addressed to its own name.
+        asks: of everybody.
+        addresses: publishes under everybody's name: what is addressed to them.
+    """
+
+    publishes: tuple[str, ...]
+    answers: tuple[str, ...]
+    hears: tuple[str, ...]
+    asks: tuple[str, ...]
+    hears_own: tuple[str, ...] = ()
+    addresses: tuple[str, ...] = ()
+
+
+SITE_ROLE = _Role(
+    publishes=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.MEASURED),
+    answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
+    hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
+    asks=(topics.INFO, topics.PING, topics.STOP),
+    hears_own=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
+)
+RECORDER_ROLE = _Role(
+    publishes=(topics.EVENT, topics.STATS),
+    answers=(topics.INFO, topics.PING),
+    hears=(topics.STATE, topics.LINK, topics.EVENT),
+    asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
+)
+OPERATOR_ROLE = _Role(
+    publishes=(),
+    answers=(),
+    hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS),
+    asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
+    addresses=(topics.HAND, topics.ENABLE),
+)
+BRIDGE_ROLE = _Role(
+    publishes=(),
+    answers=(),
+    hears=(topics.STATE, topics.EVENT),
+    asks=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
+    addresses=(topics.HAND, topics.MEASURED),
+)
+ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE, BRIDGE: BRIDGE_ROLE}
+"""Of members that are no sites."""
+
+
+def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
+    """Returns Zenoh's settings that hold members, a router among them or not, to their roles."""
+    rules: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for member in members:
+        relayed = [_rule(["ingress", "egress"], _EVERY, [f"{topics.ROOT}/**"])]
+        own = relayed if member == ROUTER else _hold(member, ROLES.get(member, SITE_ROLE))
+        kept = (rule for rule in own if rule["key_exprs"])
+        named = [{"id": f"{member} {n}", "permission": "allow", **rule} for n, rule in enumerate(kept)]
+        rules += named
+        policies.append({"rules": [rule["id"] for rule in named], "subjects": [member]})
+    subjects = [
+        {"id": member, "cert_common_names": [member], "link_protocols": list(PROTOCOLS)} for member in members
+    ]
+    control = {"enabled": True, "default_permission": "deny", "rules": rules}
+    return {
+        "access_control": {**control, "subjects": subjects, "policies": policies},
+        "low_pass_filter": [
+            *SIZE_LIMITS,
+            limit_sizes("replies", ["reply"], MOST_REPLY_BYTES),
+        ],
+    }
+
+
+_ALIVE = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
+_EVERY = "put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", *_ALIVE
+
+
+def _hold(member: str, role: _Role) -> Iterator[dict[str, Any]]:
+    """Yields what comes from a member (ingress) and what goes to it (egress)."""
+
+    def keys(whose: str, channels: Sequence[str]) -> list[str]:
+        """Returns the keys of some channels of a member, or of every one, in any session."""
+        return [topics.key("*", whose, channel) for channel in channels]
+
+    says = keys(member, role.publishes) + keys("*", role.addresses)
+    hears = keys("*", role.hears) + keys(member, role.hears_own)
+    everyone = [topics.presence_key("*", "*")]
+    yield _rule(["ingress"], ["put"], says)
+    yield _rule(["ingress"], ["declare_subscriber"], hears)
+    yield _rule(["ingress"], ["declare_queryable", "reply"], keys(member, role.answers))
+    yield _rule(["ingress"], ["query"], keys("*", role.asks))
+    yield _rule(["ingress"], ["liveliness_token"], [topics.presence_key("*", member)])
+    yield _rule(["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], everyone)
+    yield _rule(["egress"], ["put"], hears)
+    yield _rule(["egress"], ["declare_subscriber"], keys("*", (*role.publishes, *role.addresses)))
+    yield _rule(["egress"], ["query"], keys("*", role.answers))
+    yield _rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
+    yield _rule(["egress"], _ALIVE, everyone)
+
+
+def _rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
+    return {"flows": flows, "messages": list(messages), "key_exprs": keys}

@@ -4,10 +4,7 @@ Invariant: a scenario that loads also runs; every mistake that a person can make
 path of the key and the nearest valid name.
 """
 
-from .arms import Arm as Arm
-from .delay_models import Link as Link
 from .expect import Expect as Expect
-from .operators.kernel_operators import Pulse as Pulse
 from .override import apply_overrides as apply_overrides
 from .run_changes import find_owner as find_owner
 from .run_changes import initial_link_tables as initial_link_tables
@@ -23,7 +20,5 @@ from .scenario_reader import parse_embedded as parse_embedded
 from .scenario_reader import parse_scenario as parse_scenario
 from .scenario_reader import read_shipped as read_shipped
 from .scenario_reader import read_template as read_template
-from .scenario_types import Limits as Limits
-from .scenario_types import OnStale as OnStale
 from .scenario_types import Scenario as Scenario
 from .scenario_types import SiteSpec as SiteSpec

@@ -28,7 +28,7 @@ from ..core.chain import (
 from ..core.rotation import rotation_matrix, turn_between
 from ..core.site_setup import ChainSetup, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
-from ..core.vectors import Array, Vector
+from ..core.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
@@ -171,13 +171,9 @@ class ArmModel(NamedTuple):
 
     Attributes:
         theta: its true parameters: Eq. (24) for the planar arm, ten a link for a chain.
-        counts: how many numbers the vectors of its site have.
-        joint_names: of its joints.
-        link_names: of the links that these move.
         efforts: largest effort that its file states for each joint, N m or N; inf where it states none.
         speeds: largest speed so, rad/s or m/s.
         lengths_m: of the two links of the planar arm; (0, 0) of a chain.
-        chain: the chain, or None for the planar arm.
     """
 
     theta: Array
@@ -207,16 +203,19 @@ class ArmModel(NamedTuple):
         if self.chain is None:
             (l1, l2), turned = self.lengths_m, q[0] + q[1]
             return [l1 * math.cos(q[0]) + l2 * math.cos(turned), l1 * math.sin(q[0]) + l2 * math.sin(turned)]
+        return list(place_end_effector(self._place(q), np.array(self.chain.tip_m)))
+
+    def _place(self, q: Vector | Array) -> RowArray:
+        assert self.chain is not None
         rows = build_chain(self.chain.joints)
         place_joints(rows, np.asarray(q, dtype=np.float64))
-        return list(place_end_effector(rows, np.array(self.chain.tip_m)))
+        return rows
 
     def end_turn(self, q: Vector) -> tuple[float, float, float]:
         """Returns the end effector's orientation in a pose as a rotation vector, rad."""
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
-        rows = build_chain(self.chain.joints)
-        place_joints(rows, np.asarray(q, dtype=np.float64))
+        rows = self._place(q)
         place_end_effector(rows, np.array(self.chain.tip_m))  # which turns the links into base axes
         return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
@@ -244,8 +243,7 @@ class ArmModel(NamedTuple):
         """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n), per joint."""
         assert self.chain is not None
         assert self.chain.task is not None
-        rows = build_chain(self.chain.joints)
-        place_joints(rows, np.asarray(q, dtype=np.float64))
+        rows = self._place(q)
         place_end_effector(rows, np.array(self.chain.tip_m))
         J = np.hstack([self.chain.task.scale * rows["J_lin"], rows["J_ang"]]).T
         found: Array = J[: self.counts.shared]
@@ -260,9 +258,7 @@ class ArmModel(NamedTuple):
 
     def inertia(self, q: Array) -> Array:
         """Returns M(q) of a chain, shape (n, n), with the inertia of its drives."""
-        assert self.chain is not None
-        rows = build_chain(self.chain.joints)
-        place_joints(rows, np.asarray(q, dtype=np.float64))
+        rows = self._place(q)
         mass_matrix(rows, self.theta)
         lower = np.tril(rows["M"])
         M: Array = lower + np.tril(lower, -1).T

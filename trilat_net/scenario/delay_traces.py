@@ -1,7 +1,9 @@
-"""Delay traces: from a CSV file or an earlier log to the text that a resolved scenario holds.
+"""Delay traces: from a CSV file, an earlier log or what `irtt` and `ping` measured, to a scenario's text.
 
-Invariant: a scenario that ran does not need the file again. Times count from the trace's first point;
-times and delays are whole microseconds.
+Invariant: a scenario that ran does not need the file again. Times count from the trace's first point, of a
+measurement from the first sending; times and delays are whole microseconds. A sample without an answer is
+lost, and so is one that took longer than a link may. Half a round trip stands for one way, unless one way was
+measured and is asked for. Data of others is read where it is, never shipped.
 
     t_s,delay_ms
     0.000,41.2
@@ -9,19 +11,25 @@ times and delays are whole microseconds.
 """
 
 import csv
+import gzip
+import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..core.channel import LOST
 from ..core.delay import MAX_DELAY_US
-from ..core.vectors import Points
-from ..errors import ScenarioError
+from ..core.vectors import Array, Points
+from ..errors import ScenarioError, UsageError
 from ..files import open_regular
+from ..results import Result
 
 MAX_TRACE_POINTS = 200_000
 """Most points of one trace: 200 s of a log at 1 kHz."""
@@ -128,3 +136,232 @@ def parse_trace(text: str) -> Points:
         raise ValueError(f"its delays must be from 0 to {MAX_DELAY_US} us, or {_LOST!r}")
     points.flags.writeable = False
     return points
+
+
+WAYS = ("half", "send", "receive", "whole")
+"""Half of a round trip, one way of `irtt` there or back, or what stands there as it is."""
+LONGEST_MS = MAX_DELAY_US / 1e3
+_MOST_BYTES = 2**30
+_SEQUENCES = 2**16
+"""After so many `ping` counts from 0 again."""
+_PING = re.compile(
+    r"^(?:\[(?P<at>\d+\.\d+)\] )?.*icmp_seq[= ](?P<n>\d+)\b(?:.*\btime[=<](?P<ms>[\d.]+) ?ms)?"
+)
+_COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
+_UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_TIMES, _DELAYS = ("t", "time", "timestamp", "pub_time"), ("delay", "rtt", "latency")
+
+Sent = list[tuple[float, float]]
+"""Times of sending, s, and what was measured, ms; infinite of a sample without an answer."""
+
+
+@dataclass(frozen=True, repr=False)
+class MeasuredTrace(Result):
+    """A trace from a measurement.
+
+    Attributes:
+        points: times of sending from the first on, s, and delays, ms; infinite of a sample lost.
+        too_long: samples that count as lost because they took longer than a link may.
+        doubled: samples left out because another one has their time.
+        cut: samples left out at the end because a trace has a most of points.
+    """
+
+    points: tuple[TracePoint, ...]
+    too_long: int
+    doubled: int
+    cut: int
+
+    @property
+    def delay_ms(self) -> Array:
+        """The delays of what was not lost, in order."""
+        return np.array([ms for _, ms in self.points if math.isfinite(ms)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain values, with the keys of `trilat trace import --json`."""
+        delay_ms, lost = self.delay_ms, np.array([math.isinf(ms) for _, ms in self.points])
+        bursts = int(np.sum(np.diff(lost.astype(np.int8), prepend=0) == 1))
+        found: dict[str, Any] = {
+            "samples": len(self.points),
+            "span_s": self.points[-1][0],
+            "lost_percent": 100.0 * float(lost.mean()),
+            "lost_in_a_row": float(lost.sum() / bursts) if bursts else 0.0,
+            "too_long": self.too_long,
+            "doubled": self.doubled,
+            "cut": self.cut,
+        }
+        if not len(delay_ms):
+            return found
+        low, median, high, most = np.percentile(delay_ms, (0.0, 50.0, 99.0, 100.0)).tolist()
+        off = delay_ms - delay_ms.mean()
+        return {
+            **found,
+            "min_ms": low,
+            "p50_ms": median,
+            "mean_ms": float(delay_ms.mean()),
+            "p99_ms": high,
+            "max_ms": most,
+            "deviation_ms": float(delay_ms.std()),
+            "correlation": float(off[1:] @ off[:-1] / (off @ off)) if off.any() else 0.0,
+        }
+
+    def blocks(self) -> list[str]:
+        """Returns the lines of its text."""
+        facts = self.to_dict()
+        lost = f"{facts['lost_percent']:.2f} % lost, {facts['lost_in_a_row']:.1f} in a row"
+        lines = [f"{facts['samples']} samples in {facts['span_s']:.1f} s, {lost}"]
+        if "min_ms" in facts:
+            shown = ("min", "p50", "mean", "p99", "max", "deviation")
+            lines.append("delay, ms: " + ", ".join(f"{name} {facts[f'{name}_ms']:.2f}" for name in shown))
+            lines.append(f"correlation from one sample to the next: {facts['correlation']:.3f}")
+        said = {
+            "too_long": f"took longer than {LONGEST_MS / 1e3:g} s and count as lost",
+            "doubled": "have the time of another one and are left out",
+            "cut": f"are left out at the end: a trace has at most {MAX_TRACE_POINTS} points",
+        }
+        return lines + [f"{facts[key]} {words}" for key, words in said.items() if facts[key]]
+
+    def write_rows(self) -> str:
+        """Returns the table that a link of model "trace" reads: t_s,delay_ms."""
+        rows = (f"{t_s:.6f},{'lost' if math.isinf(ms) else f'{ms:.3f}'}" for t_s, ms in self.points)
+        return "\n".join(["t_s,delay_ms", *rows]) + "\n"
+
+
+def import_trace(
+    path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
+) -> MeasuredTrace:
+    """Returns the trace of a file of `irtt client -o`, of `ping -D`, or of a table with a head.
+
+    >>> with open("table.csv", "w") as table:
+    ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
+    >>> tn.import_trace("table.csv", "csv").delay_ms.tolist()
+    [10.0, 20.0]
+
+    Args:
+        path: the file; JSON may be gzipped.
+        form: "irtt", "ping" or "csv".
+        way: one of `WAYS`; "send" and "receive" are those of irtt, whose clocks must agree then. "": half of
+            what is a round trip, as irtt, ping and a column "rtt" have it.
+        column: the column of delays in a table; "": the first one named like one.
+        every_s: the interval of a `ping` without -D, which does not print when it sent, s.
+
+    Raises:
+        UsageError: there is no such form, or it has no such way.
+        ScenarioError: the file cannot be read, or is not of that form.
+    """
+    if form not in _READERS:
+        raise UsageError(f"a trace is imported from {', '.join(_READERS)}, not from {form!r}")
+    ways = WAYS if form == "irtt" else ("half", "whole")
+    if way and way not in ways:
+        raise UsageError(f"the way of {form} is {', '.join(ways)}, not {way!r}")
+    try:
+        with open_regular(Path(path)) as stream:
+            raw = stream.read(_MOST_BYTES)
+        text = (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode("utf-8-sig")
+        return _arrange(_READERS[form](text, way, column, every_s))
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
+        raise ScenarioError(f"{path}: is not of the form {form}: {error}") from None
+
+
+def _arrange(sent: Sent) -> MeasuredTrace:
+    if not sent:
+        raise ValueError("it has no samples")
+    sent.sort(key=lambda one: one[0])
+    begin_s, points, too_long, doubled = sent[0][0], [], 0, 0
+    last_us = -1
+    for at_s, ms in sent:
+        t_us = round((at_s - begin_s) * 1e6)
+        if t_us <= last_us:
+            doubled += 1
+            continue
+        if not ms >= 0.0:
+            raise ValueError(
+                f"a delay of {ms:g} ms: the clocks do not agree, half of the round trip is known"
+            )
+        last_us = t_us
+        too_long += LONGEST_MS < ms < math.inf
+        points.append((t_us * 1e-6, ms if ms <= LONGEST_MS else math.inf))
+    found = MeasuredTrace(
+        tuple(points[:MAX_TRACE_POINTS]), too_long, doubled, max(0, len(points) - MAX_TRACE_POINTS)
+    )
+    format_trace(found.points)
+    return found
+
+
+def _read_irtt(text: str, way: str, *_: object) -> Sent:
+    """Reads `irtt client -o`: nanoseconds, and a status of loss in words."""
+    key, share = {"half": ("rtt", 0.5), "whole": ("rtt", 1.0)}.get(way or "half", (way, 1.0))
+    sent: Sent = []
+    for trip in json.loads(text)["round_trips"]:
+        times = trip["timestamps"]["client"]["send"]
+        answered = trip["lost"] == "false"
+        ms = share * trip["delay"][key] * 1e-6 if answered else math.inf
+        sent.append((times.get("monotonic", times.get("wall")) * 1e-9, ms))
+    return sent
+
+
+def _read_ping(text: str, way: str, _: str, every_s: float) -> Sent:
+    """Reads the lines of `ping`, best of `ping -D`; numbers that are missing are samples lost."""
+    share, seen = (1.0 if way == "whole" else 0.5), {}
+    number, stamped = -1, True
+    for line in text.splitlines():
+        found = _PING.match(line)
+        if found is None:
+            continue
+        n = int(found["n"])
+        number = n if number < 0 else number + (n - number + _SEQUENCES // 2) % _SEQUENCES - _SEQUENCES // 2
+        if found["ms"] is None or number in seen:  # no answer, or a second one
+            continue
+        stamped = stamped and found["at"] is not None
+        ms = float(found["ms"])
+        seen[number] = (float(found["at"] or 0.0) - ms * 1e-3, share * ms)
+    if not seen:
+        raise ValueError("no line tells of an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
+    numbers = np.arange(min(seen), max(seen) + 1)
+    at_s = numbers * every_s
+    if stamped:
+        at_s = np.interp(numbers, list(seen), [at for at, _ in seen.values()])
+    return [(float(t), seen.get(int(n), (0.0, math.inf))[1]) for n, t in zip(numbers, at_s, strict=True)]
+
+
+def _read_table(text: str, way: str, column: str, _: float) -> Sent:
+    """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or t_s,delay_ms."""
+    numbered = enumerate(text.splitlines(), start=1)
+    (_, head), *lines = [(n, line) for n, line in numbered if line.strip() and not line.startswith("#")]
+    cells = _split_cells(head)
+    time, time_s = _find_column(cells, _TIMES, "")
+    delay, delay_s = _find_column(cells, _DELAYS, column)
+    half = way == "half" or (not way and "rtt" in cells[delay].lower())
+    unit_ms = delay_s * (500.0 if half else 1e3)
+    sent: Sent = []
+    for number, line in lines:
+        row = _split_cells(line)
+        try:
+            ms = math.inf if row[delay] in ("lost", "-1", "") else unit_ms * float(row[delay])
+            sent.append((float(row[time]) * time_s, ms))
+        except (IndexError, ValueError):
+            raise ValueError(f"line {number} is not as its head says") from None
+    return sent
+
+
+def _split_cells(line: str) -> list[str]:
+    return [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
+
+
+def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
+    for place, cell in enumerate(cells):
+        found = _COLUMN.match(cell)
+        if found is not None and (cell == wanted if wanted else found["name"].lower() in names):
+            unit = found["suffix"] or found["unit"]
+            if unit is None:
+                raise ValueError(f"its column {cell!r} names no unit, as {cell}_ms would")
+            return place, _UNIT_S[unit]
+    raise ValueError(f"its head has no {wanted or f'column like {names[0]}_ms'}")
+
+
+_READERS: dict[str, Callable[[str, str, str, float], Sent]] = {
+    "irtt": _read_irtt,
+    "ping": _read_ping,
+    "csv": _read_table,
+}

@@ -56,7 +56,6 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
 
 
 def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each site, its law, and what the condition of that may be made of."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     every = (scenario.names, scenario.controls, scenario.alpha, _find_link_delays(scenario.links, rates_hz))
     ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
@@ -82,7 +81,6 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns which dominance factors have no effect by the laws that have them, and why."""
     ramped = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
     for name, law, situation in _list_situations(scenario):
@@ -133,7 +131,6 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 
 def _describe_arms(scenario: Scenario) -> list[str]:
-    """Returns the facts of the arms that come from files: their joints, what these move, and their limits."""
     lines: list[str] = []
     for arm in dict.fromkeys(spec.arm for spec in scenario.sites.values() if spec.arm.urdf):
         owners = [name for name, spec in scenario.sites.items() if spec.arm == arm]
@@ -159,7 +156,6 @@ def _describe_arms(scenario: Scenario) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns how far every site in task space starts from a singular pose."""
     lines = []
     for name, model in scenario.arms.items():
         if model.shares_pose:
@@ -255,7 +251,6 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the keys whose values differ; a law of another kind as a whole."""
     if len({table.get("control", {}).get("law") for table in tables}) > 1:
         laws = ScenarioDifference("control", (), tuple(describe_law(table["control"]) for table in tables))
         rest = [{key: value for key, value in table.items() if key != "control"} for table in tables]
@@ -269,7 +264,6 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the links that differ, those with the same difference as one."""
     alike: dict[tuple[str, ...], list[str]] = {}
     common = [name for name in scenarios[0].links if all(name in other.links for other in scenarios)]
     for name in common:

@@ -200,12 +200,18 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
         return list(name_law_classes(overrides).items())
     pairs = []
     for text in overrides:
-        key, equals, value = str(text).partition("=")
-        if not equals or not key.strip():
+        if (pair := split_assignment(str(text))) is None:
             raise ScenarioError(f"an override reads KEY=VALUE, as in control.Kd=5, not {text!r}")
-        try:
-            parsed: Any = tomllib.loads(f"value = {value}")["value"]
-        except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
-            parsed = value.strip()
-        pairs.append((key.strip(), parsed))
+        pairs.append(pair)
     return pairs
+
+
+def split_assignment(text: str) -> Override | None:
+    """Returns the key and the value, TOML or a bare word, of a text KEY=VALUE; None if it is none."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        return None
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
+        return key.strip(), value.strip()

@@ -31,6 +31,7 @@ from ..fields import (
     is_distribution,
     is_number,
     reword_problem,
+    split_refusal,
     suggest_nearest,
 )
 from ..files import open_regular
@@ -152,7 +153,6 @@ def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
-    """Returns the text of a file that an arm names, or as much of it as shows that it is too long."""
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.urdf")
     try:
@@ -183,7 +183,6 @@ def _resolve_control(written: Any, default: TomlTable, path: str, counts: Vector
 
 
 def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: str) -> TomlTable:
-    """Returns a user's law: the hash of its file, and its settings."""
     inherited = default if default.get("law") == code else {}
     settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
     if not re.fullmatch(LAW_PATH_PATTERN, code):
@@ -284,7 +283,6 @@ def _resolve_site(
 def _resolve_arm(
     site: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool, path: str
 ) -> tuple[TomlTable, ArmModel | None]:
-    """Returns an arm's table with all numbers drawn, and its model, see `_model_arm`."""
     table, task = dict(site["arm"]), site["task"]
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
     table = draws.draw_numbers(table, path)
@@ -315,8 +313,8 @@ def _model_arm(
     except msgspec.ValidationError as error:
         if not (table.get("urdf") or chains):
             return None
-        problem, _, place = str(error).partition(" - at ")
-        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('`$.')}") from None
+        problem, place = split_refusal(error)
+        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('.')}") from None
     foreign = [key for key in table if key in (ArmLinks._fields if arm.urdf else CHAIN_KEYS)]
     if foreign:
         owner = f"belongs to the planar arm, and this one is {arm.urdf}" if arm.urdf else _OF_A_CHAIN
@@ -328,17 +326,16 @@ def _model_arm(
         raise ScenarioError(problem, path=f"{path}.{placed[0]}")
     if sum(abs(x) for x in arm.down) < 1e-6:
         raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
+    own = f"{path.removesuffix('arm')}task"
     try:
         task = msgspec.convert(task_table, Task)
     except msgspec.ValidationError as error:
         if any(map(is_distribution, task_table.values())):
             return None
-        problem, _, place = str(error).partition(" - at ")
-        raise ScenarioError(
-            reword_problem(problem), path=f"{path.removesuffix('arm')}task.{place.strip('`$.')}"
-        ) from None
+        problem, place = split_refusal(error)
+        raise ScenarioError(reword_problem(problem), path=f"{own}.{place.strip('.')}") from None
     if idle := task.find_idle_key(task_table):
-        raise ScenarioError(idle.problem, path=f"{path.removesuffix('arm')}task.{idle.key}")
+        raise ScenarioError(idle.problem, path=f"{own}.{idle.key}")
     try:
         return build_arm(arm, task, urdf, chains)
     except ScenarioError as error:
@@ -348,7 +345,6 @@ def _model_arm(
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of a site that do not fit its arm."""
     law = site["control"].get("law", "adaptive")
     tables: list[tuple[TomlTable, type[Frozen], str]]
     tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm"), (site["task"], Task, f"{path}.task")]

@@ -110,7 +110,6 @@ class ExperimentText(NamedTuple):
     Attributes:
         called: what a command calls it: a shipped name or a path; of one that is in no file the path at which
             a command would look for it.
-        text: its TOML text.
         folder: of the files that it names; None: it is resolved, and names none.
     """
 

@@ -124,13 +124,8 @@ class SiteSpec(Frozen, frozen=True):
         rate_hz: tick rate of its loop, Hz.
         q0_rad: start pose, rad.
         qd0_rad_s: start velocity, rad/s.
-        arm: its links.
-        control: its law and gains.
-        limits: its limits.
         on_stale: its rule for a peer whose samples are too old.
         task: what it follows: joints, or its end effector.
-        hands: its operators.
-        environment: its environment.
         plant: "simulated"; or "external": an arm outside of the program, whose state is measured.
     """
 

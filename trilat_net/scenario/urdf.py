@@ -192,7 +192,6 @@ def _refuse(place: str, problem: str) -> NoReturn:
 
 
 def _quote(word: str) -> str:
-    """Returns a name or a number of the file, so short that a message stays one."""
     return repr(word if len(word) <= 60 else f"{word[:57]}...")
 
 
@@ -212,7 +211,6 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Returns the root element of a document that is what it seems."""
     if len(text) > MAX_CHARACTERS:
         _refuse("", f"has {len(text)} characters, at most {MAX_CHARACTERS} are read")
     for word in ("<!DOCTYPE", "<!ENTITY"):
@@ -237,7 +235,6 @@ def _parse_xml(text: str) -> Element:
 
 
 def _name_elements(root: Element, tag: str) -> dict[str, Element]:
-    """Returns the links or joints of a robot by name."""
     named: dict[str, Element] = {}
     for n, element in enumerate(root.findall(tag), 1):
         name = element.get("name", "")
@@ -250,7 +247,6 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _read_tree(root: Element) -> _Robot:
-    """Returns the links and how joints connect them, which must be a tree."""
     links = _name_elements(root, "link")
     above: dict[str, _Edge] = {}
     below: dict[str, list[_Edge]] = {name: [] for name in links}
@@ -327,7 +323,6 @@ def _find_tip(robot: _Robot, base: str, tip: str) -> str:
 
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
-    """Returns the joints from the base to the end link; those that a chain cannot have are refused."""
     path: list[_Edge] = []
     name = tip
     while name != base:
@@ -387,7 +382,6 @@ def _gather_bodies(
 
 
 def _read_joint(edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]) -> UrdfJoint:
-    """Returns a joint that moves, with its axis, limits and friction."""
     place = _joint(edge.name)
     axis = _child(edge.element, "axis", place)
     x, y, z = (1.0, 0.0, 0.0) if axis is None else _read_vector(axis, "xyz", place)
@@ -530,7 +524,6 @@ def _principal_moments(tensor: Matrix) -> list[float]:
 
 
 def _check_stated(place: str, mass: float, tensor: Matrix) -> None:
-    """Refuses a body that cannot be; points and rods without thickness may."""
     if mass < 0.0:
         _refuse(place, f"its mass is {mass:g} kg, must not be negative")
     if mass == 0.0 and any(map(any, tensor)):
@@ -541,7 +534,6 @@ def _check_stated(place: str, mass: float, tensor: Matrix) -> None:
 
 
 def _check_moments(place: str, moments: Sequence[float], bound: float, slack: float) -> None:
-    """Refuses principal moments below a bound, and one that exceeds the two others together."""
     least, middle, most = moments
     stated = f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
     if least < bound:

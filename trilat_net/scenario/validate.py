@@ -16,7 +16,7 @@ import numpy as np
 from ..core.dominance import is_irreducible
 from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
 from ..errors import ScenarioError
-from ..fields import TomlTable, reword_problem
+from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
 from ..laws.sent_vectors import check_sends
 from . import operators
@@ -172,8 +172,8 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         with _FIRST_USE:
             scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
-        problem, _, path = str(error).partition(" - at ")
-        dotted = _name_key(resolved, path.strip("`$."))
+        problem, path = split_refusal(error)
+        dotted = _name_key(resolved, path.strip("."))
         drawn = resolved.get("drawn", {}).get(dotted_key(dotted))
         why = f"; {drawn['value']:g} was drawn with seed {resolved['seed']}" if drawn else ""
         raise ScenarioError(_reword(problem, dotted) + why, path=dotted) from None
@@ -202,7 +202,11 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     joints = {name: model.counts.joints for name, model in scenario.arms.items()}
     if found := find_expect_problem(scenario.expect, joints):
         raise ScenarioError(found.problem, path=f"expect.{found.key}")
-    return msgspec.structs.replace(scenario, timeline=tuple(map(_normalise_change, scenario.timeline)))
+    timeline = (  # links as in `links`, so that 350 and 350.0 are one experiment
+        msgspec.structs.replace(one, to=msgspec.to_builtins(one.after)) if one.link else one
+        for one in scenario.timeline
+    )
+    return msgspec.structs.replace(scenario, timeline=tuple(timeline))
 
 
 def _check_joint_space(scenario: Scenario) -> None:
@@ -262,7 +266,6 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses vectors of one name and of several lengths that a site would get of its peers."""
     for site in scenario.names:
         lengths: dict[str, tuple[str, int]] = {}
         for peer in scenario.peers(site):
@@ -300,7 +303,6 @@ def _check_energy_laws(scenario: Scenario) -> None:
 
 
 def _check_start_poses(scenario: Scenario) -> None:
-    """Refuses an arm that would start beyond a stop."""
     for name, model in scenario.arms.items():
         joints = model.chain.joints if model.chain is not None else ()
         for n, (joint, start) in enumerate(zip(joints, scenario.sites[name].q0_rad, strict=False)):
@@ -389,13 +391,6 @@ def _check_live_hands(site: SiteSpec, path: str) -> None:
         )
 
 
-def _normalise_change(change: Change) -> Change:
-    """Returns a change with its link written as in `links`, so that 350 and 350.0 are one experiment."""
-    if not change.link:
-        return change
-    return msgspec.structs.replace(change, to=msgspec.to_builtins(change.after))
-
-
 def check_links_memory(scenario: Scenario, site: str) -> None:
     """Refuses links of a site whose delays would take more than `MAX_LINKS_BYTES`.
 
@@ -472,14 +467,13 @@ def check_change(change: Change, path: str) -> None:
     try:
         found = change.after.find_problem()
     except msgspec.ValidationError as error:
-        problem, _, key = str(error).partition(" - at ")
-        raise ScenarioError(_reword(problem, key.strip("`$.")), path=f"{path}.to{key.strip('`$')}") from None
+        problem, key = split_refusal(error)
+        raise ScenarioError(_reword(problem, key.strip(".")), path=f"{path}.to{key}") from None
     if found:
         raise ScenarioError(found.problem, path=f"{path}.to.{found.key}")
 
 
 def _reword(problem: str, path: str) -> str:
-    """Returns a validation message in the words of a scenario's author."""
     if problem.startswith("Invalid enum value"):
         choices = _CHOICES[path.rpartition(".")[2]]
         return f"is {problem.removeprefix('Invalid enum value ')}, must be {' or '.join(map(repr, choices))}"

@@ -37,7 +37,6 @@ def session_payloads(path: Path) -> dict[str, list[bytes]]:
 
 
 def event(site: str, n: int) -> bytes:
-    """A small message that is numbered."""
     return encode(Event(member=site, boot=BOOT, kind="mode", text=f"{site} {n}", n=n))
 
 
@@ -60,7 +59,6 @@ def write(path: Path, messages: Iterable[tuple[str, int, int, int]], session: st
 
 
 def loaded(*paths: Path, **selection: Any) -> tuple[SessionHeader, MessageBatch]:
-    """What is preloaded of files."""
     header, batch = preload_messages(paths, PlaySelection(**selection), 1 << 28)
     assert batch is not None
     return header, batch

@@ -30,7 +30,6 @@ def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
 
 
 def sorted_in(messages: list[PlayedMessage], *how: int, **limits: int) -> tuple[list[PlayedMessage], int]:
-    """Messages in the order of play, and how many stood too far away."""
     found = list(sort_messages(messages, *how, **limits))
     return joined([batch for batch, _ in found]), sum(strays for _, strays in found)
 
@@ -73,7 +72,6 @@ def test_messages_beyond_the_memory_limit_are_given_early() -> None:
 
 @contextmanager
 def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
-    """A source whose process reads a log, and its header."""
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
         source.read([path], PlaySelection(), loop=loop)
@@ -82,7 +80,6 @@ def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionH
 
 
 def taken(source: MessageSource) -> list[MessageBatch]:
-    """A round of a source, whose process writes while this one reads."""
     blocks = []
 
     def over() -> bool:

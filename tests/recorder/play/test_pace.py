@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.pace import LATENESS_LIMIT_US, SPIN_NS, LatenessHistogram, Pace, parse_rate, wait_until
+from recorder.play.player import LATENESS_LIMIT_US, SPIN_NS, LatenessHistogram, Pace, parse_rate, wait_until
 from trilat_net.errors import UsageError
 
 from .clocks import LookedAt

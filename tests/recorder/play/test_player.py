@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from recorder.play.batch import BatchBuilder, MessageBatch
 from recorder.play.message_source import MessageSource
-from recorder.play.pace import Pace
-from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Player, PlayProgress
+from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Pace, Player, PlayProgress
 from recorder.play.session_reader import SessionHeader
 from recorder.play.site_stand_ins import PlayedHistory
 from trilat_net.scenario import load_scenario
@@ -23,7 +22,6 @@ messages = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 2)), min_size=1
 
 
 def block(given: Iterable[tuple[int, int]]) -> MessageBatch:
-    """Messages at (ms, on a channel), numbered by their time, told by their place."""
     gathering = BatchBuilder()
     for number, (t_ms, channel) in enumerate(sorted(given)):
         gathering.add(t_ms * MS, channel, number, bytes([number]))
@@ -34,7 +32,6 @@ HEADER = SessionHeader("s", load_scenario("paper"), "", "", 0)
 
 
 def given_at_once(given: Iterable[tuple[int, int]]) -> MessageSource:
-    """A source that has all its messages."""
     return MessageSource(HEADER, block(given))
 
 
@@ -87,7 +84,6 @@ class Stage:
         )
 
     def play(self, rate: float = 1.0, later_ns: int = 0, *, loop: bool = False) -> Pace:
-        """Plays from 0 on, beginning so much later; returns what was due when."""
         pace = Pace(self.clock.now_ns + later_ns, 0, rate)
         self.player.prepare()
         self.player.play(pace, loop=loop)

@@ -12,7 +12,6 @@ CHANNEL, OTHER = 3, 4
 
 
 def remembered(numbers: list[int], played: int, size: int = 1, kept_ns: int | None = None) -> PlayedHistory:
-    """A memory of messages of one channel among another's, of which so many have been played."""
     memory = PlayedHistory(kept_ns)
     gathering = BatchBuilder()
     for place, number in enumerate(numbers):

@@ -24,10 +24,8 @@ class Holding(NamedTuple):
     """What an operator who takes hold of an arm meets.
 
     Attributes:
-        counts: how many numbers the vectors of the site have.
         q0_rad: the arm's start pose, as far as it is one.
         end_effector_m: returns the end effector's place in that pose.
-        draws: gives the numbers of distributions.
     """
 
     counts: fields.VectorCounts
@@ -185,7 +183,6 @@ def resolve_operators(
 
 
 def _find_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str) -> type[ActorBase]:
-    """Returns the kind of an actor; refuses one in the wrong list with the name of the right one."""
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
     kind = entry["kind"]
@@ -203,7 +200,6 @@ def _check_values(
     path: str,
     counts: fields.VectorCounts,
 ) -> None:
-    """Refuses a wrong or a missing value, with the values that its key takes."""
     words = {name: both[counts != fields.VectorCounts()] for name, both in IN_WORDS.items()}
 
     def describe_values(key: str) -> str:
