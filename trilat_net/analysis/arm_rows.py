@@ -234,14 +234,12 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
-        """Its rows, of one layout for all chains: the loops are compiled once."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
         return np.array([getattr(joint, name) for joint in self.chain.joints])
 
     def _of_joints(self, **values: Any) -> "ChainArmRows":
-        """Returns the same with one value of every joint replaced."""
         joints = tuple(joint._replace(**values) for joint in self.chain.joints)
         return self._replace(chain=self.chain._replace(joints=joints))
 
@@ -282,7 +280,6 @@ class ChainArmRows(NamedTuple):
         return self.law_torque(self.theta[np.newaxis], q, still, still, still)
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Returns place and Jacobian of the end effector, with that of its turn, and the potential energy."""
         found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
         gravity, tip = np.array(self.chain.gravity_m_s2), np.array(self.chain.tip_m)
         _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)

@@ -79,7 +79,6 @@ def list_losses(log: Log) -> list[str]:
 
 
 def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> DominanceHistory:
-    """Returns the factors of the peers that are there, in proportion to the planned ones."""
     alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
     whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
     rate = (rate * whole - alpha * whole_rate) / whole**2

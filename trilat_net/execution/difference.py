@@ -93,7 +93,6 @@ def find_first_difference(
 def _compare_fields(
     logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality, channel: LawChannel
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Yields every field with both values, and whether they agree."""
     mode = computed.mode.name.lower()
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
     yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns

@@ -42,7 +42,6 @@ from ..scenario.validate import refuse_external_arms
 
 
 def _float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-    """Returns which words of eight bytes of an array's element are floating-point numbers."""
     if dtype.fields is None:
         base = dtype.base if dtype.subdtype is None else dtype.subdtype[0]
         return np.full(max(1, dtype.itemsize // 8), base.kind == "f")
@@ -185,7 +184,6 @@ class FusedRun:
         self.ran_s = 0.0
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
-        """Makes the laws that are plugged in, each on the rows of its site."""
         tables, count = self._tables, len(setups)
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None

@@ -89,7 +89,6 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 
 
 def _stack_hands(log: Log, ticks: int) -> tuple[Array, IntArray]:
-    """Returns what live hands did at every tick, and which torque sources they are, as a feed has them."""
     setups = [log.scenario.setup(name)._replace(own=None) for name in log.scenario.names]
     live = [[n for n, one in enumerate(setup.actors) if one.acts in LIVE_KINDS] for setup in setups]
     size = max((setup.layout.hand - 3) // 2 for setup in setups)

@@ -148,7 +148,6 @@ def compare_site_rerun(
 
 
 def _rms(values: Array) -> float:
-    """Returns the largest root mean square of any column, without overflow of squares."""
     largest = _largest(values)
     if not 0.0 < largest < np.inf:
         return largest
@@ -345,7 +344,6 @@ def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields everything that a recorded site published, in order of time."""
     part = log[name]
     events = [event for event in log.events if event.member == name]
     events.sort(key=lambda event: event.t_ns)  # those before the epoch come first
@@ -409,7 +407,6 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
 
 
 def _describe_later_changes(again: Rerun) -> Iterator[str]:
-    """Yields a note for every changed link or row that changes during the run too: then that holds."""
     keys = [changed.key for changed in again.request.changes]
     during = [change.link or change.dominance for change in again.request.scenario.timeline]
     for name in again.request.replaced:

@@ -131,7 +131,6 @@ class RerunSite:
         return made
 
     def _execute(self, n: int | None) -> RerunTick:
-        """Steps the site and compares the result with record n of the log."""
         arrivals, missing = self._inputs.arrivals(self.entries)
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)

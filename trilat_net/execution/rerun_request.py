@@ -90,7 +90,6 @@ def resolve_rerun_request(
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
-    """Refuses a key that has no effect in a rerun, or that belongs to a recorded site."""
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
         raise ScenarioError("is nothing that is executed: it has no effect in a rerun", path=key)
@@ -105,7 +104,6 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 
 
 def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
-    """Refuses other sites, other rates in an open loop, and a run beyond the end of the log."""
     if wanted.names != original.names:
         raise ScenarioError(f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites")
     if wanted.duration_s > original.duration_s:
@@ -123,7 +121,6 @@ def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) 
 
 
 def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> Scenario:
-    """Returns the wanted scenario with everything that belongs to recorded sites as in the original."""
 
     def source(name: str) -> Scenario:
         return original if name in recorded else wanted
@@ -141,7 +138,6 @@ def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
-    """Returns every value in which two scenarios differ."""
     before, after = (dict(flatten_table(msgspec.to_builtins(scenario))) for scenario in (original, other))
     return [
         ChangedValue(key, before.get(key), after.get(key))
@@ -166,7 +162,6 @@ def describe_rerun_changes(request: RerunRequest) -> list[str]:
 
 
 def _describe_parts(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
-    """Yields every change: subject, the site or link that owns it, and both values in words."""
     done: set[str] = set()
     for changed in request.changes:
         group, _, rest = changed.key.partition(".")

@@ -225,7 +225,6 @@ class SiteVerifier:
         return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
 
     def _verify_record(self, n: int, state: State) -> None:
-        """Executes the tick of record n and compares the result with the record."""
         result, states, peers = self._result, self._log.states, self._log.peers
         difference = self._find_other_sender(state)
         if not result.whole_run and n - 2 >= self._began and states[n - 2].tick == state.tick - 2:
@@ -266,7 +265,6 @@ class SiteVerifier:
         return changes[:MAX_RAMPS], None
 
     def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
-        """Returns the arrivals of a record up to the first that no peer can have sent, which differs."""
         for n, (peer, tick, _) in enumerate(state.rx):
             if not 0 <= peer < len(self._inputs.samples):
                 invalid = RecordDifference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
@@ -342,7 +340,6 @@ def _execute_sites(
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
-    """Compares the records that an open-loop rerun took over with those of its log."""
     if recorded.payloads == source.payloads:
         return
     for ours, theirs in zip_longest(recorded.states, source.states):

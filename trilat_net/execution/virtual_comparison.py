@@ -190,7 +190,6 @@ def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntr
 
 
 def _recorded_scenario(log: Log) -> Scenario:
-    """Returns a log's scenario, no longer than its records: a torn log is a short run."""
     ends_s = [(log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
     duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
     return msgspec.structs.replace(log.scenario, duration_s=duration_s)

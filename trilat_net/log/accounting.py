@@ -383,7 +383,6 @@ class SessionAccounts:
                     gap.hear_of(heard - base)
 
     def _leave_out(self, event: Event) -> None:
-        """Takes ticks that a site says it did not make, as "first-last first-last", for not made."""
         rate_hz = self._rates_hz[event.member]
         for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
             for channel in (topics.STATE, topics.LINK):
@@ -399,7 +398,6 @@ class SessionAccounts:
             (account or self._accounts[topic]).take(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
-        """Yields what lies before a start of a site, by channel."""
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
             known = (topic, boot) in self._start_gaps

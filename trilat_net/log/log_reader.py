@@ -185,7 +185,6 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns a member's events in order: one that came late belongs before those that it precedes."""
         events = self._decode(topic, Event)
         boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
         return sorted(events, key=lambda event: (boots[event.boot], event.n))

@@ -121,7 +121,6 @@ _ROOTS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
-    """Returns what twins say for a run or against it."""
     if not twins.pushes:
         return "note"
     if twins.grows or twins.left is not None:

@@ -210,7 +210,6 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 
 
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the two-ports that fail the criterion, and the number of those that meet it."""
     failing = [one for one in ports.two_ports if one.minima.below]
     holding = len(ports.two_ports) - len(failing)
     third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""

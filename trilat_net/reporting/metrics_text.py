@@ -81,7 +81,6 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_impedance(found: LogMetrics) -> Iterator[Block]:
-    """Yields the impedance that operators feel over frequency, decided or not."""
     if not found.responses:
         return
     rows = []

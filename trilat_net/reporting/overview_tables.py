@@ -167,7 +167,6 @@ def _three(spread: JsonObject | None) -> list[str | None]:
 
 
 def _number(value: float | None) -> str | None:
-    """Returns a number with four digits, or all that it has before the point."""
     if value is None:
         return None
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"

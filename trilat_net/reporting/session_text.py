@@ -96,7 +96,6 @@ def compose_benchmark(found: Result) -> Iterator[Block]:
 
 
 def _judgement(one: dict[str, Any], needs: dict[str, Any]) -> str:
-    """Returns in words whether a network is good enough over one transport."""
     if one["p99_ms"] is None:
         return "nothing came back"
     parts = [f"p99 {one['p99_ms']:.3g} ms"]

@@ -236,7 +236,6 @@ def _cells(pair: LogAndRerun | None) -> list[str]:
 
 
 def _describe_effects(again: Rerun) -> list[str]:
-    """Returns the other effects on sites and links, a sentence each."""
     lines = []
     for effect in again.sites.values():
         if effect.q_max_rad:
@@ -258,7 +257,6 @@ def _describe_effects(again: Rerun) -> list[str]:
 
 
 def _values(before: object, after: object) -> tuple[str, str]:
-    """Returns two values, with as many digits as tell them apart."""
     short = tuple(f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after))
     return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
 

@@ -273,7 +273,6 @@ def compute_run_metrics(
 
 
 def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
-    """Returns the quantities of a window, of all sites that it is of."""
     parts = [stretch.figures() for stretch in stretches if stretch is not None]
     if len(parts) == 1:
         return parts[0]
@@ -285,7 +284,6 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    """Compares every site's latest angles at the ticks of the first one, in their last second."""
     if not all(len(end.t_ns) for end in ends):  # a site's part ends long before the others'
         return None
     if len({end.q.shape[1] for end in ends}) > 1:  # unlike arms have no angle in common

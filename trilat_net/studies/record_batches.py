@@ -75,7 +75,6 @@ class BatchedRun(NamedTuple):
 
 
 def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
-    """Returns the batch of columns q, qd, q_des, tau, tau_x and x, which is empty in joint space."""
     q, qd, q_des, tau, tau_x, x = vectors
     e = find_task_errors(x, q_des, axes) if x.size else q - q_des
     return RecordBatch(t_ns, q, qd, e, tau, tau_x, used)

@@ -292,7 +292,6 @@ def trials(
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
-    """Refuses a scenario that expects nothing, or something of a time that it does not reach."""
     expect, end_s = scenario.expect, scenario.duration_s
     if not expect.asks:
         raise ScenarioError(
@@ -638,5 +637,4 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
 
 
 def _clean(text: str) -> str:
-    """Returns text without the characters that no XML document may hold, not even escaped."""
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

@@ -374,7 +374,6 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    """Returns a matrix of rates without the states that have none, which the others give at once."""
     given = np.flatnonzero(E == 0.0)
     kept = np.setdiff1d(np.arange(len(matrix)), given)
     ours = np.linalg.solve(matrix[np.ix_(given, given)], matrix[np.ix_(given, kept)])

@@ -324,7 +324,6 @@ def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None
 
 
 def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: int) -> Equilibrium:
-    """Returns an equilibrium with what laws of one's own remember after so many ticks at its pose."""
     theta_hat = rest.theta_hat.copy()
     for n, (site, x) in enumerate(
         zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)

@@ -186,7 +186,6 @@ class _SpanMap:
         return V, [track[rows - 1 :] for track, rows in zip(tracks, self._rows, strict=True)]
 
     def _run_ticks(self, tracks: Sequence[Array], i: int, first: int, count: int) -> None:
-        """Makes some ticks of a site, all of whose samples in use are known."""
         at, P = first + self._rows[i] - 1, self._P[i]
         x, after = tracks[i][at], tracks[i][at + 1 : at + 1 + count]
         after[:] = 0.0

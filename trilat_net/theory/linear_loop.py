@@ -157,7 +157,6 @@ def differentiate_references(
 
 
 def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) -> Array:
-    """Returns the derivative of what site i follows by what j shares, by a complex step."""
     poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
     poses[j] = poses[j] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[j]))
     derivative: Array = evaluate_reference(row, poses[i], poses).imag / site_dynamics.COMPLEX_STEP
@@ -239,7 +238,6 @@ def _name_motion(joints: int) -> tuple[str, ...]:
 
 
 def _find_independent_rows(matrix: Array) -> list[int]:
-    """Returns as many rows as a matrix has rank, each as independent of those before as can be, in order."""
     _, R, order = qr(matrix.T, mode="economic", pivoting=True)
     sizes = np.abs(np.diag(R))
     return sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
@@ -348,7 +346,6 @@ _Places = dict[tuple[int, Place], slice]
 def _place_form_states(
     conditions: OperatingConditions, forms: Sequence[LinearForm | None], loop: LinearLoop
 ) -> tuple[_Places, list[str]]:
-    """Returns where states and what is sent stand, by site, and the names of all states of the loop."""
     places: _Places = {}
     names = list(loop.names)
     for i, (name, form) in enumerate(zip(conditions.names, forms, strict=True)):
@@ -373,7 +370,6 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    """Adds the blocks of a law at a site to the terms of the loop, by their delays."""
     (places, i), site = where, sites[where[1]]
     ports = np.cumsum([0, *(one.at.joints for one in sites)])
 

@@ -70,7 +70,6 @@ class NumericLaw:
 
     @property
     def _memory_at(self) -> slice:
-        """Where its memory stands in the arguments: after the angles and speeds."""
         return slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:

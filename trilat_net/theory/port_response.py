@@ -210,7 +210,6 @@ def _add_spring(loop: LinearLoop, site: str, load: PortLoad) -> LinearLoop:
 
 
 def _clamp(loop: LinearLoop, site: str) -> LinearLoop:
-    """Returns the loop with a site's joints fixed: the torque there keeps their accelerations zero."""
     ports = find_site_ports(loop, site)
     others = [n for n in range(len(loop.inputs)) if n not in ports]
     speeds = [loop.names.index(loop.outputs[port]) for port in ports]

@@ -199,7 +199,6 @@ def _as_columns(values: object, like: Numbers) -> Numbers:
 def _evaluate_law(
     site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """Returns the torque of the law, unclamped, and the rate of its estimate."""
     at, gains = lay_out_arguments(site), site.gains
     q, qd, estimate = x[at.q], x[at.qd], x[at.estimate]
     _, _, e, ed, v, a, *_ = following
@@ -224,7 +223,6 @@ def _evaluate_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """True where an estimate is at an end of its box and its rate points outward."""
     low, high = _as_columns(site.gains.low, estimate), _as_columns(site.gains.high, estimate)
     down = (estimate.real <= low + SWITCHING_TOLERANCE) & (rate.real < -SWITCHING_TOLERANCE)
     up = (estimate.real >= high - SWITCHING_TOLERANCE) & (rate.real > SWITCHING_TOLERANCE)

@@ -249,7 +249,6 @@ class PlacedChain:
         return solve_columns(self.inertia_matrix(theta), force)
 
     def _stop_torque(self, qd: Numbers) -> Numbers:
-        """Returns the torque of the stops on the joints: springs and dampers that never pull."""
         q, stiffness, damping = self._q, self._per_joint("stop_stiffness"), self._per_joint("stop_damping")
         total: Numbers = np.zeros_like(q)
         for name, sign in (("lower", 1.0), ("upper", -1.0)):
@@ -298,7 +297,6 @@ class PlacedChain:
         return rate + turned
 
     def _carry_to_tip(self, columns: Numbers) -> Numbers:
-        """Returns spatial motions of the last link as those of the end effector in base axes."""
         R, tip = self._links[-1].R_base, build_cross_matrix(np.array(self._chain.tip_m))
         linear = columns[:3] - np.einsum("ab,bn...->an...", tip, columns[3:])
         return np.concatenate([_multiply(R, linear), _multiply(R, columns[3:])])

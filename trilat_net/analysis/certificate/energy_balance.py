@@ -108,7 +108,6 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the sum of all judged amounts before each row, from 0 on."""
     counted = amounts if judged is None else np.where(judged, amounts, 0.0)
     return np.concatenate([[0.0], np.cumsum(counted)])
 

@@ -94,7 +94,6 @@ class RecordWindow:
         return True
 
     def _move(self, first: int) -> None:
-        """Forgets the records before a tick."""
         left = max(0, self.newest + 1 - first)
         for column in (self._floats, self._used, self._known, self._follows, self._rests):
             column[:left] = column[first - self.first :][:left].copy()

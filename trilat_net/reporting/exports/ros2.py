@@ -87,7 +87,6 @@ class _BagChannels:
         self._channels: dict[str, int] = {}
 
     def channel(self, topic: str) -> int:
-        """Returns the number of a channel."""
         if topic not in self._channels:
             kind, about = self._known[topic]
             if kind not in self._schemas:

@@ -236,7 +236,6 @@ def _plot_case(axes: Axes, at: float, row: Mapping[str, Any], number: int) -> No
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
-    """Draws the period, for how long samples are held, and the ends of stability, with words beside them."""
     needs = facts["needs"]
     bounds = [("one period", 1e3 / needs["rate_hz"], "center"), ("held by links", needs["held_ms"], "top")]
     ages = [one["age_ms"] for one in facts["transports"] if one["age_ms"] is not None]

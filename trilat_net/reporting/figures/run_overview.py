@@ -138,7 +138,6 @@ def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
 
 
 def _describe(log: Log, form: FigureSize) -> str:
-    """Returns the run's title and how it ended."""
     last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
     when = "not settled" if last is None else f"settled at {last:.1f} s"
     words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"

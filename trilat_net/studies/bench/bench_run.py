@@ -85,7 +85,6 @@ def run_bench_task(task: BenchRunItem) -> BenchRun:
 
 
 def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
-    """Makes a run of so many seconds and its twins, and judges both."""
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
     (records, end), growth = run_whole(scenario), TwinGrowth("none were asked for")
     if end.diverged_at_s is None and twins:
@@ -188,7 +187,6 @@ def _find_push(judged: _JudgedRun) -> tuple[float, float]:
 
 
 def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
-    """Returns the RMS over ticks and joints of q_s - sum_j alpha_sj q_j."""
     peers, own = scenario.peers(SLAVE), records[SLAVE]
     start = np.array([scenario.dominance[SLAVE].get(peer, 0.0) for peer in peers])
     changes = [change for change in scenario.timeline if change.dominance == SLAVE]

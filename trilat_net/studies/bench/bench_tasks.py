@@ -31,12 +31,10 @@ _FIRST, _SECOND = 0.75, 0.25
 
 
 def _hand(to: Sequence[float], begin_s: float = 1.0, **more: Any) -> dict[str, Any]:
-    """Returns a hand that goes to a pose in 2 s."""
     return {**_HAND, "to_rad": list(to), "move_start_s": begin_s, "move_end_s": begin_s + 2.0, **more}
 
 
 def _shares(a: float) -> dict[str, dict[str, float]]:
-    """Returns the rows of the dominance matrix in which the first user has the share a."""
     names = ("m1", "m2", "s")
     rows = zip(names, complementary_shares(a).tolist(), strict=True)
     return {

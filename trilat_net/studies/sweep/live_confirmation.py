@@ -132,7 +132,6 @@ GridIndex = tuple[Any, ...]
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    """Returns rows by the numbers of their values along the axes, then law and seed."""
     values = [sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one)) for key in axes]
     numbers = [{value: n for n, value in enumerate(some)} for some in values]
 

@@ -247,7 +247,6 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
 
 
 def _title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
-    """Returns a panel's title: words stand for themselves, numbers with what they are."""
     words = []
     for key, value in settings:
         spaced = value.replace("_", " ") if isinstance(value, str) and key != "law" else value
@@ -369,7 +368,6 @@ def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
 
 
 def _find_asked_share(least: float, ticks: int) -> float:
-    """Returns the share of K T that d must exceed, of reversible shares with that least eigenvalue."""
     phi, w, lag = _tick_angles(ticks)
     asked = [
         (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks) for a in (least, 1.0)
@@ -519,7 +517,6 @@ def trace_linear_analysis(columns: Sequence[GrowthColumn], y: PlaneAxis) -> tupl
 
 
 def _changes(spare: Sequence[float]) -> list[int]:
-    """Returns the places of a column after which it changes between stable and not."""
     pairs = enumerate(pairwise(spare))
     return [n for n, (a, b) in pairs if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)]
 

@@ -154,7 +154,6 @@ def _listed(key: str, text: str) -> tuple[str, ...]:
 
 
 def _split(text: str, mark: str) -> list[str]:
-    """Returns the parts between marks that stand in no bracket and in no quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:
@@ -170,7 +169,6 @@ def _split(text: str, mark: str) -> list[str]:
 
 
 def _read(text: str) -> Any:
-    """Returns the value of an override's text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -392,7 +390,6 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
 def _law_overrides(
     written: ExperimentText, overrides: Sequence[str], base: Scenario, law: str
 ) -> tuple[str, ...]:
-    """Returns what puts a law into force at every site."""
     ours = [name for name in LAWS if name != "own"]
     if law not in ours and ":" not in law:
         hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
@@ -406,7 +403,6 @@ def _law_overrides(
 
 
 def _refuse_unfit(plan: SweepPlan, law: int) -> None:
-    """Refuses an axis with a value that makes no scenario or no difference, and corners that cannot run."""
     origin = [law] + [0] * len(plan.axes)
     for n, one in enumerate(plan.axes, 1):
         seen: dict[str, str] = {}

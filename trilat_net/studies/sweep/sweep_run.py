@@ -170,7 +170,6 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[st
 
 
 def _kinds_of_axes(plan: SweepPlan) -> dict[str, type]:
-    """Returns the types of the columns that say where a row lies."""
     return {"cell": int, **{one.key: float if one.numeric else str for one in plan.axes}, "law": str}
 
 
@@ -491,7 +490,6 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _describe(plan: SweepPlan) -> dict[str, Any]:
-    """Returns all that results depend on."""
     arithmetic, versions = describe_program()
     return {**plan.facts(), "arithmetic": arithmetic, "versions": versions}
 
@@ -672,7 +670,6 @@ def run_sweep(
 def _run_cells(
     plan: SweepPlan, journal: RunJournal[CellRun], pool: executor.WorkerPool, progress: executor.Progress
 ) -> None:
-    """Runs the first seed of every cell, then the others of those in which anything is random."""
     first, *others = plan.seeds
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:

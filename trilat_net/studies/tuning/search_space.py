@@ -169,7 +169,6 @@ _KNOWN = "known"
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields where each law is searched that says so."""
     for name, kind in BUILT_IN.items():
         knobs = tuple(
             TunedGain(gain, tune[2], tune[0], tune[1], *tune[3:]) for gain, tune in kind.tune.items()
