@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import angles, links, speeds
 from tests.theory.loops import Array
+from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
-from trilat_net.theory.textbook_arm import PlacedArm
 
 
 def placed(q: Array) -> PlacedArm:

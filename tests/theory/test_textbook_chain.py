@@ -5,9 +5,10 @@ import pytest
 
 from tests.core.chain_references import chain_references
 from tests.theory.loops import Array
+from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.core.chain import ChainJoint, build_chain, find_acceleration, place_joints
 from trilat_net.core.site_setup import ChainSetup
-from trilat_net.theory.textbook_arm import PlacedArm, PlacedChain
+from trilat_net.theory.textbook_arm import PlacedChain
 
 REFERENCES = chain_references()
 each = pytest.mark.parametrize("name", REFERENCES)

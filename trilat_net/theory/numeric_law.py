@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..analysis.arm_rows import Numbers
 from ..core import chain_stages, two_link_stages
 from ..core.compiled_law import plug_law
 from ..core.site_arrays import build_site_arrays
@@ -20,7 +21,6 @@ from ..core.ticks import tick_ns
 from ..core.user_law import LawContext, UserLaw, list_remembered, read_memory
 from ..core.vectors import Array
 from ..errors import ScenarioError
-from .textbook_arm import Numbers
 
 _TICK = 1_000_000
 """The tick at which a law is asked: late, so that nothing begins."""

@@ -13,11 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.arm_rows import Numbers, PlacedArm, multiply_columns
 from ..core.exogenous import OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .numeric_law import NumericLaw
-from .textbook_arm import Numbers, PlacedArm, PlacedChain, multiply_columns
+from .textbook_arm import PlacedChain
 from .textbook_task import Following, follow_in_task, follow_joints, share_pose
 
 COMPLEX_STEP = 1e-30

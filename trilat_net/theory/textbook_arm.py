@@ -1,14 +1,11 @@
-"""Arms in plain NumPy: the planar two-joint arm by its printed matrices, a chain of joints by Jacobians.
+"""A chain of joints in plain NumPy, by Jacobians; the planar arm is `analysis.arm_rows.PlacedArm`.
 
 Invariant: independent of the compiled core, and analytic in every argument but where a chain meets a stop
 (there the real part decides), so that a complex step gives derivatives exact to rounding.
 
 Vectors have their components on the first axis and any number of columns behind it: shape (n,) or (n, B).
 
-The planar arm: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
-Eq. (1)-(5), (24).
-
-A chain: of a spatial vector the linear half comes first, at the origin of the link's own frame. With the
+Of a spatial vector the linear half comes first, at the origin of the link's own frame. With the
 Jacobian J_i of link i, its velocities V_i = J_i qd and W_i = J_i v, and its acceleration
 A_i = X A_p + S a + V_i x (S v), gravity included, link i needs
 
@@ -18,100 +15,19 @@ which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n'
 M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors.
 """
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..analysis.arm_rows import Numbers, multiply_columns, solve_columns
 from ..core.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
 from ..core.site_setup import ChainSetup
-
-Numbers = NDArray[Any]
-"""Real numbers, or complex ones for a derivative by complex step."""
 
 _EPSILON = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _j, _k], _EPSILON[_i, _k, _j] = 1.0, -1.0
 _INERTIA_PLACES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
-
-
-def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
-    """Returns the product of a matrix, shape (a, b, ...), and a vector, shape (b, ...)."""
-    product: Numbers = np.einsum("ab...,b...->a...", matrix, vector)
-    return product
-
-
-def solve_columns(A: Numbers, b: Numbers) -> Numbers:
-    """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
-    solved = np.linalg.solve(np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis])
-    return np.moveaxis(solved[..., 0], -1, 0)
-
-
-@dataclass(frozen=True)
-class PlacedArm:
-    """The planar arm in the poses q: the same methods as `PlacedChain`.
-
-    Attributes:
-        g_m_s2: gravitational acceleration, m/s^2.
-        lengths_m: of the two links.
-        q: shape (2, ...), rad.
-    """
-
-    g_m_s2: float
-    lengths_m: tuple[float, float]
-    q: Numbers
-
-    def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
-        bend = theta[1] * np.cos(self.q[1])
-        coupling = theta[2] + bend
-        return np.array([[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]])
-
-    def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
-        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
-        h = -theta[1] * np.sin(self.q[1])
-        return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
-
-    def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns G(q), shape (2, ...), N m."""
-        outer = theta[4] * self.g_m_s2 * np.cos(self.q[0] + self.q[1])
-        return np.array([theta[3] * self.g_m_s2 * np.cos(self.q[0]) + outer, outer])
-
-    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
-        moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
-        torque: Numbers = (
-            multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
-        )
-        return torque
-
-    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta = e_p."""
-        units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
-        return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
-
-    def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns zeros: this arm has no friction in its joints."""
-        return 0.0 * v
-
-    def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
-        at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
-        return solve_columns(self.inertia_matrix(theta), torque - at_no_acceleration)
-
-    def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector from the base, shape (2, ...), m."""
-        (l1_m, l2_m), inner, outer = self.lengths_m, self.q[0], self.q[0] + self.q[1]
-        x, y = l1_m * np.cos(inner) + l2_m * np.cos(outer), l1_m * np.sin(inner) + l2_m * np.sin(outer)
-        return np.array([x, y])
-
-    def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
-        x, y = self.end_effector_position()
-        outer = self.q[0] + self.q[1]
-        return np.array([[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]])
 
 
 def build_cross_matrix(a: Numbers) -> Numbers:

@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.arm_rows import Numbers, multiply_columns, solve_columns
 from ..core.site_setup import SiteSetup, TaskSetup
 from ..core.vectors import Array
-from .textbook_arm import Numbers, PlacedChain, build_cross_matrix, multiply_columns, solve_columns
+from .textbook_arm import PlacedChain, build_cross_matrix
 
 PLACE_COORDINATES = 3
 """Coordinates of a task that are a place; those behind it are a rotation vector."""
