@@ -179,7 +179,7 @@ def certify(
     Raises:
         LogError: the log cannot be read.
     """
-    from .theory.end_pose import certify_run
+    from .theory.linear_analysis import certify_run
 
     return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.analysis.lyapunov_weights import (
+from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
     find_kd_scales,

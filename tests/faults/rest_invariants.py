@@ -8,7 +8,7 @@ tick: a torque that begins at zero cannot hold what hangs until it has grown to 
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 

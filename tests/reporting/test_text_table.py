@@ -4,7 +4,7 @@ from io import StringIO
 
 from rich.console import Console
 
-from trilat_net.reporting.text_table import TextTable
+from trilat_net.reporting.result_text import TextTable
 
 TABLE = TextTable(
     ("site", "delay", "note"),

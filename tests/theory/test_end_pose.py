@@ -3,7 +3,7 @@
 import pytest
 
 import trilat_net as tn
-from trilat_net.theory.end_pose import find_end_pose_roots
+from trilat_net.theory.linear_analysis import find_end_pose_roots
 
 
 def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:

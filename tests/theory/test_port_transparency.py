@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 
 from tests.theory.networks import Network, Wire, pair
 from trilat_net.errors import UsageError
-from trilat_net.theory.port_response import PortLoad, to_imaginary_axis
-from trilat_net.theory.port_transparency import Transparency, measure_transparency
+from trilat_net.theory.port_response import PortLoad, Transparency, measure_transparency, to_imaginary_axis
 
 POSITIVE = st.floats(0.1, 10.0)
 

@@ -37,12 +37,11 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result
 from ..scenario.law_consent import find_user_laws
-from .difference import RecordDifference
 from .rerun_execution import RerunExecution, RerunSite, RerunTick
 from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
 from .resumption import read_output
-from .site_channels import SiteChannels, SiteEntry, describe_accounts
-from .virtual import open_in_memory
+from .verify import RecordDifference
+from .virtual import SiteChannels, SiteEntry, describe_accounts, open_in_memory
 from .virtual_network import Deliveries
 
 

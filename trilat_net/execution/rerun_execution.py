@@ -20,7 +20,6 @@ from ..net.messages import LinkStats
 from ..net.timing import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario
-from .difference import RecordDifference, equal_bits, equal_record, find_first_difference
 from .rerun_request import RerunRequest
 from .resumption import (
     ArrivalEntry,
@@ -30,7 +29,7 @@ from .resumption import (
     make_arrival,
     read_output,
 )
-from .verify import PROGRESS_EVERY
+from .verify import PROGRESS_EVERY, RecordDifference, equal_bits, equal_record, find_first_difference
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 
 

@@ -24,8 +24,7 @@ from ..errors import NotRepeatable, UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
-from .fused import FusedRun, RunInputs
-from .log_inputs import explain_no_repetition, read_run_inputs
+from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
 
 PUSH_RAD = 1e-6
 """The usual push, rad."""

@@ -21,14 +21,14 @@ from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
-from .difference import (
+from .resumption import ArrivalEntry, find_recorded_hand
+from .verify import (
     RecordDifference,
     describe_law_failure,
     equal_bits,
     equal_record,
     find_first_difference,
 )
-from .resumption import ArrivalEntry, find_recorded_hand
 from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..analysis import site_signals
 from ..analysis.arm_rows import joint_positions_m
+from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
-from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints

@@ -14,9 +14,8 @@ from ..theory.linear_analysis import LinearAnalysis
 from ..theory.linear_edge import EdgeScan
 from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
-from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
-from .result_text import Block, MarkedText
-from .text_table import TextTable
+from ..theory.port_response import QUOTED_AT_HZ, Transparency
+from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 

@@ -8,9 +8,8 @@ from itertools import groupby
 
 from ..analysis.metrics.log_metrics import LogMetrics
 from ..analysis.metrics.measures import Metric, Quantity, quantities
-from .result_text import Block, MarkedText
+from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
-from .text_table import TextTable
 
 _NO_NUMBER = "–"
 _MAX_LINES = 16

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from ..analysis.file_overview import FileOverview
 from ..results import JsonObject
-from .result_text import Block, MarkedText
+from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
-from .text_table import TextTable
 
 _MOST_GAPS = 4
 _VIEWS = "/viz/"

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..results import Result
-from .result_text import Block, MarkedText
-from .text_table import TextTable
+from .result_text import Block, MarkedText, TextTable
 
 MARKS = {"ok": "[green]ok[/green]  ", "warn": "[yellow]warn[/yellow]", "fail": "[red]fail[/red]"}
 

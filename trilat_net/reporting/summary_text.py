@@ -15,8 +15,7 @@ from ..execution.rerun_request import describe_rerun_changes
 from ..log.log_reader import Log
 from ..log.recover import Recovery
 from ..log.session_check import LogCheckResult
-from .result_text import Block, MarkedText
-from .text_table import TextTable
+from .result_text import Block, MarkedText, TextTable
 
 MOST_LINES = 12
 """Lines of each kind; summary.json has the rest."""

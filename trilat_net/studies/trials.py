@@ -43,8 +43,7 @@ from ..execution.verify import verify
 from ..fields import field_names, is_distribution
 from ..log.log_reader import open_log
 from ..net.clock import SystemClock
-from ..reporting.result_text import Block, MarkedText
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import Block, MarkedText, TextTable
 from ..results import Result
 from ..scenario import Expect, Scenario, load_scenario
 from ..scenario.law_consent import list_imported_laws

@@ -32,7 +32,7 @@ from .site_dynamics import (
     lay_out_arguments,
     place_arm,
 )
-from .textbook_task import SINGULAR
+from .textbook_arm import SINGULAR
 
 MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""

@@ -25,7 +25,7 @@ from ..laws.linear_form import LinearForm, Place
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
-from .textbook_task import PLACE_COORDINATES, evaluate_reference
+from .textbook_arm import PLACE_COORDINATES, evaluate_reference
 
 _DEPENDENT = 1e-9
 """Rows of a regressor that are dependent to this, relative to the largest, are."""

@@ -18,8 +18,7 @@ from ..core.exogenous import OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .numeric_law import NumericLaw
-from .textbook_arm import PlacedChain
-from .textbook_task import Following, follow_in_task, follow_joints, share_pose
+from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints, share_pose
 
 COMPLEX_STEP = 1e-30
 SWITCHING_TOLERANCE = 1e-9
@@ -77,7 +76,7 @@ class ArgumentLayout(NamedTuple):
 
     @property
     def q_des(self) -> slice:
-        """The reference, q_id; in task space a pose, see `textbook_task`."""
+        """The reference, q_id; in task space a pose, see `textbook_arm`."""
         return self._input(0)
 
     @property
@@ -128,7 +127,7 @@ class SiteRates(NamedTuple):
         external: the torque of operators and environments that act continuously, shape (n, ...), N m.
         held: the torque of those that are sampled and held, shape (n, ...), N m.
         x: what peers get of the pose, shape (m, ...): the angles, or place and orientation, see
-            `textbook_task.Following`.
+            `textbook_arm.Following`.
         xd: its velocity.
         reflected: the external and held torque as peers get it, a force in task space.
     """

@@ -16,16 +16,14 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.expect import ExpectWindow, window_quantities
 from trilat_net.studies.measure_run import (
+    BATCH_RECORDS,
+    RecordBatch,
     RunMetrics,
     SiteStats,
     WindowStats,
+    join_batches,
     measure_log,
     measure_virtual_run,
-)
-from trilat_net.studies.record_batches import (
-    BATCH_RECORDS,
-    RecordBatch,
-    join_batches,
     run_compiled_in_batches,
     run_in_batches,
 )

@@ -16,8 +16,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory, align_records, view_delayed_peer
-from ..dominance_history import DominanceHistory, trace_dominance
-from ..lyapunov_weights import compute_lyapunov_weights
+from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
 from ..torque_sources import split_torque
 from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion

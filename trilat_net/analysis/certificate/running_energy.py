@@ -24,8 +24,13 @@ from ..aligned import (
     PeerTrajectory,
     find_unlimited,
 )
-from ..dominance_history import DominanceHistory, evaluate_ramps, forget_ramps, list_scripted_ramps
-from ..lyapunov_weights import find_closed_groups
+from ..dominance_history import (
+    DominanceHistory,
+    evaluate_ramps,
+    find_closed_groups,
+    forget_ramps,
+    list_scripted_ramps,
+)
 from .energy_balance import (
     compute_energy_balance,
     derive_site_energies,

@@ -18,7 +18,7 @@ from ...theory.delay_margin import MAX_COMMON_DELAY_S
 from ...theory.frequency_search import Minima
 from ...theory.linear_analysis import LinearAnalysis
 from ...theory.port_analysis import PortAnalysis
-from ...theory.port_transparency import Transparency
+from ...theory.port_response import Transparency
 from .. import style
 from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 

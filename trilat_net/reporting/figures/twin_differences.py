@@ -20,7 +20,7 @@ from ...analysis.run_end import classify_log_end
 from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude, measure_twins
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
-from ...execution.log_inputs import explain_no_repetition
+from ...execution.fused import explain_no_repetition
 from ...execution.twins import SMALLEST, TwinPath
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize

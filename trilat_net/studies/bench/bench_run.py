@@ -28,12 +28,11 @@ from ...files import make_results_folder, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..record_batches import RecordBatch, run_whole
+from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
-from .bench_plan import BenchCell, BenchPlan, name_settings
+from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, name_settings
 from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
-from .bench_tasks import SHORTER_REACH, TASKS
 
 SLAVE, USER = "s", "m1"
 BOUND_RAD_S = 5.0

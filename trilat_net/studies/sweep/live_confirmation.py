@@ -14,7 +14,7 @@ import numpy as np
 from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from ...scenario import Scenario, parse_scenario
 from .stability_map import label_axis
 from .sweep_cell import CellClass, classify_end

@@ -27,7 +27,7 @@ from ...core.vectors import Array
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import COLUMN_IN, FigureSize, make_print_size
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from .stability_map import (
     CELL_CLASSES,
     MapLine,

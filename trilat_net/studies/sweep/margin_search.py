@@ -19,7 +19,7 @@ import numpy as np
 
 from ...errors import ScenarioError, UsageError
 from ...files import write_whole
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.law_consent import list_imported_laws
