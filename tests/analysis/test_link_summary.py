@@ -14,9 +14,14 @@ from scipy import stats
 
 import trilat_net
 from tests.analysis.ages_in_use import in_order, newest_wins
-from trilat_net.analysis import delivery as module
-from trilat_net.analysis.delivery import first_ticks, predict_delivery
-from trilat_net.analysis.link_summary import bin_ages, compute_statistics, summarise_links
+from trilat_net.analysis import link_summary as module
+from trilat_net.analysis.link_summary import (
+    bin_ages,
+    compute_statistics,
+    first_ticks,
+    predict_delivery,
+    summarise_links,
+)
 from trilat_net.core.channel import LOST
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import first_tick_at

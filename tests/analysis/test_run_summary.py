@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 import trilat_net
 from tests.log_editing import edited, recorded, without
-from trilat_net.analysis.file_overview import FileInventory, describe_files
-from trilat_net.analysis.run_summary import summarise_run
+from trilat_net.analysis.file_overview import FileInventory, describe_files, summarise_run
 from trilat_net.errors import LogError
 
 from . import logs

@@ -37,8 +37,15 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result
 from ..scenario.law_consent import find_user_laws
-from .rerun_execution import RerunExecution, RerunSite, RerunTick
-from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
+from .rerun_execution import (
+    RerunExecution,
+    RerunOverrides,
+    RerunRequest,
+    RerunSite,
+    RerunTick,
+    describe_rerun_changes,
+    resolve_rerun_request,
+)
 from .resumption import read_output
 from .verify import RecordDifference
 from .virtual import SiteChannels, SiteEntry, describe_accounts, open_in_memory

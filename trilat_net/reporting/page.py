@@ -17,7 +17,7 @@ from string import Template
 from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
-from ..analysis.run_summary import summarise_run
+from ..analysis.file_overview import summarise_run
 from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
 from ..analysis.twin_growth import PushedTwins
