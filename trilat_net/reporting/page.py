@@ -100,7 +100,10 @@ def write_report(
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
         section = _render_certificate(certificate)
-        verdict = _render_verdict(certificate)
+        mark, text = describe_certificate(certificate)[0]
+        kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
+        found = f'<li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li>'
+        verdict = f'<ul class="verdicts">{found}</ul>'
         pictures = []
         if certificate.balance is not None:
             pictures.append(("V and energies", draw_functional(log, certificate)))
@@ -217,12 +220,6 @@ def _json(value: Any, indent: int | None = None) -> str:
 
 def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
-
-
-def _render_verdict(certificate: Certificate) -> str:
-    mark, text = describe_certificate(certificate)[0]
-    kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
-    return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li></ul>'
 
 
 def _render_check_lines(verdicts: Sequence[Finding]) -> str:

@@ -82,13 +82,6 @@ def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
     return RecordBatch._make(map(np.concatenate, zip(*blocks, strict=True)))
 
 
-class BatchedRun(NamedTuple):
-    """A run that was passed on: when its first site left its limits, s, or None; samples that came late."""
-
-    diverged_at_s: float | None
-    late_samples: int
-
-
 def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
     q, qd, q_des, tau, tau_x, x = vectors
     e = find_task_errors(x, q_des, axes) if x.size else q - q_des
@@ -102,8 +95,14 @@ def _pack_records(axes: Sequence[float], records: Sequence[TickRecord]) -> Recor
     return _make_batch(axes, t_ns, used, *map(np.array, zip(*rows, strict=True)))
 
 
-def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]) -> BatchedRun:
-    """Runs a scenario in virtual time and passes every site's records on, batch by batch."""
+def run_in_batches(
+    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+) -> tuple[float | None, int]:
+    """Runs a scenario in virtual time and passes every site's records on, batch by batch.
+
+    Returns:
+        when the first site left its limits, s, or None; and how many samples came late.
+    """
     pending: dict[str, list[TickRecord]] = {name: [] for name in take}
     sites: dict[str, Site] = {}
     diverged_at_s: float | None = None
@@ -123,7 +122,7 @@ def run_in_batches(scenario: Scenario, take: Mapping[str, Callable[[RecordBatch]
                 diverged_at_s = output.t_ns / NS_PER_S
     for name in pending:
         flush(name)
-    return BatchedRun(diverged_at_s, sum(count.late for site in sites.values() for count in site.counts()))
+    return diverged_at_s, sum(count.late for site in sites.values() for count in site.counts())
 
 
 def run_compiled_in_batches(
@@ -429,14 +428,16 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
     tallies = {name: _site_stats(scenario, name) for name in scenario.names}
-    run = run_in_batches(scenario, {name: tally.add for name, tally in tallies.items()})
+    diverged_at_s, late_samples = run_in_batches(
+        scenario, {name: tally.add for name, tally in tallies.items()}
+    )
     made = sum(tally.records for tally in tallies.values())
     return compute_run_metrics(
         scenario,
         tallies,
-        diverged_at_s=run.diverged_at_s,
-        late_samples=run.late_samples,
-        missing=0 if run.diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
+        diverged_at_s=diverged_at_s,
+        late_samples=late_samples,
+        missing=0 if diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
     )
 
 

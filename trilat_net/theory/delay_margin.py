@@ -149,7 +149,7 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
 
     And whether roots are on it for every delay, as G has an eigenvalue of modulus 1 at every frequency.
     """
-    pencil = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0)).pencil
+    pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
     if not len(pencil.delays):
         return [], False
     with characteristic_roots.limit_blas_threads():

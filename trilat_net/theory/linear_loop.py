@@ -152,15 +152,11 @@ def differentiate_references(
             found[i, int(j)] = row[j] * np.eye(len(shared[i]))
         if len(shared[i]) > PLACE_COORDINATES and conditions.sites[i].layout.task:
             for peer in {i, *np.flatnonzero(row).tolist()}:
-                found[i, peer] = _differentiate_reference(row, i, peer, shared)
+                poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
+                poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[peer]))
+                moved = evaluate_reference(row, poses[i], poses).imag
+                found[i, peer] = moved / site_dynamics.COMPLEX_STEP
     return found
-
-
-def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) -> Array:
-    poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
-    poses[j] = poses[j] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[j]))
-    derivative: Array = evaluate_reference(row, poses[i], poses).imag / site_dynamics.COMPLEX_STEP
-    return derivative
 
 
 def couple_sites(
@@ -225,7 +221,9 @@ def differentiate_rates(
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))
         else:
             effect = rates.tau[:, at.estimate]
-            joints = _find_independent_rows(effect)
+            _, R, order = qr(effect.T, mode="economic", pivoting=True)  # its independent rows
+            sizes = np.abs(np.diag(R))
+            joints = sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
             names = tuple(f"gravity{joint + 1}" for joint in joints)
             jacobian = _replace_estimate(at, rates, effect[joints], names)
             jacobian = jacobian._replace(left_out=at.parameters - len(joints))
@@ -235,12 +233,6 @@ def differentiate_rates(
 
 def _name_motion(joints: int) -> tuple[str, ...]:
     return tuple(f"{kind}{joint + 1}" for kind in ("q", "qd") for joint in range(joints))
-
-
-def _find_independent_rows(matrix: Array) -> list[int]:
-    _, R, order = qr(matrix.T, mode="economic", pivoting=True)
-    sizes = np.abs(np.diag(R))
-    return sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
 
 
 def _replace_estimate(

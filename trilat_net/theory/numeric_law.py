@@ -60,7 +60,9 @@ class NumericLaw:
         own = np.array(read_memory(self._law))
         self._own, self._keeps_past = len(own), False
         self.memory, self.names = own, _name_memory(self._law, self._own)
-        arguments = self._lay_out(setup)
+        start, rest = np.array(setup.q0), np.zeros(self._layout.joints)
+        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
+        arguments = np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
         past = np.r_[np.zeros(self._layout.joints), setup.q0]
         self._keeps_past = not np.array_equal(self._ask(arguments, past), self._ask(arguments, past + 1e-3))
         if self._keeps_past:
@@ -93,12 +95,6 @@ class NumericLaw:
             if not np.abs(step).max(initial=0.0) > _STILL:
                 break
         return x[memory]
-
-    def _lay_out(self, setup: SiteSetup) -> Array:
-        n, start = self._layout.joints, np.array(setup.q0)
-        rest = np.zeros(n)
-        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
-        return np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
 
     def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
         """Returns the torque and the rate of the memory; of complex columns with their derivatives."""
