@@ -14,22 +14,19 @@ A_i = X A_p + S a + V_i x (S v), gravity included, link i needs
 which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n' F_n), Eq. (12), and
 M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors.
 
-Following in task space: with J the Jacobian of the followed axes and A = J J' + 1 of each axis that is not
-followed + damping,
-
-    v = psi + J' y,               A y  = -Lambda e - J psi
-    a = psi' + Jd' y + J' y',     A y' = -Lambda ed - Jd v - J (psi' + Jd' y)
-
-with psi = -k (q - posture); a force F at the end effector is the torque J' F, and a torque tau there is the
-force A^-1 J tau. Sources stand in `core.task_space` and docs/laws.md.
+Following in task space is that of `analysis.following.find_task_reference`, with psi = -k (q - posture); a
+force F at the end effector is the torque J' F, and a torque tau there is the force A^-1 J tau. Sources stand
+in `core.task_space` and docs/laws.md.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..analysis.arm_rows import Numbers, multiply_columns, solve_columns
+from ..analysis.following import find_task_reference
 from ..core.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
 from ..core.site_setup import ChainSetup, SiteSetup, TaskSetup
 from ..core.vectors import Array
@@ -402,11 +399,7 @@ def follow_in_task(
     A, least = _damp(task, J)
     posture = np.array(task.posture or site.q0).reshape(-1, *one)
     psi, psi_d = -task.posture_rate * (q - posture), -task.posture_rate * qd
-    y = solve_columns(A, -Lambda * e - multiply_columns(J, psi))
-    v = psi + multiply_columns(J.swapaxes(0, 1), y)
-    psi_d = psi_d + multiply_columns(Jd.swapaxes(0, 1), y)
-    y_d = solve_columns(A, -Lambda * ed - multiply_columns(Jd, v) - multiply_columns(J, psi_d))
-    a = psi_d + multiply_columns(J.swapaxes(0, 1), y_d)
+    v, a = find_task_reference(J, Jd, partial(solve_columns, A), (psi, psi_d), (Lambda * e, Lambda * ed))
     return Following(x, xd, e, ed, v, a, J, A, least)
 
 
