@@ -26,9 +26,10 @@ from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput, TickRecord
 from ..errors import LawFailed, ScenarioError
 from ..log.accounting import MIN_COVERAGE, Coverage
-from ..log.log_reader import Log, judge_integrity, open_log
+from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..log.running_digest import Integrity
+from ..log.session_check import judge_integrity
 from ..log.site_log import SiteLog
 from ..net.messages import STATE_VECTORS, State
 from ..scenario import Scenario, parse_core_change

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...log.accounting import Coverage
-from ...log.log_reader import Log, judge_integrity
+from ...log.log_reader import Log
 from ...log.running_digest import Integrity
+from ...log.session_check import judge_integrity
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses

@@ -16,9 +16,9 @@ from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
 from ...reporting.result_text import TextTable
 from ...scenario import Scenario, parse_scenario
-from .stability_map import label_axis
 from .sweep_cell import CellClass, classify_end
-from .sweep_run import ResultRow
+from .sweep_plan import label_axis
+from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
 """A live session lasts as long as the cell ran: longer ones are passed over, s."""

@@ -26,16 +26,15 @@ from ...scenario.law_consent import list_imported_laws
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
-from .stability_map import (
-    StableInterval,
+from .stability_map import StableInterval, evaluate_criterion, find_criterion_edge
+from .sweep_plan import (
+    SweepCell,
+    SweepPlan,
     build_sweep_command,
-    evaluate_criterion,
-    find_criterion_edge,
     format_override,
     format_override_value,
     label_axis,
 )
-from .sweep_plan import SweepCell, SweepPlan
 
 SCAN_POINTS = 9
 """Values of the scan: islands that are wider than an eighth of the range are seen."""
