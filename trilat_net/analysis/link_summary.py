@@ -4,10 +4,10 @@ Invariant: a quantity that the log does not determine is None. docs/definitions.
 delay is the age of the sample in use at a tick (age of information, Kaul, Yates and Gruteser 2012). Clock
 estimates are those in force while the session ran, without later improvement.
 
-Invariant (L4): the prediction is a function of seed, link and index; the log's scenario and the changes
-that its records name determine it, also for samples that never arrived. Invariant (L3): a record names its
-inputs. Samples that only a missing record could name stay unknown and count neither as arrived nor as
-missing.
+Invariant (L4): the predicted delivery of a sample is a function of seed, link and index; the log's scenario
+and the changes that its records name determine it, also for samples that never arrived. Invariant (L3): a
+record names its inputs. Samples that only a missing record could name stay unknown and count neither as
+arrived nor as missing.
 """
 
 from typing import NamedTuple

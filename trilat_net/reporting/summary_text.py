@@ -1,6 +1,7 @@
 """What is found of a run, as text: its summary, the checks of its log, a recovery, a rerun.
 
-The summary has links, changes, modes, clocks, and messages of user laws and arms.
+The summary has links, changes, modes, clocks, and messages of user laws and arms. What was measured of a
+running session, and of this machine, is here too.
 
 Invariant: a link with one constant delay and no loss gets no line.
 """
