@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from trilat_net.errors import UsageError
+from trilat_net.studies.intervals import wilson_interval
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, read_results, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
@@ -22,7 +23,6 @@ from trilat_net.studies.sweep.sweep_results import (
     reproduction_duration_s,
     require_polars,
 )
-from trilat_net.studies.sweep.sweep_run import wilson_interval
 
 from .quick import DELAYS, Judge, asked, outcome_of
 
