@@ -17,12 +17,12 @@ from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
-from trilat_net.execution import difference, twins
+from trilat_net.execution import twins, verify
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
-from trilat_net.studies.bench import bench_plan, bench_results, bench_run, bench_tasks
+from trilat_net.studies.bench import bench_plan, bench_results, bench_run
 from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
 from trilat_net.studies.tuning import candidate, search_space, tuning_plan
 from trilat_net.theory import (
@@ -32,7 +32,6 @@ from trilat_net.theory import (
     linear_analysis,
     linear_edge,
     port_response,
-    port_transparency,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -55,10 +54,10 @@ STATED: list[tuple[str, str, float, float]] = [
     ("bench.md", "is at least -1 mJ", -1, 1e3 * bench_results.PASSIVE_J),
     ("bench.md", "less than 2 s before the end", 2, bench_run.REST_S),
     ("bench.md", "at most 100 s", 100, bench_results.LONGEST_S),
-    ("bench.md", "40 round trips", 40, bench_tasks.ROUND_TRIPS),
+    ("bench.md", "40 round trips", 40, bench_plan.ROUND_TRIPS),
     ("bench.md", "less than 1 N", 1, bench_results.LEAST_CONTACT_N),
     ("bench.md", "none of fewer than 20 seeds", 20, bench_results.LEAST_SEEDS),
-    ("bench.md", "round trips of 68, 272 and 1088 ms", 1088, bench_tasks.TUNED_ROUND_TRIPS_MS[-1]),
+    ("bench.md", "round trips of 68, 272 and 1088 ms", 1088, bench_plan.TUNED_ROUND_TRIPS_MS[-1]),
     ("certificate.md", "end of each of 16 windows", 16, twins.WINDOWS),
     ("certificate.md", "a difference above 1e-4 is made small again", 1e-4, twins.LARGEST),
     ("certificate.md", "a run within 1e-7 of its records has twins", 1e-7, twins.SAME_RUN),
@@ -101,7 +100,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("metrics.md", "Hann windows of 4 s", 4, measured_impedance.SEGMENT_S),
     ("metrics.md", "0.5 to 20 Hz", 20, measured_impedance.HIGHEST_HZ),
     ("metrics.md", "coherence of 0.9", 0.9, measured_impedance.MIN_COHERENCE),
-    ("ports.md", "over 0.1-10 Hz", 10, port_transparency.TRANSPARENCY_BAND_HZ[1]),
+    ("ports.md", "over 0.1-10 Hz", 10, port_response.TRANSPARENCY_BAND_HZ[1]),
     ("recording.md", "of the last 60 s", 60, retransmit_buffer.KEPT_S),
     ("recording.md", "records up to 120 000", 120_000, retransmit_buffer.RECORDS_KEPT),
     ("recording.md", "at most 64 messages", 64, requests.BACKFILL_MESSAGES),
@@ -156,7 +155,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("log-tools.md", "at most 32 sites", 32, resolve.MAX_SITES),
     ("log-tools.md", "links of a site up to 64 MiB", 64, site_arrays.MAX_LINKS_BYTES / 2**20),
     ("log-tools.md", "of more than 65 536 only", 65_536, site_log.MAX_DECODED_RECORDS),
-    ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, difference.TOLERANCE),
+    ("log-tools.md", "agree to 1e-9 (1 + |a|)", 1e-9, verify.TOLERANCE),
     ("log-tools.md", "sleeps until 150 us before", 150, player.SPIN_NS / 1e3),
     ("maps/README.md", "nine values first", 9, margin_search.SCAN_POINTS),
     ("maps/README.md", "[--tolerance 0.005]", 0.005, margin_search.MARGIN_TOLERANCE),

@@ -116,9 +116,7 @@ def test_a_file_is_written_whole_or_what_was_there_stays(
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_file_that_is_open_elsewhere_stays_with_the_functions_of_windows_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_open_elsewhere_stays_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows replaces no file that a program has open."""
     write_whole(tmp_path / "report.json", "1")
 
@@ -133,9 +131,7 @@ def test_a_file_that_is_open_elsewhere_stays_with_the_functions_of_windows_repla
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_folder_that_cannot_be_synced_is_left_with_the_functions_of_windows_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_sync_is_left_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows opens no folder."""
 
     def refuse(*_: object) -> int:

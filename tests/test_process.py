@@ -174,7 +174,7 @@ class ProcessEndedError(Exception):
     """Stands for the end of a process."""
 
 
-def test_a_worker_ends_with_its_parent_with_the_functions_of_windows_replaced(
+def test_a_worker_ends_with_its_parent_as_on_windows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """There the number of a parent that has gone stays the same; a handle to it, here a pipe, tells."""
@@ -193,7 +193,7 @@ def test_a_worker_ends_with_its_parent_with_the_functions_of_windows_replaced(
     assert codes == [1]
 
 
-def test_a_closed_window_is_a_signal_with_the_functions_of_windows_replaced() -> None:
+def test_a_closed_window_is_a_signal_as_on_windows() -> None:
     program = (
         "import signal\n"
         "signal.SIGBREAK = signal.SIGHUP\n"

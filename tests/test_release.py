@@ -58,7 +58,7 @@ def test_what_the_workflows_run_is_there() -> None:
                     assert words[0] in ("python", "check-wheel-contents", "twine", "trilat-net"), line
 
 
-def test_it_is_built_once_installed_everywhere_and_then_published_without_a_secret() -> None:
+def test_a_release_is_built_once_and_published_without_a_secret() -> None:
     jobs = RELEASE["jobs"]
     assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
     needs = {"build": None, "compile": "build", "install": "compile", "studies": "build"}
@@ -85,7 +85,7 @@ def locked(name: str) -> set[str]:
     return set(re.findall(r"^([\w-]+)==", text, re.MULTILINE))
 
 
-def test_every_lock_has_what_is_stated_for_it_and_setup_installs_no_extra() -> None:
+def test_every_lock_has_what_is_stated_for_it() -> None:
     """A lock that is made once and not again with a new dependency lacks it: `make lock`."""
     groups = {key: names_of(stated) for key, stated in PROJECT["dependency-groups"].items()}
     needed, extras = PROJECT["project"]["dependencies"], PROJECT["project"]["optional-dependencies"]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .studies.executor import Workers
     from .studies.log_comparison import LogComparison
     from .studies.sweep.margin_search import SweepMargins
-    from .studies.sweep.sweep_run import SweepResults
+    from .studies.sweep.sweep_results import SweepResults
     from .studies.tuning.tuning_plan import TuningResult
     from .theory.linear_analysis import LinearAnalysis
 
@@ -178,7 +178,7 @@ def certify(
     Raises:
         LogError: the log cannot be read.
     """
-    from .theory.end_pose import certify_run
+    from .theory.linear_analysis import certify_run
 
     return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 
@@ -316,7 +316,7 @@ def sweep(
         UsageError: the folder holds something else, or polars is not installed.
     """
     from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
-    from .studies.sweep.sweep_run import require_polars
+    from .studies.sweep.sweep_results import require_polars
 
     require_polars()
     texts = _texts(set, duration_s)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.analysis.certificate import runs
 from trilat_net.analysis.aligned import align_records
-from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.torque_sources import (
     attribute_torque,
     compute_operator_script,
@@ -43,7 +43,9 @@ def test_every_actor_does_what_the_core_says(
     expected = np.zeros_like(q)
     for n in range(len(states)):
         expected[n] = exogenous.source_torque(float(t_s[n]), q[n], qd[n], lengths, rows[0], table)[:2]
-    found = compute_source_torque(actor, t_s, q, qd, compute_end_effector(lengths, q, qd))
+    found = compute_source_torque(
+        actor, t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -70,7 +72,7 @@ def test_a_script_is_its_torque_at_a_fixed_pose(acts: TorqueKind) -> None:
     actor = TorqueSource(acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0))
     t_s = np.linspace(0.0, 4.0, 41)
     still = np.tile([0.3, 1.1], (len(t_s), 1))
-    tip = compute_end_effector((1.0, 1.0), still, 0.0 * still)
+    tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(still, 0.0 * still)
     torque, script = (
         compute_source_torque(actor, t_s, still, 0.0 * still, tip),
         compute_operator_script(actor, t_s, tip.J[0]),

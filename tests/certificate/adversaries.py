@@ -41,8 +41,8 @@ from trilat_net.log.log_reader import Log
 from trilat_net.log.running_digest import DigestState, Integrity
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
-from trilat_net.theory.end_pose import find_end_pose_roots
 from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
+from trilat_net.theory.linear_analysis import find_end_pose_roots
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
 from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions, is_constant_link
 

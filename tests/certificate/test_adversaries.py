@@ -165,7 +165,7 @@ def _hold(found: Tally) -> None:
 @pytest.mark.parametrize(
     "seed", [WIDE_FROM, *(pytest.param(n, marks=pytest.mark.long) for n in range(2001, 2040))]
 )
-def test_the_stored_truth_of_whatever_is_drawn_is_that_found_anew(seed: int) -> None:
+def test_the_stored_truth_of_a_drawn_case_is_found_anew(seed: int) -> None:
     drawn = draw_experiment(seed)
     stored, found = read_truth(seed, drawn), find_truth(drawn)
     assert (found.unstable, found.near) == (stored.unstable, stored.near)
@@ -194,7 +194,7 @@ def _kinds(seeds: range) -> list[int]:
         *(pytest.param(range(n, n + 100), id=str(n), marks=pytest.mark.long) for n in range(0, SEEDS, 100)),
     ],
 )
-def test_stored_truths_and_words_without_a_log_are_those_found_anew(seeds: Iterable[int]) -> None:
+def test_stored_truths_and_words_are_found_anew(seeds: Iterable[int]) -> None:
     for seed in seeds:
         drawn = draw_experiment(seed)
         stored, found = read_truth(seed, drawn), find_truth(drawn)

@@ -128,7 +128,7 @@ def test_what_is_printed_has_letters_on_every_system(
 
 
 @pytest.mark.parametrize(("name", "code"), [((), 0), (("a?b.mcap",), 2)])
-def test_a_closed_pipe_and_a_bad_name_with_the_functions_of_windows_replaced(
+def test_a_closed_pipe_and_a_bad_name_as_on_windows(
     name: tuple[str, ...], code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both are EINVAL there."""

@@ -163,7 +163,7 @@ def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) ->
     assert done.returncode in (-number, 128 + number), done.stderr
 
 
-def test_a_signal_ends_the_first_process_of_a_container_as_it_compiles(tmp_path: Path) -> None:
+def test_a_signal_ends_a_containers_first_process_while_it_compiles(tmp_path: Path) -> None:
     """The kernel lets no signal end such a process that it did not ask for."""
     first = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
     if shutil.which("unshare") is None or subprocess.run([*first, "true"], capture_output=True).returncode:

@@ -13,7 +13,7 @@ from tests.execution.logs import without_records
 from trilat_net.analysis.twin_growth import TWINS
 from trilat_net.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
-from trilat_net.execution.log_inputs import explain_no_repetition
+from trilat_net.execution.fused import explain_no_repetition
 
 OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.arm_rows import inertia_product_rows
+from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
@@ -104,7 +104,7 @@ def functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
         speed = speeds(log, peer)
         stored = integral((Kd * speed**2).sum(axis=1))
         V += 0.5 * (
-            (r * inertia_product_rows(arm.theta, q, r)).sum(axis=1)
+            (r * PlanarArmRows(arm.theta, 0.0, (1.0, 1.0)).multiply_inertia(q, r)).sum(axis=1)
             + ((here.theta_hat[DELAY:] - arm.theta) ** 2).sum(axis=1)
             + ((lengths_m - arm.lengths_m) ** 2).sum(axis=1) / LENGTH_GAIN
             + Lambda * (Kd * e**2).sum(axis=1)

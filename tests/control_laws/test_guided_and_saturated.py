@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
+from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.core.elementary import tanh
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_law_conditions
-from trilat_net.theory.textbook_arm import PlacedArm
 
 SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}
 P_D = {"law": "p_d", "K": 100.0, "d": 20.0}

@@ -92,7 +92,7 @@ def run_leaves(folder: Path, cache: Path, **more: str) -> tuple[str, int]:
     return "\n".join(said), int(number)
 
 
-def test_with_a_wheels_code_nothing_is_compiled_and_bits_are_the_hosts(tmp_path: Path) -> None:
+def test_a_wheels_code_compiles_nothing_and_has_the_hosts_bits(tmp_path: Path) -> None:
     host, compiled = run_leaves(tmp_path / "none", tmp_path / "host")
     generic, _ = run_leaves(tmp_path / "none", tmp_path / "generic", NUMBA_CPU_NAME="generic")
     within = shutil.ignore_patterns("*-within*")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.core.guarded_runs import LIMITS, TEXT, adaptive_text, guarded, ordered, stopped_log
 from tests.core.rests import gravity_of, integrals, reference, rest_torque
-from trilat_net.analysis.arm_rows import build_arm_rows, inertia_product_rows
+from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
 from trilat_net.core.resting import limit_torque_rate
 from trilat_net.core.site_arrays import build_site_arrays
 from trilat_net.core.site_setup import RestGains
@@ -74,7 +74,7 @@ def test_storage_falls_by_what_is_dissipated(how: str) -> None:
     e, off = q - part.q_des[rows], part.theta_hat[rows] - theta
     r, B, w = qd + 2.0 * e, np.array(gains.damping), integrals(part, slice(still - 1, 5899))
     V = 0.5 * (
-        (r * inertia_product_rows(theta, q, r)).sum(axis=1)
+        (r * PlanarArmRows(theta, 0.0, (1.0, 1.0)).multiply_inertia(q, r)).sum(axis=1)
         + 2.0 * 5.0 * (e**2).sum(axis=1)
         + (off**2).sum(axis=1) / 3.0
         + (w**2 / (B / (4.0 * gains.time_s))).sum(axis=1)

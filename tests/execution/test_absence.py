@@ -19,8 +19,9 @@ from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify
 from trilat_net.log.accounting import MIN_COVERAGE, Coverage
-from trilat_net.log.log_reader import judge_integrity, open_log
+from trilat_net.log.log_reader import open_log
 from trilat_net.log.running_digest import DigestState
+from trilat_net.log.session_check import judge_integrity
 from trilat_net.net.messages import Event
 
 LATE = {("m1", 0, 20): 35, ("m2", 1, 30): 38, ("s", 0, 25): 39}

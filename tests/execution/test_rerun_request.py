@@ -7,7 +7,7 @@ import pytest
 
 from tests.log_editing import opened, recorded
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.execution.rerun_request import RerunRequest, describe_rerun_changes, resolve_rerun_request
+from trilat_net.execution.rerun_execution import RerunRequest, describe_rerun_changes, resolve_rerun_request
 
 from .deliveries import SITES
 

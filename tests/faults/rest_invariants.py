@@ -8,11 +8,11 @@ tick: a torque that begins at zero cannot hold what hangs until it has grown to 
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis.arm_rows import inertia_product_rows
+from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.core.site_setup import LEAST_STOP_S, SiteSetup
 from trilat_net.net.messages import State
 from trilat_net.scenario import Scenario
@@ -32,6 +32,10 @@ MOST_ENERGY = 1.2
 LEAST_ENERGY_J = 1e-4
 """Of an arm that is at rest already: less than it has at 0.05 rad/s."""
 PEERS = 2
+
+
+def _multiply_inertia(theta: Any, q: Any, x: Any) -> Any:
+    return PlanarArmRows(theta, 0.0, (1.0, 1.0)).multiply_inertia(q, x)
 
 
 class Rest(NamedTuple):
@@ -74,7 +78,7 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
             place = of.stop
             if resting:
                 q, qd = (np.array([getattr(state, key) for state in rows]) for key in ("q", "qd"))
-                kinetic_j = 0.5 * (qd * inertia_product_rows(theta, q, qd)).sum(axis=1)
+                kinetic_j = 0.5 * (qd * _multiply_inertia(theta, q, qd)).sum(axis=1)
                 binds = np.append(limited[of], False)
                 blend = max(round(BLEND_S * setup.rate_hz), int(np.argmin(binds)))
                 yield Rest(name, setup, rows, limited[of], kinetic_j, blend)
@@ -150,7 +154,7 @@ def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndar
     w = np.array([state.mem[first : first + len(q[0])] for state in rest.states[:-1]])
     e, off = q - q_des, theta_hat - theta
     r = qd + np.asarray(gains.Lambda) * e
-    kinetic = (r * inertia_product_rows(theta, q, r)).sum(axis=1)
+    kinetic = (r * _multiply_inertia(theta, q, r)).sum(axis=1)
     stored = (np.asarray(gains.Lambda) * np.asarray(gains.Kd) * e**2).sum(axis=1)
     learnt = (off**2 / np.asarray(gains.Gamma)).sum(axis=1)
     integral = (w**2 / np.asarray(still.vectors()["integral"])).sum(axis=1)
@@ -215,6 +219,6 @@ def find_stopping_distance(scenario: Scenario, rest: Rest) -> float:
     q, v = (rest.rows(key)[: rest.blend + 1] for key in ("q", "qd"))
     stop_s = max(LEAST_STOP_S, float((np.abs(v[0]) / still.deceleration).max()))
     a = np.diff(v, axis=0) * rest.setup.rate_hz
-    d_nm = np.abs(inertia_product_rows(scenario.arms[rest.name].theta, q[1:], a)).max(axis=0, initial=0.0)
+    d_nm = np.abs(_multiply_inertia(scenario.arms[rest.name].theta, q[1:], a)).max(axis=0, initial=0.0)
     aside_rad = 4.0 * still.time_s * d_nm / still.damping
     return MOST_WAY * float((np.abs(v[0]) * stop_s / 2.0 + aside_rad).max())

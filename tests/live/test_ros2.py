@@ -148,7 +148,7 @@ def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, An
 
 
 @pytest.mark.long
-def test_a_stranger_leads_an_arm_stops_it_and_the_log_is_verified(stage: Stage) -> None:
+def test_a_stranger_leads_and_stops_an_arm_and_verifies(stage: Stage) -> None:
     with bridged_session(stage, 25) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for n in range(150):
@@ -199,7 +199,7 @@ def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_router_that_comes_late_and_again_is_joined_and_latecomers_see_the_arm(stage: Stage) -> None:
+def test_a_router_that_comes_late_is_joined_and_latecomers_see(stage: Stage) -> None:
     (router,) = find_free_endpoints(1)
     session = Session(stage, "play", PAPER, "--duration", "120", *SLOWER)
     session.all()
@@ -246,7 +246,7 @@ SAFE = [-0.25, 0.25]
 
 
 @pytest.mark.long
-def test_a_robot_of_ros_is_an_arm_and_brakes_when_its_site_is_silent(stage: Stage) -> None:
+def test_a_robot_of_ros_brakes_when_its_site_is_silent(stage: Stage) -> None:
     (router,) = find_free_endpoints(1)
     running = stage.start("router", "router", "--listen", router)
     (stage.folder / "robot.toml").write_text(ROBOT)

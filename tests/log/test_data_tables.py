@@ -194,7 +194,7 @@ def test_a_frame_is_its_table(name: str, kind: str) -> None:
         ("pandas", lambda log: log.to_frame()),
     ],
 )
-def test_without_a_library_of_frames_one_is_told_what_to_install(
+def test_a_missing_frame_library_is_named_with_its_install(
     library: str, frame: Callable[[Log], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)

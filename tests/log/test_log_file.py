@@ -129,7 +129,7 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
     assert messages(active_path(path)) == []
 
 
-def test_a_log_that_is_open_elsewhere_is_kept_beside_with_the_functions_of_windows_replaced(
+def test_a_log_open_elsewhere_is_kept_beside_as_windows_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Windows replaces no file that a viewer has open."""

@@ -69,7 +69,7 @@ def test_a_signal_does_not_shorten_a_sleep() -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_the_clock_is_that_of_posix_and_not_the_coarse_one_of_windows() -> None:
+def test_the_clock_is_not_the_coarse_one_of_windows() -> None:
     """Python 3.12 reads GetTickCount64 for `monotonic` on Windows, which goes in steps of 16 ms."""
     fine, coarse = time.get_clock_info("perf_counter"), time.get_clock_info("monotonic")
     assert SystemClock.monotonic_ns is time.perf_counter_ns

@@ -162,7 +162,7 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
         assert {payload for _, payload in heard(say, inbox)} == {b"true"}
 
 
-def test_a_bridge_is_a_hand_and_an_arm_and_holds_no_switch(meeting: Meeting, folder: Path) -> None:
+def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: Path) -> None:
     """It gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
     bridge, operator = (meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR))
     meeting.m1.respond(key("m1", topics.SET), lambda payload: payload)

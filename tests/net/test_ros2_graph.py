@@ -228,7 +228,7 @@ def wire() -> Iterator[Wire]:
 SENT = Attachment(1, 5, b"s" * 16)
 
 
-def test_a_message_of_another_type_or_without_attachment_is_not_taken(wire: Wire) -> None:
+def test_a_message_of_another_type_or_unattached_is_refused(wire: Wire) -> None:
     came: list[tuple[bytes, Attachment]] = []
     wire.graph.subscribe("a", STRING, lambda data, sent: came.append((data, sent)))
     right = topic_key(0, "a", STRING, STRING_HASH)
@@ -243,7 +243,7 @@ def test_a_message_of_another_type_or_without_attachment_is_not_taken(wire: Wire
     assert wire.graph.refusals.counts == {"a: a message without an attachment of ROS": 3}
 
 
-def test_what_a_message_raises_is_refused_and_the_next_one_comes(wire: Wire) -> None:
+def test_a_message_that_raises_is_refused_and_the_next_comes(wire: Wire) -> None:
     came: list[bytes] = []
 
     def take(data: bytes, _: Attachment) -> None:
@@ -267,7 +267,7 @@ def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None
     with_token.undeclare()
 
 
-def test_a_request_without_an_attachment_is_refused_and_answered_by_nobody(wire: Wire) -> None:
+def test_a_request_without_attachment_is_refused_and_unanswered(wire: Wire) -> None:
     wire.graph.serve("end", TRIGGER, lambda _: b"done")
     key = topic_key(0, "end", TRIGGER, find_type_hash(TRIGGER, "jazzy"))
 

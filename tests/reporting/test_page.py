@@ -11,7 +11,7 @@ from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
-from trilat_net.analysis.run_summary import summarise_run
+from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
 from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures, write_report_figures
 from trilat_net.reporting.page import render_report, write_report

@@ -1,8 +1,13 @@
-"""What a terminal is told of links, changes, modes and clocks."""
+"""What a terminal is told of links, changes, modes and clocks.
 
+Text tables: the same cells on a terminal, in Markdown and as lines.
+"""
+
+from io import StringIO
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 import trilat_net
 from tests.analysis import logs
@@ -13,6 +18,7 @@ from trilat_net.core.ticks import LifeReason, find_alarm
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.reporting import summary_text
 from trilat_net.reporting.page import render_alarms
+from trilat_net.reporting.result_text import TextTable
 from trilat_net.reporting.summary_text import (
     MOST_LINE_CHARACTERS,
     format_clock_lines,
@@ -143,3 +149,39 @@ def test_what_ended_the_run_is_a_line_without_controls() -> None:
     assert (law, arm) == ("slow", "off")
     assert failed.startswith("the law a:B of s failed at tick 3:  [31mxxx")
     assert len(failed) == MOST_LINE_CHARACTERS
+
+
+TABLE = TextTable(
+    ("site", "delay", "note"),
+    [["energies"], ["m1", "40.5", "|e| [red]"], ["long name", "7", "\x1b[2J"]],
+    align="lrl",
+    units=("", "ms"),
+)
+
+
+def test_lines_are_aligned_and_short_rows_stay_short() -> None:
+    assert TABLE.lines() == [
+        "site       delay ms  note",
+        "energies",
+        "m1             40.5  |e| [red]",
+        "long name         7  \x1b[2J",
+    ]
+
+
+def test_markdown_escapes_bars_and_marks_numbers() -> None:
+    heads, rule, group, first, _ = TABLE.markdown().splitlines()
+    assert heads == "| site | delay ms | note |"
+    assert rule == "| --- | --: | --- |"
+    assert group == "| energies |  |  |"
+    assert first == r"| m1 | 40.5 | \|e\| [red] |"
+
+
+def test_a_terminal_gets_every_cell_and_no_control_characters() -> None:
+    console = Console(file=StringIO(), width=12)
+    console.print(TABLE._replace(styles={"7": "green"}).rich())
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "\x1b" not in text
+    assert "".join(text.split()).count("[red]") == 1
+    console = Console(file=StringIO(), width=40)
+    console.print(TextTable(("", ""), [("a", "b")]).rich())  # without headers, without their line
+    assert console.file.getvalue().split() == ["a", "b"]  # type: ignore[attr-defined]

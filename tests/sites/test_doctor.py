@@ -187,7 +187,7 @@ def test_the_rate_is_told_with_how_late_ticks_were(
     assert text in found.text
 
 
-def test_a_real_loop_is_measured_in_a_process_of_its_own() -> None:
+def test_a_real_loop_is_measured_in_its_own_process() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 
 
@@ -199,9 +199,7 @@ def test_what_is_promised_here_is_told(kernel: str, name: str, monkeypatch: pyte
     assert name in found.text
 
 
-def test_open_rights_are_no_finding_with_the_functions_of_windows_replaced(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open_rights_are_no_finding_on_windows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows lets a mode tell nothing but whether a file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:

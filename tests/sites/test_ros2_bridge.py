@@ -133,7 +133,7 @@ def test_whatever_comes_is_taken_or_counted(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, 1e7])
-def test_a_target_that_no_arm_can_take_is_refused_and_the_last_one_stays(x: float) -> None:
+def test_an_impossible_target_is_refused_and_the_last_one_stays(x: float) -> None:
     desk = Desk()
     desk.hears(0.1)
     desk.hears(x)
@@ -275,7 +275,7 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
 
 
 @pytest.mark.parametrize("name", ["paper", "six_joints", "unlike_arms", "wall_in_space"])
-def test_the_pose_of_the_tip_is_that_of_a_link_in_the_transforms(name: str) -> None:
+def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
@@ -306,7 +306,7 @@ def shares(*numbers: float) -> bytes:
     )
 
 
-def test_shares_are_asked_for_once_and_what_is_refused_is_said() -> None:
+def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
     asked: list[dict[str, float]] = []
     said: list[str] = []
 
@@ -414,7 +414,7 @@ class Robot:
         return [message.data.tolist() for message in got]
 
 
-def test_joint_states_of_a_robot_are_the_measurements_of_its_site() -> None:
+def test_joint_states_of_a_robot_are_its_sites_measurements() -> None:
     robot, of_another_clock = Robot(), 1_790_000_000 * 10**9
     robot.says(["gripper", "elbow", "shoulder"], [9.0, 2.0, 1.0], [8.0, 4.0, 3.0], stamp_ns=of_another_clock)
     robot.says(["shoulder", "elbow"], [1.5, 2.5], [0.0, 0.0], stamp_ns=0)
@@ -445,7 +445,7 @@ def test_joint_states_that_measure_no_arm_are_named(
     assert robot.said == [f"refused: joint_states {said}"]
 
 
-def test_two_robots_on_one_topic_measure_nothing_until_one_is_gone() -> None:
+def test_two_robots_on_one_topic_measure_nothing() -> None:
     robot, pose = Robot(), (["shoulder", "elbow"], [1.0, 2.0], [0.0, 0.0])
     robot.says(*pose)
     robot.says(*pose, sender=SECOND)
@@ -479,7 +479,7 @@ def test_whatever_a_robot_says_is_taken_passed_over_or_counted(data: bytes) -> N
     assert len(robot.measured()) + robot.refusals.counts.total() <= 1
 
 
-def test_a_robot_gets_each_torque_once_in_the_order_of_its_controller() -> None:
+def test_a_robot_gets_each_torque_once_in_its_own_order() -> None:
     robot = Robot()
     robot.ticks(0, 3.0, 4.0)
     assert robot.driven() == [[4.0, 3.0]]
@@ -489,7 +489,7 @@ def test_a_robot_gets_each_torque_once_in_the_order_of_its_controller() -> None:
     assert robot.driven(2_000_000) == [[8.0, 7.0]]
 
 
-def test_a_robot_without_a_torque_gets_again_and_again_what_is_safe() -> None:
+def test_a_robot_without_a_torque_gets_the_safe_command() -> None:
     robot, safe = Robot(), [[0.5, -0.5]]
     assert robot.driven() == safe  # the site has made no tick
     assert robot.driven(SAFE_NS - 1) == []
@@ -566,7 +566,7 @@ def event(kind: str, **fields: Any) -> Event:
     return Event(member="s", boot=1, kind=kind, text="", **fields)
 
 
-def test_a_session_that_begins_anew_is_shown_with_its_own_epoch() -> None:
+def test_a_session_begun_anew_is_shown_with_its_epoch() -> None:
     sites = Sites([])
     sites.begin(10**18)
     with sites.shown() as bridge:

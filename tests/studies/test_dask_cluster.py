@@ -19,7 +19,7 @@ from trilat_net.studies import dask_cluster
 from trilat_net.studies.dask_cluster import WorkerRequirements, describe_worker, find_unfit
 from trilat_net.studies.executor import open_worker_pool
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.sweep_run import RESULTS_FILE
+from trilat_net.studies.sweep.sweep_results import RESULTS_FILE
 
 from .sweep.quick import SHORT
 from .sweep.quick import asked as plan

@@ -13,7 +13,7 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.intervals import mean_interval
 from trilat_net.studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.sweep_run import collect_grid_points, list_totals
+from trilat_net.studies.sweep.sweep_results import collect_grid_points, list_totals
 from trilat_net.studies.trials import run_trials, trials
 from trilat_net.studies.tuning import plan_tuning
 from trilat_net.studies.tuning.candidate import (

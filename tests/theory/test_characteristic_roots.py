@@ -1,10 +1,25 @@
-"""Threads of the linear algebra: as they were, and no number changed."""
+"""Threads of the linear algebra: as they were, and no number changed.
+
+Roots against closed forms, and against the number of turns of det Delta, which misses none.
+"""
+
+import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import lambertw
 
+from tests.theory.loops import loop, residual, roots_within
 from trilat_net.theory import characteristic_roots
-from trilat_net.theory.characteristic_roots import limit_blas_threads
+from trilat_net.theory.characteristic_roots import (
+    chebyshev_differentiation,
+    chebyshev_interpolation,
+    chebyshev_nodes,
+    compute_delay_spectrum,
+    limit_blas_threads,
+)
 
 
 def test_the_number_of_threads_is_put_back_whatever_happens() -> None:
@@ -36,3 +51,93 @@ def test_a_guess_beyond_the_range_of_exp_is_dropped(E: np.ndarray | None) -> Non
         roots, dropped = characteristic_roots.refine_roots(pencil, np.array([-1.1 + 0j, -1e4 + 0j]), "ab", 4)
     assert dropped == 1
     assert roots[0].s == pytest.approx(-1.0, abs=1e-6)
+
+
+@given(a=st.floats(-3, 3).filter(lambda a: abs(a) > 0.05), T=st.floats(0.02, 3))
+def test_one_delay_is_lamberts_function(a: float, T: float) -> None:
+    """x' = -a x(t - T) has the roots W_k(-a T) / T."""
+    found = compute_delay_spectrum(loop(0.0, (T, -a)), 3).roots
+    exact = np.array([lambertw(-a * T, k) / T for k in range(-6, 7)])
+    exact = exact[exact.imag >= -1e-9]
+    exact = exact[np.argsort(-exact.real)]
+    assert len(found) == 3
+    if abs(a * T - 1 / math.e) < 1e-3:  # two roots meet: they are known to the root of rounding only
+        return
+    for root, wanted in zip(found, exact, strict=False):
+        assert abs(root.s - wanted) <= 1e-9 * (1 + abs(wanted))
+
+
+def test_the_textbook_case() -> None:
+    """x' = -x(t - 1): the omega constant's neighbour, -0.3181 + 1.3372 j."""
+    (root,) = compute_delay_spectrum(loop(0.0, (1.0, -1.0)), 1).roots
+    assert root.s == pytest.approx(-0.31813150520476 + 1.33723570143069j, abs=1e-12)
+
+
+@given(a=st.floats(0.1, 0.9))
+def test_two_delays_with_a_root_on_the_axis(a: float) -> None:
+    """x' = -a x(t - pi/2) - (1 - a) x(t - 5 pi/2) has the root j, since both terms turn by a quarter."""
+    found = compute_delay_spectrum(loop(0.0, (math.pi / 2, -a), (5 * math.pi / 2, a - 1)), 8)
+    assert min(abs(root.s - 1j) for root in found.roots) <= 1e-9
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=25)
+def test_no_root_is_missed(seed: int) -> None:
+    """As many as det Delta has zeros to the right of the last one that was asked for."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 5))
+    delays = np.sort(rng.uniform(0.05, 1.5, 2))
+    system = loop(rng.normal(size=(n, n)), *((float(T), rng.normal(size=(n, n))) for T in delays))
+    found = compute_delay_spectrum(system, 5)
+    assert all(residual(system, root.s) <= 1e-12 for root in found.roots)
+    reals = [root.s.real for root in found.roots]
+    assert reals == sorted(reals, reverse=True)
+    for after, before in zip(found.roots[1:], found.roots, strict=False):
+        gap = before.s.real - after.s.real
+        if gap > 0.05:
+            left = before.s.real - 0.5 * gap
+            right = [root for root in found.roots if root.s.real > left]
+            count = sum(root.multiplicity * (2 if root.s.imag else 1) for root in right)
+            far = sum(np.linalg.norm(d.A) * math.exp(max(0.0, -left) * d.delay_s) for d in system.delayed)
+            size = 1.0 + np.linalg.norm(system.A) + far
+            assert roots_within(system, complex(left, -size), complex(size, size), 6000) == count
+
+
+def test_several_modes_that_share_a_root_are_one_root() -> None:
+    system = loop(-np.eye(3), (0.5, -2.0 * np.eye(3)))
+    (root,) = compute_delay_spectrum(system, 1).roots
+    assert root.multiplicity == 3
+
+
+def test_roots_at_zero_are_counted_and_never_the_rightmost() -> None:
+    """Two masses that agree on any place, one estimate that nothing moves, and one that moves nothing."""
+    A = np.zeros((4, 4))
+    A[0, 0] = A[1, 1] = -1.0
+    A[3, 0] = 1.0
+    late = np.zeros((4, 4))
+    late[0, 1] = late[1, 0] = 1.0
+    found = compute_delay_spectrum(loop(A, (0.3, late)), 3)
+    assert (found.zeros, found.drifting) == (3, 0)
+    assert found.rightmost is not None
+    assert found.rightmost.s.real < -0.1
+    assert found.verdict == "stable"
+
+
+def test_a_mass_that_nothing_holds_drifts() -> None:
+    found = compute_delay_spectrum(loop([[0.0, 1.0], [0.0, 0.0]]), 1)
+    assert (found.zeros, found.roots) == (2, ())
+    chain = np.zeros((3, 3))
+    chain[0, 1] = chain[2, 0] = 1.0
+    chain[2, 2] = -1.0
+    chain[1, 1] = -1.0
+    late = np.zeros((3, 3))
+    late[1, 1] = 1.0
+    held = compute_delay_spectrum(loop(chain, (0.2, late)), 1)
+    assert (held.zeros, held.drifting, held.verdict) == (2, 1, "at the edge")
+
+
+@given(order=st.integers(3, 30), at=st.floats(-1, 1))
+def test_polynomials_are_differentiated_and_interpolated_exactly(order: int, at: float) -> None:
+    nodes = chebyshev_nodes(order)
+    assert chebyshev_differentiation(order) @ nodes**3 == pytest.approx(3 * nodes**2, abs=1e-10)
+    assert chebyshev_interpolation(order, np.array([at])) @ nodes**3 == pytest.approx(at**3, abs=1e-12)

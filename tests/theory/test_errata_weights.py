@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 
 from tests.theory.energy import balance
 from tests.virtual_runs import run
-from trilat_net.analysis.lyapunov_weights import (
+from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
     left_perron_vector,

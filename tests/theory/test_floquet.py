@@ -15,9 +15,8 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.sample_uses import draw_uses
 from trilat_net.theory import find_equilibrium, floquet
 from trilat_net.theory.characteristic_roots import Spectrum
-from trilat_net.theory.floquet import compute_sampled_spectrum, find_samples_in_use
+from trilat_net.theory.floquet import CoupledTicks, compute_sampled_spectrum, find_samples_in_use
 from trilat_net.theory.operating_point import derive_operating_conditions
-from trilat_net.theory.tick_map import CoupledTicks
 
 POSE = (0.1, 0.4)
 

@@ -182,11 +182,11 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
     swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
     loop = linearise_loop(conditions, rest, every_estimate=True)
-    pencil = find_moving_part(loop)
+    pencil, names, _ = find_moving_part(loop)
     for s in swings:
-        vector = np.linalg.svd(pencil.pencil.at(s)[0])[2][-1].conj()
+        vector = np.linalg.svd(pencil.at(s)[0])[2][-1].conj()
         vector *= 1e-5 / vector[np.abs(vector).argmax()]
-        off = dict(zip(pencil.names, vector.real.tolist(), strict=True))
+        off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)
         measured = realise(follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16)
         assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)

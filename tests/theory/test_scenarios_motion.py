@@ -1,10 +1,22 @@
-"""Free motion, the box, shares, a cut: the contrasts of `free`, `paper`, `box`, `training`, `outage`."""
+"""Free motion, the box, shares, a cut: the contrasts of `free`, `paper`, `box`, `training`, `outage`.
+
+What a wall tells apart: scenarios `contact` and `windup`.
+
+What the shipped scenarios expect are the figures, within their last printed digit or 2 %.
+
+That they meet what they expect is tested in `tests/studies/trials/test_shipped.py`.
+
+P+d at its margin, and jitter: scenarios `p_d_margin`, `p_d_margin_two`, `jitter`.
+
+A figure "at t" is the largest |e| of the two seconds from t on.
+"""
 
 import numpy as np
 import pytest
 
-from tests.theory.figures_of_runs import Overrides, measured, printed, value
+from tests.theory.figures_of_runs import Overrides, measured, peak, printed, value
 from tests.virtual_runs import sampled
+from trilat_net.analysis.envelope_trend import EnvelopeTrend
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.theory import analyse_linear_loop
@@ -110,3 +122,190 @@ def test_a_ramped_return_needs_no_more_than_uncut_links() -> None:
     uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
     assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
     assert value(held, "speed_peak_rad_s") <= value(uncut, "speed_peak_rad_s")
+
+
+LATE = (9.0, 15.0, "s")
+
+
+def test_direct_force_reflection_hammers_at_200_ms() -> None:
+    made = measured("contact", {}, LATE)
+    assert value(made, "wall_mean_n") == printed(8.0, 1.0)
+    assert value(made, "wall_deviation_n") == printed(14.0, 1.0)
+    assert value(made, "wall_peak_n") == printed(52.0, 1.0)
+    assert value(made, "wall_hits") == 3
+
+
+def test_at_20_ms_there_is_one_hit() -> None:
+    made = measured("contact", {"link.delay_ms": 20.0}, (0.0, 15.0, "s"), (14.0, 15.0, "s"))
+    assert value(made, "wall_hits") == 1
+    assert value(made, "wall_mean_n", 1) == printed(3.3, 0.1)
+    assert value(made, "wall_deviation_n", 1) < 0.01
+
+
+def test_a_fifth_of_the_force_settles() -> None:
+    made = measured("contact", {"sites.m.control.k_f": 0.2}, (14.0, 15.0, "s"))
+    assert value(made, "wall_mean_n") == printed(8.5, 0.1)
+    assert value(made, "wall_deviation_n") < 0.05
+
+
+def test_free_motion_is_calm_at_200_ms() -> None:
+    made = measured("contact", {"sites.s.environment": []}, (14.0, 15.0, "s"))
+    assert value(made, "speed_peak_rad_s") < 1e-6
+    assert made.end_error_rad is not None
+    assert made.end_error_rad < 1e-6
+
+
+@pytest.mark.parametrize(
+    "law",
+    [{"law": "pd_d"}, pytest.param({"law": "p_d", "K": 100.0, "d": 40.0}, marks=pytest.mark.long)],
+    ids=str,
+)
+def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object]) -> None:
+    """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
+    made = measured(
+        "contact",
+        {"control": law, "sites.m.control": {}, "sites.s.control": {}, "duration_s": 25.0},
+        (24.0, 25.0, "s"),
+    )
+    assert value(made, "wall_mean_n") > 1.0
+    assert value(made, "wall_deviation_n") < 0.05
+
+
+@pytest.mark.long
+def test_without_learning_gravity_nothing_winds_up() -> None:
+    made = measured(
+        "windup",
+        {"control.Gamma": [1.0, 1.0, 1.0, 0.0, 0.0], "duration_s": 20.0},
+        (10.0, 10.2, "s"),
+        (19.8, 20.0, "s"),
+    )
+    assert value(made, "wall_mean_n", 1) == pytest.approx(value(made, "wall_mean_n", 0), abs=0.02)
+
+
+FIGURES = [
+    ("contact", "wall_mean_n", (9.0, 15.0), 8.0, 1.0),
+    ("contact", "wall_deviation_n", (9.0, 15.0), 14.0, 1.0),
+    ("contact", "wall_peak_n", (9.0, 15.0), 52.0, 1.0),
+    ("windup", "wall_mean_n", (5.8, 6.2), 1.0, 0.1),
+    ("windup", "wall_mean_n", (9.9, 10.1), 4.3, 0.1),
+    ("windup", "wall_mean_n", (19.9, 20.1), 8.5, 0.1),
+    ("windup", "wall_mean_n", (58.9, 59.1), 10.7, 0.1),
+    ("box", "q1_rad", (12.0, 60.0), 0.502, 1e-3),
+    ("box", "q2_rad", (12.0, 60.0), -0.496, 1e-3),
+    ("training", "q1_rad", (9.0, 10.0), -0.6 + 0.203, 1e-3),
+    ("training", "q1_rad", (25.0, 30.0), -0.6 - 0.203, 1e-3),
+    ("force_sharing", "push1_mean_nm", (13.0, 15.0), -4.79, 0.01),
+    ("force_sharing", "push1_mean_nm", (38.0, 40.0), -16.4, 0.1),
+    ("force_sharing", "push1_mean_nm", (52.0, 54.0), -5.0, 0.01),
+    ("jitter", "error_peak_rad", (38.0, 40.0), 0.022, 1e-3),
+    ("outage", "speed_peak_rad_s", (6.0, 15.0), 0.41, 0.01),
+    ("outage", "torque_peak_nm", (6.0, 15.0), 35.0, 1.0),
+]
+"""Scenario, quantity, window, figure, its last printed digit.
+
+A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force that hammers, over three hits.
+"""
+
+
+@pytest.mark.parametrize(("name", "key", "window", "figure", "digit"), FIGURES)
+def test_limits_of_window_are_figure_within_its_bar(
+    name: str, key: str, window: tuple[float, float], figure: float, digit: float
+) -> None:
+    asked = {(w.from_s, w.to_s): dict(w.asked) for w in load_scenario(name).expect.windows}
+    least, most = asked[window][key]
+    bar = max(digit, 0.02 * abs(figure))
+    assert figure - bar <= least + 1e-12
+    assert most <= figure + bar + 1e-12
+    assert least <= figure <= most
+
+
+@pytest.mark.parametrize(("name", "settled_s"), [("free", 11.9), ("outage", 12.4)])
+def test_so_are_the_times_at_which_they_settle(name: str, settled_s: float) -> None:
+    by_s = load_scenario(name).expect.synchronised_by_s
+    assert by_s is not None
+    assert settled_s <= by_s <= 1.02 * settled_s
+
+
+def test_paper_ends_where_the_anchor_is() -> None:
+    expect = load_scenario("paper").expect
+    assert set(expect.end_pose_rad.values()) == {(-0.1729, 0.0874)}
+    assert expect.end_pose_within_rad <= 0.02 * 0.0874
+
+
+CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
+
+
+@pytest.mark.parametrize(("name", "margin"), [("p_d_margin", 1.0), ("p_d_margin_two", 2.0)])
+def test_margin_is_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
+    """d = abs(lambda_min(alpha)) K T."""
+    scenario = load_scenario(name)
+    (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
+    alpha = np.array([[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites])
+    assert -np.linalg.eigvals(alpha).real.min() * 10.0 * delay_ms * 1e-3 == pytest.approx(margin)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "d"), [("p_d_margin", 0.9), ("p_d_margin_two", 1.8)])
+def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
+    """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""
+    shipped = load_scenario(name)
+    assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
+    assert measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend is EnvelopeTrend.GROWS
+
+
+@pytest.mark.long
+def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
+    """-0.8, so 1.6: as `docs/lab.md` asks."""
+    row = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
+    alpha = np.array([[row[i].get(j, 0.0) for j in row] for i in row])
+    assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
+    changes = {"dominance": row, "duration_s": 40.0}
+    assert measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend is EnvelopeTrend.GROWS
+    assert measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend is EnvelopeTrend.DECAYS
+
+
+@pytest.mark.long
+def test_half_of_the_margin_grows_to_10_rad() -> None:
+    made = measured("p_d_margin", {"control.d": 0.5, "duration_s": 40.0}, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    assert [peak(made, 0), peak(made, 1)] == [printed(1.6, 0.1), printed(10.0, 1.0)]
+
+
+@pytest.mark.long
+def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
+    made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
+    assert peak(made) == printed(3e-3, 1e-3)
+
+
+@pytest.mark.long
+def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
+    jitter = measured("jitter", {}, (38.0, 40.0, ""))
+    constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
+    assert (jitter.end.error.trend, constant.end.error.trend) == (EnvelopeTrend.DECAYS, EnvelopeTrend.GROWS)
+    assert peak(jitter) == printed(0.022, 0.001)
+    assert peak(constant) == printed(5.3, 0.1)
+    ages = [age.mean_ms for age in jitter.ages.values()]
+    assert ages == [printed(25.0, 1.0)] * len(ages)
+    assert {age.mean_ms for age in constant.ages.values()} == {200.0}
+
+
+@pytest.mark.long
+def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
+    limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
+    free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
+    assert peak(free) == printed(339.0, 1.0)
+    assert {age.max_ms for age in free.ages.values()} == {400.0}
+    assert free.peak_speed_rad_s is not None
+    assert free.peak_speed_rad_s > load_scenario("jitter").sites["s"].limits.qd_limit_rad_s
+
+
+@pytest.mark.parametrize(
+    ("changes", "leaves"),
+    [({"link.order": "in_order"}, True), ({"rate_hz": 100}, False)],
+    ids=["order", "rate"],
+)
+def test_order_makes_jitter_leave_its_limits_unlike_slower_rates(
+    changes: dict[str, str | int], leaves: bool
+) -> None:
+    made = FusedRun(load_scenario("jitter", changes))
+    made.advance(40.0)
+    assert (made.diverged_s is not None) is leaves

@@ -1,4 +1,7 @@
-"""The textbook matrices against the arm of physical bodies, and against each other."""
+"""The textbook matrices against the arm of physical bodies, and against each other.
+
+The chain in plain NumPy against Pinocchio's numbers, the planar arm, and the compiled leaves.
+"""
 
 import numpy as np
 import pytest
@@ -6,10 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
+from tests.core.chain_references import chain_references
 from tests.core.physical_arms import angles, links, speeds
 from tests.theory.loops import Array
+from trilat_net.analysis.arm_rows import PlacedArm
+from trilat_net.core.chain import ChainJoint, build_chain, find_acceleration, place_joints
+from trilat_net.core.site_setup import ChainSetup
 from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
-from trilat_net.theory.textbook_arm import PlacedArm
+from trilat_net.theory.textbook_arm import PlacedChain
 
 
 def placed(q: Array) -> PlacedArm:
@@ -52,3 +59,95 @@ def test_the_tip_moves_as_its_jacobian_says(q: Array, qd: Array) -> None:
     step = 1e-30
     moved = placed(q + 1j * step * qd).end_effector_position().imag / step
     assert placed(q).position_jacobian() @ qd == pytest.approx(moved, abs=1e-12 * (1 + np.abs(qd).max()))
+
+
+REFERENCES = chain_references()
+each = pytest.mark.parametrize("name", REFERENCES)
+DRIVE = {"armature_kg_m2": 0.1, "viscous": 0.5, "coulomb": 1.5, "lower": -0.5, "upper": 0.5}
+STOPS = {"stop_stiffness": 200.0, "stop_damping": 2.0}
+
+
+def chain(name: str, gravity: Array, **drive: float) -> ChainSetup:
+    read = REFERENCES[name].chain
+    joints = [
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
+        for one in read.joints
+    ]
+    return ChainSetup(tuple(joints), tuple(gravity), read.tip_origin_m)
+
+
+def parameters(name: str) -> Array:
+    return np.concatenate([joint.inertia for joint in REFERENCES[name].chain.joints])
+
+
+def apart(got: Array, wanted: Array) -> float:
+    return float(np.abs(got - wanted).max() / max(1.0, np.abs(wanted).max()))
+
+
+@each
+def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
+    theta = parameters(name)
+    for state in REFERENCES[name].states:
+        placed = PlacedChain(chain(name, state.gravity), state.q)
+        torque = placed.required_torque(theta, state.qd, state.v, state.a)
+        Y = placed.regressor_matrix(state.qd, state.v, state.a)
+        qdd = placed.joint_acceleration(theta, state.qd, state.tau)
+        M = placed.inertia_matrix(theta)
+        assert apart(torque, state.inverse_dynamics) <= 1e-12
+        assert apart(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
+        assert apart(M, state.inertia) <= 1e-12
+        assert apart(qdd, state.forward_dynamics) <= 100 * np.finfo(float).eps * np.linalg.cond(M)
+        assert apart(placed.end_effector_position(), state.tip_position) <= 1e-12
+        assert apart(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
+
+
+def test_columns_are_chains_of_their_own() -> None:
+    """Many states in one call are as many calls, and a complex step is the limit of differences."""
+    first, second, _ = REFERENCES["arm7"].states
+    made, theta = chain("arm7", first.gravity, **DRIVE, **STOPS), parameters("arm7")
+
+    def acceleration(q: Array, qd: Array, tau: Array, theta: Array) -> Array:
+        return PlacedChain(made, q).joint_acceleration(theta, qd, tau)
+
+    both = [np.stack(pair, axis=1) for pair in ((first.q, second.q), (first.qd, second.qd))]
+    found = acceleration(*both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1))
+    for n, one in enumerate((first, second)):
+        assert apart(found[:, n], acceleration(one.q, one.qd, one.tau, theta)) <= 1e-12
+    for k in range(7):
+        off = 1e-6 * np.eye(7)[k]
+        ahead, behind = (acceleration(first.q + way * off, first.qd, first.tau, theta) for way in (1, -1))
+        exact = acceleration(first.q + 1e-24j * off, first.qd, first.tau, theta).imag / 1e-30
+        assert apart(exact, (ahead - behind) / 2e-6) <= 1e-6
+
+
+@pytest.mark.parametrize("name", ["random3", "arm7"])
+def test_drives_and_stops_are_those_of_the_compiled_leaves(name: str) -> None:
+    for state in REFERENCES[name].states:
+        made, theta = chain(name, state.gravity, **DRIVE, **STOPS), parameters(name)
+        rows, qdd = build_chain(made.joints, 12), np.zeros(len(state.q))
+        place_joints(rows, state.q)
+        find_acceleration(rows, theta, state.gravity, state.q, state.qd, state.tau, qdd)
+        found = PlacedChain(made, state.q).joint_acceleration(theta, state.qd, state.tau)
+        assert apart(found, qdd) <= 1e-11
+
+
+def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
+    """Rods of different lengths, hung on z axes in the x-y plane."""
+    (l1, m1), (l2, m2), g = (0.7, 1.3), (1.1, 0.8), 9.81
+    outer, axis, upright = m2 * l2 * l2 / 3.0, (0.0, 0.0, 1.0), tuple(map(tuple, np.eye(3).tolist()))
+    inner = m1 * l1 * l1 / 3.0 + m2 * l1 * l1 + outer
+    theta = np.array([inner, m2 * l1 * l2 / 2.0, outer, m1 * l1 / 2.0 + m2 * l1, m2 * l2 / 2.0])
+    bodies = [
+        (m, m * half, 0.0, 0.0, 0.0, 0.0, thirds, 0.0, 0.0, thirds)
+        for m, half, thirds in ((m1, l1 / 2.0, m1 * l1 * l1 / 3.0), (m2, l2 / 2.0, outer))
+    ]
+    joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, l1))
+    q, qd, v, a = np.random.default_rng(5).normal(size=(4, 2, 6))
+    planar = PlacedArm(g, (l1, l2), q)
+    placed = PlacedChain(ChainSetup(joints, (0.0, -g, 0.0), (l2, 0.0, 0.0)), q)
+    of_chain, of_arm = (np.outer(values, np.ones(6)) for values in (np.concatenate(bodies), theta))
+    assert (
+        apart(placed.required_torque(of_chain, qd, v, a), planar.required_torque(of_arm, qd, v, a)) <= 1e-12
+    )
+    assert apart(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm)) <= 1e-12
+    assert apart(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12

@@ -23,8 +23,12 @@ from trilat_net.theory.site_dynamics import (
     lay_out_arguments,
     place_arm,
 )
-from trilat_net.theory.textbook_arm import PlacedChain
-from trilat_net.theory.textbook_task import evaluate_reference, rotation_from_vector, vector_from_rotation
+from trilat_net.theory.textbook_arm import (
+    PlacedChain,
+    evaluate_reference,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 
 angles = st.one_of(st.floats(0.0, np.pi), st.floats(0.0, 1e-3), st.floats(np.pi - 1e-3, np.pi - 1e-9))
 

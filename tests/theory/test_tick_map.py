@@ -13,10 +13,9 @@ from tests.virtual_runs import trajectories
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory import find_equilibrium
 from trilat_net.theory.characteristic_roots import Spectrum, compute_delay_spectrum
-from trilat_net.theory.floquet import compute_sampled_spectrum
+from trilat_net.theory.floquet import compute_sampled_spectrum, discretise_zero_order_hold
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import derive_operating_conditions
-from trilat_net.theory.tick_map import discretise_zero_order_hold
 
 POSE = (-0.1729, 0.0874)
 

@@ -6,6 +6,7 @@ gradient is one recursion. Both have the same functions, and hardly anything els
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,32 +39,91 @@ _NO_WEIGHT_J = 1e-6
 """An arm whose energy in the field of gravity varies by less cannot hang."""
 _ENERGY_SWEEPS = 20
 
+Numbers = NDArray[Any]
+"""Real numbers, or complex ones for a derivative by complex step.
 
-def inertia_product_rows(theta: Array, q: Array, x: Array) -> Array:
-    """Returns M(q) x of rows of q, rad, and of x, shape (K, 2) each; theta of the arm has shape (5,)."""
-    bend = theta[1] * np.cos(q[:, 1])
-    cross = theta[2] + bend
-    first = (theta[0] + 2.0 * bend) * x[:, 0] + cross * x[:, 1]
-    return np.stack([first, cross * x[:, 0] + theta[2] * x[:, 1]], axis=1)
+Vectors have their components on the first axis and any number of columns behind it: shape (n,) or (n, B).
+"""
 
 
-def regressor_rows(g: float, q: Array, qd: Array, v: Array, a: Array) -> Array:
-    """Returns Y(q, qd, v, a) with Y theta = M(q) a + C(q, qd) v + G(q), Eq. (12), shape (K, 2, 5).
+def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
+    """Returns the product of a matrix, shape (a, b, ...), and a vector, shape (b, ...)."""
+    product: Numbers = np.einsum("ab...,b...->a...", matrix, vector)
+    return product
 
-    Gravitational acceleration g in m/s^2; q, qd, reference velocity v and acceleration a of shape (K, 2), in
-    rad, rad/s and rad/s^2.
+
+def solve_columns(A: Numbers, b: Numbers) -> Numbers:
+    """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
+    solved = np.linalg.solve(np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis])
+    return np.moveaxis(solved[..., 0], -1, 0)
+
+
+@dataclass(frozen=True)
+class PlacedArm:
+    """The planar arm in the poses q, analytic in every argument: a complex step gives exact derivatives.
+
+    "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq. (1)-(5), (24).
+    `theory.textbook_arm.PlacedChain` has the same methods.
+
+    Attributes:
+        g_m_s2: gravitational acceleration, m/s^2.
+        lengths_m: of the two links.
+        q: shape (2, ...), rad.
     """
-    Y = np.zeros((len(q), 2, 5))
-    c2, s2 = np.cos(q[:, 1]), np.sin(q[:, 1])
-    Y[:, 0, 0] = a[:, 0]
-    Y[:, 0, 1] = c2 * (2.0 * a[:, 0] + a[:, 1])
-    Y[:, 0, 1] -= s2 * (qd[:, 1] * v[:, 0] + (qd[:, 0] + qd[:, 1]) * v[:, 1])
-    Y[:, 0, 2] = a[:, 1]
-    Y[:, 0, 3] = g * np.cos(q[:, 0])
-    Y[:, 1, 1] = c2 * a[:, 0] + s2 * qd[:, 0] * v[:, 0]
-    Y[:, 1, 2] = a[:, 0] + a[:, 1]
-    Y[:, 0, 4] = Y[:, 1, 4] = g * np.cos(q[:, 0] + q[:, 1])
-    return Y
+
+    g_m_s2: float
+    lengths_m: tuple[float, float]
+    q: Numbers
+
+    def inertia_matrix(self, theta: Numbers) -> Numbers:
+        """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
+        bend = theta[1] * np.cos(self.q[1])
+        coupling = theta[2] + bend
+        return np.array([[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]])
+
+    def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
+        """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
+        h = -theta[1] * np.sin(self.q[1])
+        return np.array([[h * qd[1], h * (qd[0] + qd[1])], [-h * qd[0], 0.0 * h * qd[0]]])
+
+    def gravity_torque(self, theta: Numbers) -> Numbers:
+        """Returns G(q), shape (2, ...), N m."""
+        outer = theta[4] * self.g_m_s2 * np.cos(self.q[0] + self.q[1])
+        return np.array([theta[3] * self.g_m_s2 * np.cos(self.q[0]) + outer, outer])
+
+    def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
+        moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
+        torque: Numbers = (
+            multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
+        )
+        return torque
+
+    def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
+        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta = e_p."""
+        units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
+        return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
+
+    def friction_torque(self, v: Numbers) -> Numbers:
+        """Returns zeros: this arm has no friction in its joints."""
+        return 0.0 * v
+
+    def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
+        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
+        at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
+        return solve_columns(self.inertia_matrix(theta), torque - at_no_acceleration)
+
+    def end_effector_position(self) -> Numbers:
+        """Returns the position of the end effector from the base, shape (2, ...), m."""
+        (l1_m, l2_m), inner, outer = self.lengths_m, self.q[0], self.q[0] + self.q[1]
+        x, y = l1_m * np.cos(inner) + l2_m * np.cos(outer), l1_m * np.sin(inner) + l2_m * np.sin(outer)
+        return np.array([x, y])
+
+    def position_jacobian(self) -> Numbers:
+        """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
+        x, y = self.end_effector_position()
+        outer = self.q[0] + self.q[1]
+        return np.array([[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]])
 
 
 class EndEffectorRows(NamedTuple):
@@ -76,18 +136,6 @@ class EndEffectorRows(NamedTuple):
     at: Array
     speed: Array
     J: Array
-
-
-def compute_end_effector(lengths: tuple[float, float], q: Array, qd: Array) -> EndEffectorRows:
-    """Returns the end effector of an arm: lengths of its links, m; q and qd, shape (K, 2), rad and rad/s."""
-    inner, outer = q[:, 0], q[:, 0] + q[:, 1]
-    elbow = lengths[0] * np.stack([np.cos(inner), np.sin(inner)], axis=1)
-    reach = lengths[1] * np.stack([np.cos(outer), np.sin(outer)], axis=1)
-    at = elbow + reach
-    J = np.empty((len(q), 2, JOINTS))
-    J[:, 0, 0], J[:, 1, 0] = -at[:, 1], at[:, 0]
-    J[:, 0, 1], J[:, 1, 1] = -reach[:, 1], reach[:, 0]
-    return EndEffectorRows(at, np.einsum("kij,kj->ki", J, qd), J)
 
 
 class PlanarArmRows(NamedTuple):
@@ -113,28 +161,30 @@ class PlanarArmRows(NamedTuple):
         """True for each parameter that the torque of gravity consists of: theta_4 and theta_5."""
         return np.arange(5) >= 3
 
+    def place(self, q: Array) -> PlacedArm:
+        """Returns the arm in the poses of all rows, which are the columns there."""
+        return PlacedArm(self.g, self.lengths_m, q.T)
+
     def weightless(self) -> "PlanarArmRows":
         """Returns the same arm without gravity: its torque is linear in v and a."""
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
         """Returns M(q) x, shape (K, 2)."""
-        return inertia_product_rows(self.theta, q, x)
+        return multiply_columns(self.place(q).inertia_matrix(self.theta), x.T).T
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
         """Returns Y(q, qd, v, a) theta_hat of estimates of every row, shape (K, 5), as (K, 2), N m."""
-        found: Array = np.einsum("kij,kj->ki", regressor_rows(self.g, q, qd, v, a), theta_hat)
-        return found
+        return self.place(q).required_torque(theta_hat.T, qd.T, v.T, a.T).T
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 5)."""
-        found: Array = np.einsum("kij,ki->kj", regressor_rows(self.g, q, qd, v, a), r)
+        found: Array = np.einsum("ijk,ki->kj", self.place(q).regressor_matrix(qd.T, v.T, a.T), r)
         return found
 
     def gravity_torque(self, q: Array) -> Array:
         """Returns G(q), shape (K, 2), N m."""
-        inner, outer = self.g * self.theta[3:, np.newaxis] * np.cos(np.cumsum(q, axis=1).T)
-        return np.array([inner + outer, outer]).T
+        return self.place(q).gravity_torque(self.theta).T
 
     def potential_energy(self, q: Array) -> Array:
         """Returns g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), shape (K,), J."""
@@ -152,7 +202,10 @@ class PlanarArmRows(NamedTuple):
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in the plane."""
-        return compute_end_effector(self.lengths_m, q, qd)
+        arm = self.place(q)
+        J = arm.position_jacobian()
+        speed = multiply_columns(J, qd.T)
+        return EndEffectorRows(arm.end_effector_position().T, speed.T, J.transpose(2, 0, 1))
 
     def hanging_angle(self, q: Array) -> float:
         """Returns how far from straight down the link is that hangs least, in one pose, shape (2,), rad."""
@@ -234,14 +287,12 @@ class ChainArmRows(NamedTuple):
 
     @property
     def _rows(self) -> RowArray:
-        """Its rows, of one layout for all chains: the loops are compiled once."""
         return build_chain(self.chain.joints, MAX_JOINTS)
 
     def _column(self, name: str) -> Array:
         return np.array([getattr(joint, name) for joint in self.chain.joints])
 
     def _of_joints(self, **values: Any) -> "ChainArmRows":
-        """Returns the same with one value of every joint replaced."""
         joints = tuple(joint._replace(**values) for joint in self.chain.joints)
         return self._replace(chain=self.chain._replace(joints=joints))
 
@@ -282,7 +333,6 @@ class ChainArmRows(NamedTuple):
         return self.law_torque(self.theta[np.newaxis], q, still, still, still)
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        """Returns place and Jacobian of the end effector, with that of its turn, and the potential energy."""
         found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
         gravity, tip = np.array(self.chain.gravity_m_s2), np.array(self.chain.tip_m)
         _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)

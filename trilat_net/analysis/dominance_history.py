@@ -1,7 +1,12 @@
-"""Dominance factors of a site over time: alpha of Eq. (6), ramps and steps included.
+"""Dominance of sites: alpha of Eq. (6) over time, ramps and steps included, and the weights that it gives.
 
 Invariant: alpha is a function of time and of the applied changes alone; a ramp starts from the value that the
 ramp before it has at that time.
+
+The weights of the sites' functionals are beta_i = pi_i / c_i: pi is the left Perron vector of alpha, c_i
+the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta' Upsilon <= 0 together with Upsilon 1 = 0
+forces equality, so there is no slack. pi as the weight of a delayed consensus is a known result
+(docs/errata.md); the paper uses ones.
 """
 
 from collections.abc import Sequence
@@ -10,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.dominance import find_reach, perron_vector
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -79,7 +85,6 @@ def list_losses(log: Log) -> list[str]:
 
 
 def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> DominanceHistory:
-    """Returns the factors of the peers that are there, in proportion to the planned ones."""
     alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
     whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
     rate = (rate * whole - alpha * whole_rate) / whole**2
@@ -125,3 +130,71 @@ def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s
             alpha[climbs] = before + slope * (t_s[climbs, np.newaxis] - start_s)
             rate[climbs] = slope
     return DominanceHistory(alpha, rate, alpha[:-1] + h_s * rate[:-1])
+
+
+KD_SHAPE_TOLERANCE = 1e-9
+"""Relative difference up to which two gains are one."""
+
+
+class LyapunovWeights(NamedTuple):
+    """Weights beta, as far as they exist.
+
+    Attributes:
+        beta: per site, sum N, so that equal shares give the paper's ones, shape (N,).
+        groups: the closed groups of sites, each a tuple of indices: none in it follows a site outside. Of one
+            group pi is unique, though some of its entries may be 0.
+        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ in shape.
+    """
+
+    beta: Array
+    groups: tuple[tuple[int, ...], ...]
+    scales: Array | None
+
+
+def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
+    """Returns the groups of sites that reach each other and no other along shares, alpha shape (N, N)."""
+    reach = find_reach(alpha)
+    groups = []
+    for site in range(len(alpha)):
+        group = tuple(np.flatnonzero(reach[site] & reach[:, site]).tolist())
+        if group[0] == site and reach[site].sum() == len(group):
+            groups.append(group)
+    return tuple(groups)
+
+
+def left_perron_vector(alpha: Array) -> Array:
+    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites outside of closed groups.
+
+    If several closed groups make it ambiguous, each counts by its number of sites.
+    """
+    pi = np.zeros(len(alpha))
+    groups = find_closed_groups(alpha)
+    total = sum(map(len, groups))
+    for group in groups:
+        pi[list(group)] = perron_vector(alpha[np.ix_(group, group)]) * len(group) / total
+    return pi
+
+
+def find_kd_scales(Kd: Array) -> Array | None:
+    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd shape (N, n).
+
+    A number that is NaN is of an axis of the task that its site does not follow. If every Kd is zero, nothing
+    couples the sites and any scale holds: ones.
+    """
+    if not np.nan_to_num(Kd).any():
+        return np.ones(len(Kd))
+    sizes = Kd[:, np.isfinite(Kd).all(axis=0)].sum(axis=1)
+    if not sizes.all():
+        return None
+    shapes = Kd / sizes[:, np.newaxis]
+    if np.nan_to_num(np.fmax.reduce(shapes) - np.fmin.reduce(shapes)).max() > KD_SHAPE_TOLERANCE:
+        return None
+    scales: Array = sizes / sizes[0]
+    return scales
+
+
+def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
+    """Returns beta_i = pi_i / c_i; if the Kd, shape (N, n), differ in shape, pi alone, which lets V rise."""
+    scales = find_kd_scales(Kd)
+    beta = left_perron_vector(alpha) / (1.0 if scales is None else scales)
+    return LyapunovWeights(beta * (len(beta) / beta.sum()), find_closed_groups(alpha), scales)

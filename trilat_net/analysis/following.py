@@ -1,16 +1,13 @@
 """How the law turns errors into motion and torque of the joints, over rows: joint by joint, or in task space.
 
 Invariant: written with NumPy from the equations of `docs/laws.md`, independently of the core; J and J' of the
-followed axes alone count, and those that are not followed have no effect. With A = J J' + damping the
-reference velocity and its derivative are
-
-    v = psi + J'y,              A y = -Lambda e - J psi
-    a = psi' + Jd'y + J'y',     A y' = -Lambda ed - Jd v - J (psi' + Jd'y)
-
-so that J v = -Lambda e - damping y: what is missed where the pose is nearly singular.
+followed axes alone count, and those that are not followed have no effect. Of `find_task_reference` follows
+J v = -Lambda e - damping y: what is missed where the pose is nearly singular.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +15,40 @@ from numpy.typing import NDArray
 
 from ..core.vectors import Array
 from ..log.record_columns import Ints
-from .arm_rows import ArmRows, PlanarArmRows
+from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 
 Rows = slice | Ints
 Bools = NDArray[np.bool_]
 _LEAST_EIGENVALUE = 1e-12
 """Below this an eigenvalue of J J' is of an axis along which the end effector cannot move at all."""
+
+
+def find_task_reference(
+    J: Numbers,
+    Jd: Numbers,
+    solve: Callable[[Numbers], Numbers],
+    posture: tuple[Numbers, Numbers],
+    error: tuple[Numbers, Numbers],
+) -> tuple[Numbers, Numbers]:
+    """Returns the reference velocity of the joints and its derivative, shape (n, ...).
+
+        v = psi + J' y,               A y  = -Lambda e - J psi
+        a = psi' + Jd' y + J' y',     A y' = -Lambda ed - Jd v - J (psi' + Jd' y)
+
+    Args:
+        J: Jacobian of the followed axes, shape (m, n, ...).
+        Jd: its derivative.
+        solve: A y = b for y, shape (m, ...), A being J J' + 1 of each axis that is not followed + damping.
+        posture: psi and psi', shape (n, ...).
+        error: Lambda e and Lambda ed, shape (m, ...).
+    """
+    psi, psi_rate = posture
+    e, ed = error
+    y = solve(-e - multiply_columns(J, psi))
+    v = psi + multiply_columns(J.swapaxes(0, 1), y)
+    a = psi_rate + multiply_columns(Jd.swapaxes(0, 1), y)
+    y_rate = solve(-ed - multiply_columns(Jd, v) - multiply_columns(J, a))
+    return v, a + multiply_columns(J.swapaxes(0, 1), y_rate)
 
 
 class JointFollowing(NamedTuple):
@@ -79,17 +104,13 @@ class TaskFollowing:
         found: Array = np.einsum("kij,kj->ki", self.inverse[rows], b)
         return found
 
-    def _weights(self, rows: Rows, e: Array) -> Array:
-        """Returns y, shape (K, m)."""
-        return self._solve(rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows]))
-
     def reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
         """Returns v and a of the joints, shape (K, n)."""
-        J, Jd, y = self.J[rows], self.Jd[rows], self._weights(rows, e)
-        v = self.psi[rows] + self.push(rows, y)
-        a = self.psi_rate[rows] + np.einsum("kij,ki->kj", Jd, y)
-        b = -self.Lambda * ed - np.einsum("kij,kj->ki", Jd, v) - np.einsum("kij,kj->ki", J, a)
-        return v, a + self.push(rows, self._solve(rows, b))
+        J, Jd, inverse = (np.moveaxis(x[rows], 0, -1) for x in (self.J, self.Jd, self.inverse))
+        posture = self.psi[rows].T, self.psi_rate[rows].T
+        error = (self.Lambda * e).T, (self.Lambda * ed).T
+        v, a = find_task_reference(J, Jd, partial(multiply_columns, inverse), posture, error)
+        return v.T, a.T
 
     def lift(self, rows: Rows, de: Array) -> Array:
         """Returns what a change of e adds to r: J+ Lambda de, shape (K, n)."""
@@ -114,7 +135,7 @@ class TaskFollowing:
         damping, rate = self.damping[rows, np.newaxis], self.damping_rate[rows, np.newaxis]
         if not (damping.any() or rate.any()):
             return np.zeros_like(e), np.zeros_like(self.psi[rows])
-        y = self._weights(rows, e)
+        y = self._solve(rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows]))
         return damping * y, self.push(rows, self._solve(rows, rate * y))
 
 

@@ -417,7 +417,6 @@ def _name_motion(
 
 
 def _count_sign_changes(values: Array) -> int:
-    """Returns how often a signal passes its mean."""
     signs = np.sign(values - values.mean())
     return int(np.count_nonzero(np.diff(signs[signs != 0.0])))
 
@@ -437,7 +436,6 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
 def _find_disagreement(
     scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
 ) -> Iterable[str]:
-    """Yields what is said of sites that do not agree, do not come closer, and are not held apart."""
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
         places = any(scenario.sites[name].control.compares_places for name in names)
@@ -472,7 +470,6 @@ def _find_held_sites(scenario: Scenario, trace: RunTrace, joint: int, end_s: flo
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
-    """Yields what is said of arms that hang at the end, or that were thrown where nobody pushed them."""
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))

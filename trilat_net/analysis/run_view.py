@@ -30,13 +30,6 @@ class SiteRun(NamedTuple):
     dominance: DominanceHistory
 
 
-class WallPlace(NamedTuple):
-    """A wall and its site."""
-
-    site: str
-    wall: TorqueSource
-
-
 class RunView:
     """A run as metrics see it.
 
@@ -79,10 +72,10 @@ class RunView:
         return {use.name: use for use in summarise_links(self.log)}
 
     @cached_property
-    def walls(self) -> dict[str, WallPlace]:
-        """The walls "s/1" (the first of s)."""
+    def walls(self) -> dict[str, tuple[str, TorqueSource]]:
+        """The walls "s/1" (the first of s), each with its site."""
         return {
-            f"{site}/{n}": WallPlace(site, wall)
+            f"{site}/{n}": (site, wall)
             for site in self.log.sites
             for n, wall in enumerate(list_walls(self.scenario.sites[site]), 1)
         }

@@ -312,7 +312,6 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
 
 
 def _find_joints_by_group(scenario: Scenario) -> list[list[int]]:
-    """Returns the places of the joints of sites that shares connect."""
     counts = [scenario.layout(name).joints for name in scenario.names]
     first = np.cumsum([0, *counts]).tolist()
     return [
@@ -332,7 +331,6 @@ def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
 
 
 def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
-    """Returns the same from one push to the next."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
         peak = np.max(largest, where=np.isfinite(largest), initial=-np.inf)
         d = last * np.exp(scale - peak)[:, np.newaxis]
@@ -345,14 +343,12 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
 
 
 def _running_maximum(values: Array) -> Array:
-    """Returns the largest of each second."""
     padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
     found: Array = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1).max(axis=1)
     return found
 
 
 def _fit(t_s: Array, amplitude: Array) -> EnvelopeFit:
-    """Returns the trend of the second half of an amplitude, given by its logarithm."""
     known = np.isfinite(amplitude)
     if known.sum() < 2:
         return EnvelopeFit(EnvelopeTrend.UNDECIDED, float("nan"))
@@ -396,7 +392,6 @@ def _exp(logarithm: float) -> float:
 def _find_departures(
     twins: Twins, amplitudes: Sequence[Array], group: Sequence[int], quiet: slice
 ) -> Iterator[LeftRest]:
-    """Yields the times in which a run that is left alone gets faster, and its twins leave it."""
     t_s = twins.paths[0].t_s
     with np.errstate(divide="ignore"):
         speed = np.log(twins.speed[:, group].max(axis=1))
@@ -517,7 +512,6 @@ def _read_push(text: str) -> tuple[str, float]:
 
 
 def _read_sizes(text: str) -> list[float]:
-    """Returns a size per decade."""
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
@@ -529,7 +523,6 @@ def _read_sizes(text: str) -> list[float]:
 
 
 def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]) -> LinearSizes:
-    """Returns up to which size neighbours differ by their scale alone, where they are above the rounding."""
     assert growth.twins is not None
     paths, every = growth.twins.paths, range(len(growth.twins.joints))
     largest = [_running_maximum(measure_amplitude(path, every)) for path in paths]

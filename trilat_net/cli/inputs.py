@@ -8,7 +8,7 @@ import typer
 
 from ..files import refuse_existing, write_whole
 from ..reporting import terminal_output as terminal
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import TextTable
 from . import options
 from .options import value
 

@@ -14,7 +14,7 @@ from ..errors import LawWithheld, RunFailed, UsageError
 from ..net.clock import Clock, SystemClock, make_system_clock
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import TextTable
 from . import options
 from .options import flag, seconds, value
 

@@ -11,7 +11,7 @@ from rich.markup import escape
 from ..errors import UsageError
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import TextTable
 from . import options
 from .options import flag, value
 
@@ -111,7 +111,7 @@ def certify_command(
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
     the reasons. 2: no log.
     """
-    from ..theory.end_pose import certify_run
+    from ..theory.linear_analysis import certify_run
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)

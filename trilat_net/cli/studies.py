@@ -275,8 +275,7 @@ def compare_command(
 
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
-    from ..studies.bench.bench_plan import GAINS_FILE, tune_laws, write_gains
-    from ..studies.bench.bench_tasks import STUDIES
+    from ..studies.bench.bench_plan import GAINS_FILE, STUDIES, tune_laws, write_gains
 
     asked = STUDIES[study].laws
     unknown = [law for law in laws if law not in {law for known in asked.values() for law in known}]

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ..studies.sweep import FinishedSweep
     from ..studies.sweep.margin_search import SearchRange
     from ..studies.sweep.sweep_plan import SweepPlan
-    from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder, SweepResults
+    from ..studies.sweep.sweep_results import SweepResults
+    from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder
 
 
 _option = partial(typer.Option, rich_help_panel="Maps and edges")
@@ -48,7 +49,8 @@ def _draw_map(
 ) -> None:
     from ..reporting.appearance import COLUMN_IN, make_print_size
     from ..studies.sweep.map_page import write_map
-    from ..studies.sweep.stability_map import build_stability_map, build_sweep_command
+    from ..studies.sweep.stability_map import build_stability_map
+    from ..studies.sweep.sweep_plan import build_sweep_command
 
     form = make_print_size(COLUMN_IN if width is None else width)
     words = [] if width is None else ["--width", f"{width:g}"]
@@ -117,14 +119,14 @@ def _run_sweep(
     One that is too large is refused before it has a folder.
     """
     from ..studies.executor import count_workers
-    from ..studies.sweep import sweep_run
+    from ..studies.sweep import sweep_results, sweep_run
 
     begun, plan, done = None, asked, []
     if path is not None and (plan is None or (path / sweep_run.PLAN_FILE).exists()):
         begun = sweep_run.open_sweep_folder(path, plan)
         plan, done = begun.plan, begun.read_done()
     assert plan is not None
-    terminal.print_texts(sweep_run.describe_sweep_plan(plan))
+    terminal.print_texts(sweep_results.describe_sweep_plan(plan))
     if begun is not None:
         terminal.print_text(f"  {len(done)} runs are done already")
     workers = count_workers(jobs, on)
@@ -139,7 +141,9 @@ def _run_sweep(
     if not (expected.entries or swept.runs):
         terminal.out.print("nothing was left to run")
     speed = [sweep_run.describe_sweep_speed(swept)] if swept.runs else []
-    _print_results(swept.results, [*speed, f"results: {folder.path / sweep_run.RESULTS_FILE}"], folder.path)
+    _print_results(
+        swept.results, [*speed, f"results: {folder.path / sweep_results.RESULTS_FILE}"], folder.path
+    )
     return swept
 
 
@@ -160,7 +164,7 @@ def _run_in_folder(
 
 
 def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
-    from ..studies.sweep.sweep_run import list_next_commands, summarize_sweep
+    from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
 
     terminal.print_texts(
         [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]
@@ -169,7 +173,7 @@ def _print_results(results: "SweepResults", more: list[str], path: Path) -> None
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     from ..studies.sweep import read_results
-    from ..studies.sweep.sweep_run import build_reproduce_command
+    from ..studies.sweep.sweep_results import build_reproduce_command
 
     results = read_results(path)
     if as_json:
@@ -232,10 +236,10 @@ def sweep_command(
         tolerance: Width of an edge relative to its value.
         confirm: With results: run this many cells on each side of the edge live.
     """
-    from ..studies.sweep import plan_sweep, sweep_run
+    from ..studies.sweep import plan_sweep, sweep_results
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
 
-    sweep_run.require_polars()
+    sweep_results.require_polars()
     given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
@@ -277,7 +281,7 @@ def sweep_command(
 def _show_results(
     path: Path, confirm: int | None, draw: "Callable[[SweepResults, Path], None] | None", *, as_json: bool
 ) -> None:
-    from ..studies.sweep.sweep_run import describe_sweep_plan, read_results
+    from ..studies.sweep.sweep_results import describe_sweep_plan, read_results
 
     results = read_results(path)
     with terminal.lines_aside(as_json):

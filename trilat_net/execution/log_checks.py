@@ -174,7 +174,6 @@ def _verify_line(result: VerifyResult, recorded: str) -> Finding:
 
 
 def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Names every gap by site, up to MAX_GAPS_NAMED."""
     texts = []
     left = MAX_GAPS_NAMED
     for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):

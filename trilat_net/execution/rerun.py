@@ -37,12 +37,18 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result
 from ..scenario.law_consent import find_user_laws
-from .difference import RecordDifference
-from .rerun_execution import RerunExecution, RerunSite, RerunTick
-from .rerun_request import RerunOverrides, RerunRequest, describe_rerun_changes, resolve_rerun_request
+from .rerun_execution import (
+    RerunExecution,
+    RerunOverrides,
+    RerunRequest,
+    RerunSite,
+    RerunTick,
+    describe_rerun_changes,
+    resolve_rerun_request,
+)
 from .resumption import read_output
-from .site_channels import SiteChannels, SiteEntry, describe_accounts
-from .virtual import open_in_memory
+from .verify import RecordDifference
+from .virtual import SiteChannels, SiteEntry, describe_accounts, open_in_memory
 from .virtual_network import Deliveries
 
 
@@ -148,7 +154,6 @@ def compare_site_rerun(
 
 
 def _rms(values: Array) -> float:
-    """Returns the largest root mean square of any column, without overflow of squares."""
     largest = _largest(values)
     if not 0.0 < largest < np.inf:
         return largest
@@ -345,7 +350,6 @@ def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields everything that a recorded site published, in order of time."""
     part = log[name]
     events = [event for event in log.events if event.member == name]
     events.sort(key=lambda event: event.t_ns)  # those before the epoch come first
@@ -409,7 +413,6 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
 
 
 def _describe_later_changes(again: Rerun) -> Iterator[str]:
-    """Yields a note for every changed link or row that changes during the run too: then that holds."""
     keys = [changed.key for changed in again.request.changes]
     during = [change.link or change.dominance for change in again.request.scenario.timeline]
     for name in again.request.replaced:

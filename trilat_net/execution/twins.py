@@ -24,8 +24,7 @@ from ..errors import NotRepeatable, UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
-from .fused import FusedRun, RunInputs
-from .log_inputs import explain_no_repetition, read_run_inputs
+from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
 
 PUSH_RAD = 1e-6
 """The usual push, rad."""
@@ -218,7 +217,6 @@ class _TwinRuns:
         self._same = True
 
     def run(self) -> Twins:
-        """Makes all windows."""
         for n, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(n, 0.0)
@@ -251,7 +249,6 @@ class _TwinRuns:
         self._scale[n] = 0.0
 
     def _compare(self, log: Log, kept: Sequence[tuple[Ints, Array]]) -> None:
-        """Compares records of the run that was executed again with those of the log."""
         for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, kept, strict=True):
             part, columns = log[name], layout.columns()
             first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
@@ -268,7 +265,6 @@ class _TwinRuns:
     def _cut(
         self, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
     ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
-        """Yields of every site where its intervals stand, where each begins, and the velocities of both."""
         place = 0
         for layout, (t_ns, rows), (own_ns, own_rows) in zip(self._layouts, kept, own, strict=True):
             qd, made = layout.columns()["qd"], min(len(t_ns), len(own_ns))
@@ -280,7 +276,6 @@ class _TwinRuns:
             place += layout.joints
 
     def _measure(self, n: int, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]) -> None:
-        """Enters how far apart the velocities of a twin and of the run are, interval by interval."""
         for at, starts, qd, own_qd in self._cut(kept, own):
             apart = own_qd - qd
             largest = np.log(np.maximum.reduceat(np.abs(apart), starts, axis=0)) + self._scale[n]
@@ -289,7 +284,6 @@ class _TwinRuns:
             self._scales[n, at[0].reshape(-1)] = self._scale[n]
 
     def _renew(self, n: int, end_s: float) -> None:
-        """Makes a difference that grew small again, and pushes one anew that died down."""
         twin, last, push = self._twins[n], round(end_s * BUCKETS_PER_S), self._pushes[n]
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
         pushed = float(np.abs(push.by).max())  # nothing is made larger than it is

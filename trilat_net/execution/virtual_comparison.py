@@ -21,14 +21,14 @@ from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
-from .difference import (
+from .resumption import ArrivalEntry, find_recorded_hand
+from .verify import (
     RecordDifference,
     describe_law_failure,
     equal_bits,
     equal_record,
     find_first_difference,
 )
-from .resumption import ArrivalEntry, find_recorded_hand
 from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 
@@ -190,7 +190,6 @@ def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntr
 
 
 def _recorded_scenario(log: Log) -> Scenario:
-    """Returns a log's scenario, no longer than its records: a torn log is a short run."""
     ends_s = [(log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
     duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
     return msgspec.structs.replace(log.scenario, duration_s=duration_s)

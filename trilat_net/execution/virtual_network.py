@@ -147,7 +147,6 @@ def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[i
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns, for every sample of a peer that arrived, its first tick of arrival and the us of its entry."""
     first: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.at):
         for j, tick, us in deliveries.at[k]:
@@ -159,7 +158,6 @@ def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[i
 def _assume_arrivals(
     known: Deliveries, missing: list[int], rate_hz: int, peer: int, peer_hz: int, end: int
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields the missing tick at which each sample of a peer arrived that no record lists, and its entry."""
     first = _find_first_arrivals(known, peer)
     listed = sorted(first)
     lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // peer_hz for m in listed]

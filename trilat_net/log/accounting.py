@@ -373,7 +373,10 @@ class SessionAccounts:
                 self.expect(event.member, event.ticks)
                 self._ends[event.member] = event.ticks
             elif event.kind == "join":
-                self._begin_anew(event, self._ends.pop(event.member, 0))
+                made, rate_hz = self._ends.pop(event.member, 0), self._rates_hz[event.member]
+                for channel, gap in self._find_start_gaps(event.member, event.boot):
+                    base = self._bases.get(self._topic(event.member, channel), 0)
+                    gap.begin_anew(*(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made)))
             elif event.kind == OVERRUN:
                 self._leave_out(event)
             elif event.kind == LAST and event.about in self._rates_hz:
@@ -383,7 +386,6 @@ class SessionAccounts:
                     gap.hear_of(heard - base)
 
     def _leave_out(self, event: Event) -> None:
-        """Takes ticks that a site says it did not make, as "first-last first-last", for not made."""
         rate_hz = self._rates_hz[event.member]
         for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
             for channel in (topics.STATE, topics.LINK):
@@ -399,7 +401,6 @@ class SessionAccounts:
             (account or self._accounts[topic]).take(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
-        """Yields what lies before a start of a site, by channel."""
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
             known = (topic, boot) in self._start_gaps
@@ -408,11 +409,6 @@ class SessionAccounts:
             ):
                 gap = StartGap(self._accounts[topic], count_under_way(channel, self._rates_hz[site]))
                 yield channel, self._start_gaps.setdefault((topic, boot), gap)
-
-    def _begin_anew(self, join: Event, made: int) -> None:
-        for channel, gap in self._find_start_gaps(join.member, join.boot):
-            base, rate_hz = self._bases.get(self._topic(join.member, channel), 0), self._rates_hz[join.member]
-            gap.begin_anew(*(count_messages(channel, ticks, rate_hz) - base for ticks in (join.ticks, made)))
 
     def expect(self, site: str, ticks: int) -> None:
         """Counts as missing what a site published in so many ticks and is not there."""

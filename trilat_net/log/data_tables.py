@@ -199,7 +199,6 @@ def _make_time_columns(
 
 
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
-    """Yields the vectors of a site's records, a column per joint and per parameter of its arm."""
     docs = read_field_docs(State)
     task = _TASK_VECTORS if arm.shares_pose else {}
     for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
@@ -226,7 +225,6 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields what the site's law sends, a column per number."""
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _), peer = entry.vector, entry.peer
         stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.place + 1}" * (length > 1)
@@ -329,7 +327,6 @@ def _to_word(text: str) -> str:
 
 
 def _make_entry_column(source: str, field: str, name: str, values: Sequence[Mapping[str, int]]) -> Column:
-    """Returns the column of one peer, or of one reason, of a field that is a map."""
     unit, text, _ = read_field_docs(LinkStats)[field]
     stem, _, ending = field.rpartition("_") if unit else (field, "", "count")
     absent = 0 if field == "dropped" else None  # a reason for which no message was dropped is not named

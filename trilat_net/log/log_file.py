@@ -68,7 +68,6 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Lengthens a file, with every block of it on the disk."""
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(descriptor, begin, end - begin)

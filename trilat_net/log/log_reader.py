@@ -38,7 +38,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.delay_traces import TracePoint
 from ..scenario.law_consent import LawFiles, allow_logged_laws
 from ..scenario.operators.kernel_operators import find_live_hand
-from .accounting import LAST, SessionAccounts, parse_counts
+from .accounting import LAST, SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
     SITE_TABLE_KINDS,
@@ -53,7 +53,6 @@ from .data_tables import (
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import merge_parts
-from .running_digest import DigestState, Integrity
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
@@ -185,7 +184,6 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns a member's events in order: one that came late belongs before those that it precedes."""
         events = self._decode(topic, Event)
         boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
         return sorted(events, key=lambda event: (boots[event.boot], event.n))
@@ -527,44 +525,6 @@ def _measure(stream: BinaryIO) -> int:
     size = stream.seek(0, os.SEEK_END)
     stream.seek(here)
     return size - here
-
-
-def judge_integrity(log: Log) -> Integrity:
-    """Returns whether a log is as it was made: by its digest chain, its accounts and its statistics.
-
-    Raises:
-        LogError: a message cannot be read.
-    """
-    if log.chain.passed:
-        for site in log.sites:
-            if seam := _find_unexplained(log, site):
-                return Integrity(DigestState.CHANGED, seam)
-    return log.chain
-
-
-def _find_unexplained(log: Log, site: str) -> str:
-    """Describes a gap of a site that is none of the run's own; "" if there is none.
-
-    One of which neither the accounts nor the recorder's statistics tell is the seam of a splice, or a stretch
-    that was cut out.
-    """
-    if log.damaged:
-        return ""
-    ticks = np.unique(log[site].tick)
-    stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}  # of several it is counted anew
-    there = {"received": len(ticks), "missing": log.missing(site)}
-    if not log.part and stated not in ({}, there):
-        told = " and ".join(f"{stated.get(word, 0)} {word}" for word in there)
-        found = " and ".join(f"{n} {word}" for word, n in there.items())
-        return f"records of {site} were taken out or put in: its account says {told}, the file has {found}"
-    inner = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
-    inner -= min(inner, log.absent_ticks(site))
-    if not inner or log.chain.state is DigestState.INTACT:
-        return ""
-    counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
-    if inner <= max([stated.get("missing", 0), *counts]):
-        return ""
-    return f"{inner} records of {site} are missing in between, and nothing in the log explains it"
 
 
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:

@@ -160,7 +160,6 @@ def _signed_bytes(chain: Mapping[str, str]) -> bytes:
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    """Returns whether a file agrees with its digest chain, and the digests that it states."""
     try:
         with open_regular(path) as stream:
             reader = McapReader(stream, str(path), progress, kept=False)
@@ -174,7 +173,6 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, wanted: str) -> Any:
-    """Returns the key in a PEM file, which is to be of that kind."""
     try:
         with open_regular(path) as stream:
             data = stream.read(_MOST_BYTES)

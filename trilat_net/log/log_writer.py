@@ -180,7 +180,6 @@ class LogWriter:
             raise self._refused(error) from None
 
     def _put_view(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Writes a message of a standard channel, which is registered with its first one."""
         channel = self._standard.get(topic)
         if channel is None and self._views is not None:
             kind, about = self._views.channels[topic]
@@ -367,7 +366,6 @@ class LogParts:
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _full(self, payload: bytes, log_time_ns: int) -> bool:
-        """True where a message belongs into the next part."""
         limit, writer = self._storage, self._writer
         if self._since_ns is None:
             self._since_ns = log_time_ns

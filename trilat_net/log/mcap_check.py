@@ -141,7 +141,6 @@ class FileCheck:
         self._found[Opcode.CHUNK_INDEX, frame.offset] = found
 
     def _take_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        """Compares the index of a channel's messages in the last chunk with these."""
         if self._indexes is None:
             return  # the chunk could not be read
         channel, length = int.from_bytes(content[:2], "little"), int.from_bytes(content[2:6], "little")

@@ -261,7 +261,6 @@ class RecordScanner:
         return parse_chunk_head(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
-        """Returns where the next packed chunk begins from an offset on, by the name of its compression."""
         lead = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
         for at in range(offset, self.size, _SCAN_BYTES):
             window = self.read(at, _SCAN_BYTES + lead + 8)  # holds the name of one that begins in it

@@ -58,7 +58,6 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
-    """Refuses a part that follows another file than the one that is given as the part before it."""
     finished = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
     for part in parts:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
@@ -137,7 +136,6 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
 
 
 def _find_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
-    """Returns a key per message: its tick, its boot and number, or its boot and time."""
     payloads = channel.payloads
     try:
         match topic.rpartition("/")[2]:

@@ -260,7 +260,6 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self) -> None:
-        """Copies all that can be read, and writes the end of the file."""
         deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
         self._report_damaged()
         if self._scanner.torn is not None:
@@ -320,7 +319,6 @@ class _FileCopy:
             raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
     def _take_inner(self, opcode: int, content: bytes) -> None:
-        """Takes a record of a chunk, or a message outside of chunks."""
         if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
         elif opcode == mcap_records.OP_MESSAGE:
@@ -360,7 +358,6 @@ class _FileCopy:
         return channel, known.topic
 
     def _take_torn(self, torn: mcap_records.Damage) -> None:
-        """Saves what can be saved of the end that was cut off."""
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
         if not torn.length or opcode in _MADE_AGAIN or torn.offset > self._data_end:
             return
@@ -380,7 +377,6 @@ class _FileCopy:
         )
 
     def _report_unnamed(self) -> None:
-        """Lists as lost what nothing in the file explains, and messages that it says it has."""
         result, stated = self._result, self._survey.count
         for number, count in self._unnamed.items():
             result.lose(f"{count} messages of channel {number}, which no record names")
@@ -392,7 +388,6 @@ class _FileCopy:
             result.lose(f"{stated - self._out.messages} of the {stated} messages that it says it has")
 
     def _finish(self) -> None:
-        """Writes the accounts, the losses, and the index."""
         result, accounts = self._result, self._accounts
         result.finished = self._scanner.finished
         result.messages, result.duration_s = self._out.messages, self._out.duration_s
@@ -418,7 +413,6 @@ class _FileCopy:
 
 
 def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yields the complete records of a chunk's content that was cut off: opcode and content."""
     limit = max(mcap_records.MAX_UNPACKED_BYTES, mcap_records.MAX_UNPACKED_RATIO * len(content))
     waiting = bytearray()
     for piece in _unpack_pieces(content):
@@ -437,7 +431,6 @@ def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpack_pieces(content: bytes) -> Iterator[bytes]:
-    """Yields what is left of a chunk's records, unpacked, up to where the data make no sense."""
     name_offset = mcap_records.COMPRESSION_NAME_OFFSET + 4
     letters = int.from_bytes(content[mcap_records.COMPRESSION_NAME_OFFSET : name_offset], "little")
     data = BytesIO(content[name_offset + letters + 8 :])

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
@@ -25,9 +27,11 @@ from ..scenario.run_changes import count_skipped_ticks
 from .accounting import LAST, Account, parse_counts
 from .findings import CheckReport, Finding, Findings
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
+from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
 from .ros2 import cdr
+from .running_digest import DigestState, Integrity
 
 MAX_AHEAD_NS = 10 * NS_PER_S
 """No message is sent more than this after it came, whatever the clocks."""
@@ -492,3 +496,41 @@ class SessionCheck:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
                 finding.add("", None, f"{sent}, the scenario says {check.rate_hz}")
         return finding.tell(", ".join(texts) or "too short to tell")
+
+
+def judge_integrity(log: Log) -> Integrity:
+    """Returns whether a log is as it was made: by its digest chain, its accounts and its statistics.
+
+    Raises:
+        LogError: a message cannot be read.
+    """
+    if log.chain.passed:
+        for site in log.sites:
+            if seam := _find_unexplained(log, site):
+                return Integrity(DigestState.CHANGED, seam)
+    return log.chain
+
+
+def _find_unexplained(log: Log, site: str) -> str:
+    """Describes a gap of a site that is none of the run's own; "" if there is none.
+
+    One of which neither the accounts nor the recorder's statistics tell is the seam of a splice, or a stretch
+    that was cut out.
+    """
+    if log.damaged:
+        return ""
+    ticks = np.unique(log[site].tick)
+    stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}  # of several it is counted anew
+    there = {"received": len(ticks), "missing": log.missing(site)}
+    if not log.part and stated not in ({}, there):
+        told = " and ".join(f"{stated.get(word, 0)} {word}" for word in there)
+        found = " and ".join(f"{n} {word}" for word, n in there.items())
+        return f"records of {site} were taken out or put in: its account says {told}, the file has {found}"
+    inner = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
+    inner -= min(inner, log.absent_ticks(site))
+    if not inner or log.chain.state is DigestState.INTACT:
+        return ""
+    counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
+    if inner <= max([stated.get("missing", 0), *counts]):
+        return ""
+    return f"{inner} records of {site} are missing in between, and nothing in the log explains it"

@@ -67,7 +67,6 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 def _find_turns(turn: Array, reference: Array) -> Array:
-    """Returns the turns from references to orientations, all as rotation vectors, by their quaternions."""
     (a, u), (b, v) = map(_make_quaternions, (turn, reference))
     w, p = a * b + np.sum(u * v, axis=1, keepdims=True), b * u - a * v - np.cross(u, v)
     p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn

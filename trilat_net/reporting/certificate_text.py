@@ -14,8 +14,7 @@ from ..analysis.certificate.stability_certificate import Certificate, StabilityF
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
-from .result_text import Block, MarkedText
-from .text_table import TextTable
+from .result_text import Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
 """Smaller shares of the largest energy are not listed."""
@@ -121,7 +120,6 @@ _ROOTS = {"stable": "ok", "unstable": "open"}
 
 
 def _mark_twins(twins: TwinGrowth) -> str:
-    """Returns what twins say for a run or against it."""
     if not twins.pushes:
         return "note"
     if twins.grows or twins.left is not None:

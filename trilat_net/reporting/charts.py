@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..analysis import site_signals
 from ..analysis.arm_rows import joint_positions_m
+from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
-from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
@@ -75,7 +75,6 @@ class Charts:
         }
 
     def _table(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> int:
-        """Stores the columns of a site, decimated together, and returns the number of the table."""
         trace = decimate(tick, t_s, values, self._buckets)
         return self._store(site, trace.tick, trace.values)
 
@@ -116,12 +115,10 @@ class Charts:
     def _tables_of(
         self, signal: Callable[[SiteLog], NDArray[Any]], sites: list[str] | None = None
     ) -> dict[str, list[JsonObject]]:
-        """Returns the columns of a signal of sites, one after the other, as series."""
         parts = {site: self._log[site] for site in sites or self._log.sites}
         return {s: self._columns(s, part.tick, part.t_s, signal(part)) for s, part in parts.items()}
 
     def _columns(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> list[JsonObject]:
-        """Stores columns of a site: in one table, or each in its own, since decimation keeps all extremes."""
         count = values.shape[1]
         if not self._small:
             table = self._table(site, tick, t_s, values)
@@ -188,7 +185,6 @@ class Charts:
             yield _chart("ages", title, "ms", series, lines=lines, sites=[site], links=True, **axis)
 
     def _stated(self, site: str) -> list[JsonObject]:
-        """Returns the stated mean delays of the links to a site, as lines while they held."""
         log = self._log
         lines: list[JsonObject] = []
         for peer in log[site].peers:
@@ -236,7 +232,6 @@ class Charts:
         return {"site": site, "colour": index, "links_m": list(arm.lengths_m), "table": table}
 
     def _projected(self, site: str) -> JsonObject:
-        """Stores where a chain's joints, those of its reference and their shadows are in the picture."""
         part, arm = self._log[site], self._log.scenario.arms[site]
         rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
         actual, desired = (

@@ -21,11 +21,10 @@ from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..scenario.imported_law import allowed_laws
-from ..theory.end_pose import certify_run
+from ..theory.linear_analysis import certify_run
 from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
-from .result_text import Block, MarkedText
+from .result_text import Block, MarkedText, TextTable
 from .summary_text import format_run_lines
-from .text_table import TextTable
 
 
 @dataclass(frozen=True, repr=False)

@@ -14,9 +14,8 @@ from ..theory.linear_analysis import LinearAnalysis
 from ..theory.linear_edge import EdgeScan
 from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
-from ..theory.port_transparency import QUOTED_AT_HZ, Transparency
-from .result_text import Block, MarkedText
-from .text_table import TextTable
+from ..theory.port_response import QUOTED_AT_HZ, Transparency
+from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
@@ -210,7 +209,6 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 
 
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the two-ports that fail the criterion, and the number of those that meet it."""
     failing = [one for one in ports.two_ports if one.minima.below]
     holding = len(ports.two_ports) - len(failing)
     third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""

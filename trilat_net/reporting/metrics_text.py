@@ -8,9 +8,8 @@ from itertools import groupby
 
 from ..analysis.metrics.log_metrics import LogMetrics
 from ..analysis.metrics.measures import Metric, Quantity, quantities
-from .result_text import Block, MarkedText
+from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
-from .text_table import TextTable
 
 _NO_NUMBER = "–"
 _MAX_LINES = 16
@@ -81,7 +80,6 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_impedance(found: LogMetrics) -> Iterator[Block]:
-    """Yields the impedance that operators feel over frequency, decided or not."""
     if not found.responses:
         return
     rows = []

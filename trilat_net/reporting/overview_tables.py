@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from ..analysis.file_overview import FileOverview
 from ..results import JsonObject
-from .result_text import Block, MarkedText
+from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
-from .text_table import TextTable
 
 _MOST_GAPS = 4
 _VIEWS = "/viz/"
@@ -167,7 +166,6 @@ def _three(spread: JsonObject | None) -> list[str | None]:
 
 
 def _number(value: float | None) -> str | None:
-    """Returns a number with four digits, or all that it has before the point."""
     if value is None:
         return None
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"

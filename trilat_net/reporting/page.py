@@ -17,7 +17,7 @@ from string import Template
 from typing import Any
 
 from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
-from ..analysis.run_summary import summarise_run
+from ..analysis.file_overview import summarise_run
 from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
 from ..analysis.twin_growth import PushedTwins
@@ -100,7 +100,10 @@ def write_report(
     if certificate is not None:
         facts["certificate"] = certificate_to_json(certificate)
         section = _render_certificate(certificate)
-        verdict = _render_verdict(certificate)
+        mark, text = describe_certificate(certificate)[0]
+        kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
+        found = f'<li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li>'
+        verdict = f'<ul class="verdicts">{found}</ul>'
         pictures = []
         if certificate.balance is not None:
             pictures.append(("V and energies", draw_functional(log, certificate)))
@@ -167,7 +170,6 @@ def render_report(
 
 
 def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
-    """Returns a heading, a sentence and room for charts per section, and why some are not there."""
     filled = {chart["section"] for chart in drawn}
     chains = any(arm.chain for arm in log.scenario.arms.values())
     absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
@@ -220,13 +222,6 @@ def _asset(name: str) -> str:
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _render_verdict(certificate: Certificate) -> str:
-    """Returns the judgement of a run, as the first of its verdicts."""
-    mark, text = describe_certificate(certificate)[0]
-    kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
-    return f'<ul class="verdicts"><li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li></ul>'
-
-
 def _render_check_lines(verdicts: Sequence[Finding]) -> str:
     """Returns the list of verdicts; "" if nothing was checked."""
     items = ""
@@ -252,13 +247,11 @@ def render_alarms(log: Log) -> str:
 
 
 def _render_description(scenario: Scenario) -> str:
-    """Returns the scenario's description, a paragraph for each of its own, code where it has backticks."""
     text = _CODE.sub(r"<code>\1</code>", escape(scenario.about.strip()))
     return "".join(f"<p>{paragraph}</p>" for paragraph in text.split("\n\n") if paragraph)
 
 
 def _render_run_facts(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the run."""
     scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
     unit = shared_unit(log)
     settled = "not within the run"
@@ -281,7 +274,6 @@ def _render_run_facts(log: Log, facts: JsonObject) -> str:
 
 
 def _render_sites(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the sites: their records and their motion."""
     error = [f"max |e| ({shared_unit(log)})", f"max |e|, last 1 s ({shared_unit(log)})"]
     headers = ["site", "records", "missing", "q at the end (rad)", *error]
     headers += ["settled (s)", "max |τ| (N\u00a0m)", "ticks at the limit", "moved by operators, max (rad)"]
@@ -312,7 +304,6 @@ def _render_loops(log: Log, facts: JsonObject) -> str:
 
 
 def _render_link_ages(log: Log, facts: JsonObject) -> str:
-    """Returns the table of the links: the stated delay, and the delay that the controller saw."""
     headers = ["link", "stated delay", "effective, mean (ms)", "deviation", "p50", "p99", "min", "max"]
     headers += ["nothing new (% of ticks)", "longest silence (ms)"]
     rows = []
@@ -392,7 +383,6 @@ def _render_modes(log: Log, facts: JsonObject) -> str:
 
 
 def _render_certificate(certificate: Certificate) -> str:
-    """Returns verdict, premises and energies of a stability certificate."""
     cells = ((escape(p.name), _PREMISE_MARKS[p.holds], escape(p.text)) for p in certificate.premises)
     premises = "".join(
         f"<tr><th>{name}</th><th>{mark}</th><td>{text}</td></tr>" for name, mark, text in cells
@@ -408,13 +398,11 @@ def _render_certificate(certificate: Certificate) -> str:
 
 
 def _render_assumptions(scenario: Scenario) -> str:
-    """Returns the scenario's assumptions beyond its source."""
     items = "".join(f"<li>{escape(text)}</li>" for text in scenario.assumed)
     return f"<ul>{items}</ul>" if items else "<p>Nothing is declared as assumed.</p>"
 
 
 def _render_commands(log: Log) -> str:
-    """Returns the commands that check and repeat the run, and the resolved scenario."""
     scenario = log.scenario
     source = Path(log.source).name
     file = source if source.endswith(".mcap") else "FILE"
@@ -430,7 +418,6 @@ def _render_commands(log: Log) -> str:
 
 
 def _render_versions(log: Log) -> str:
-    """Returns the table of commit, platform and versions that made the log."""
     session = log.session
     changed = " with changes" if session.get("commit_dirty") == "true" else ""
     return _render_facts(

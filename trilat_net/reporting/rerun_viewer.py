@@ -218,7 +218,6 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Returns the names of the numbers of an array: all combinations of the names along its dimensions."""
     names = [""]
     for axis in text.split("; "):
         names = [f"{before} {name}".strip() for before in names for name in axis.split(" ")]

@@ -2,19 +2,107 @@
 
 Invariant: all three have the same blocks in the same order. Results of `studies` compose their own; those of
 the rooms below have a module here.
+
+Every cell of a table is text already, and all forms show the same cells in the same order.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 from importlib import import_module
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
 from ..results import Result
 from .terminal_output import MAX_LETTERS, sanitize
-from .text_table import TextTable
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+NO_STYLES: Mapping[str, str] = MappingProxyType({})
+
+
+class TextTable(NamedTuple):
+    """A table of texts.
+
+    Attributes:
+        headers: one per column; all empty for a table without a header line.
+        rows: one text per column each. A shorter row leaves its last cells empty; a row of one text in a
+            wider table is the heading of a group of rows.
+        align: a letter per column, "l" for words and "r" for numbers; the last one holds for all columns
+            that follow.
+        units: one per column, appended to its header; "" for none. May be shorter than `headers`.
+        styles: on a terminal, styles of cells by their texts, as in {"fails": "yellow"}.
+    """
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    align: str = "l"
+    units: Sequence[str] = ()
+    styles: Mapping[str, str] = NO_STYLES
+
+    @property
+    def titles(self) -> list[str]:
+        """The headers with their units."""
+        units = [*self.units, *[""] * len(self.headers)]
+        return [f"{head} {unit}".strip() for head, unit in zip(self.headers, units, strict=False)]
+
+    @property
+    def to_the_right(self) -> list[bool]:
+        """Per column, True if its cells are aligned to the right."""
+        return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
+
+    def rich(self) -> "Table":
+        """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow."""
+        from rich.table import Table
+        from rich.text import Text
+
+        from .terminal_output import sanitize
+
+        table = Table(box=None, pad_edge=False, show_header=any(self.titles))
+        for title, right in zip(self.titles, self.to_the_right, strict=True):
+            table.add_column(Text(sanitize(title)), justify="right" if right else "left", overflow="fold")
+        for row in self.rows:
+            heading = "bold" if len(row) == 1 < len(self.headers) else ""
+            table.add_row(*(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row))
+        return table
+
+    def markdown(self) -> str:
+        """Returns it in Markdown."""
+        rule = ["--:" if right else "---" for right in self.to_the_right]
+        blank = [""] * len(self.headers)
+        cells = (self.titles, rule, *([*row, *blank[len(row) :]] for row in self.rows))
+        return "\n".join(
+            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in cells
+        )
+
+    def html(self) -> str:
+        """Returns it in HTML."""
+        sides = ["right" if right else "left" for right in self.to_the_right]
+
+        def line(cells: Sequence[str], kind: str) -> str:
+            pairs = zip(cells, sides, strict=False)
+            made = (f'<{kind} style="text-align:{side}">{escape(cell)}</{kind}>' for cell, side in pairs)
+            return f"<tr>{''.join(made)}</tr>"
+
+        head = f"<thead>{line(self.titles, 'th')}</thead>" if any(self.titles) else ""
+        return f"<table>{head}<tbody>{''.join(line(row, 'td') for row in self.rows)}</tbody></table>"
+
+    def lines(self) -> list[str]:
+        """Returns its lines with columns aligned by spaces; the first holds the headers, if there are any."""
+        table = [self.titles, *self.rows] if any(self.titles) else self.rows
+        widths = [
+            max((len(row[n]) for row in table if n < len(row)), default=0) for n in range(len(self.headers))
+        ]
+        return [
+            "  ".join(
+                cell.rjust(width) if right else cell.ljust(width)
+                for cell, width, right in zip(row, widths, self.to_the_right, strict=False)
+            ).rstrip()
+            for row in table
+        ]
 
 
 class MarkedText(NamedTuple):
@@ -50,11 +138,11 @@ _COMPOSERS = {
     "LogCheckReport": "summary_text:compose_verification",
     "LogCheckResult": "summary_text:compose_log_check",
     "LogMetrics": "metrics_text:compose_metrics",
-    "DoctorReport": "session_text:compose_doctor",
+    "DoctorReport": "summary_text:compose_doctor",
     "FileOverview": "overview_tables:compose_overview",
-    "NetworkBenchmark": "session_text:compose_benchmark",
-    "PingReport": "session_text:compose_ping",
-    "TopicDelays": "session_text:compose_topic_delays",
+    "NetworkBenchmark": "summary_text:compose_benchmark",
+    "PingReport": "summary_text:compose_ping",
+    "TopicDelays": "summary_text:compose_topic_delays",
     "Recovery": "summary_text:compose_recovery",
     "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "summary_text:compose_rerun",

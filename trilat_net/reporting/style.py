@@ -25,8 +25,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
+from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
-from ..analysis.trace_decimation import decimate
 from ..core.vectors import Array
 from ..files import write_whole
 from ..log.log_reader import Log

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..log.log_reader import Log
     from ..results import Result
     from .conclude import Conclusion
-    from .text_table import TextTable
+    from .result_text import TextTable
 
 _CONTROLS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
@@ -119,8 +119,7 @@ def print_result(found: "Result", *, as_json: bool = False) -> None:
     if as_json:
         print_json(found.to_dict())
         return
-    from .result_text import compose
-    from .text_table import TextTable
+    from .result_text import TextTable, compose
 
     for block in compose(found):
         if isinstance(block, TextTable):

@@ -101,7 +101,6 @@ def check_this_worker(required: WorkerRequirements) -> None:
 
 
 def _make_probe() -> Callable[[Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]]:
-    """Returns a function that is sent by value, because a worker may have another program or none."""
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
         try:

@@ -102,7 +102,6 @@ class _Feed(Generic[T]):
         self._runs, self._wall_s = 0, 0.0
 
     def measure(self, runs: int, wall_s: float) -> None:
-        """Takes in the duration of a batch."""
         self._runs, self._wall_s = self._runs + runs, self._wall_s + wall_s
 
     def take(self, *, idle: bool) -> list[tuple[int, T]]:
@@ -228,7 +227,6 @@ class WorkerPool:
     def _collect(
         self, future: Future[_BatchResult], batch: _Batch, feed: _Feed[T], lost: Callable[[T], R] | None
     ) -> Iterator[tuple[int, R]]:
-        """Yields the results of a batch that ended, or takes its items back."""
         try:
             result = future.result()
         except BrokenExecutor:
@@ -251,7 +249,6 @@ class WorkerPool:
             yield number, lost(item)
 
     def _replace(self, broken: Executor) -> None:
-        """Replaces a broken executor, once."""
         if self._restart is None:
             raise RunFailed(f"a worker process was ended{self._hint}") from None
         if broken is self._executor:

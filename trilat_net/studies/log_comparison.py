@@ -13,12 +13,11 @@ from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, co
 from ..errors import UsageError
 from ..log.log_reader import Log
 from ..reporting.certificate_text import describe_judgement
-from ..reporting.result_text import Block, MarkedText
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import Block, MarkedText, TextTable
 from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
-from ..theory.end_pose import certify_run
+from ..theory.linear_analysis import certify_run
 from .intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 

@@ -1,31 +1,160 @@
-"""The metrics of a run that [expect] can ask for, from a run in virtual time or from a log.
+"""The metrics of a run that [expect] can ask for, of a run in virtual time or of a log, and their outcomes.
 
 Invariant: every metric has one definition: both sources feed the same running statistics of their sites with
-the same records, in time order; a metric that a run cannot give is None, never a guess. Memory is bounded:
-kept are extrema, sums, the last second, and the buckets on which the judgement rests. How a run is cut into
-batches changes only the last bits of a mean.
+the same records, batch by batch in time order; a metric that a run cannot give is None, never a guess. Memory
+is bounded: kept are extrema, sums, the last second, and the buckets on which the judgement rests. How a run
+is cut into batches changes only the last bits of a mean. An outcome states value, limit and margin.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
+from .. import process
 from ..analysis.arm_rows import build_arm_rows
-from ..analysis.metrics.log_metrics import measure_whole
+from ..analysis.metrics.log_metrics import find_quantity, measure_whole
 from ..analysis.metrics.measures import Metric
-from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, classify_run_end
+from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, Stability, classify_run_end, reduce_to_buckets
 from ..analysis.torque_sources import list_walls, wall_force
-from ..core.ticks import BUCKETS_PER_S, NS_PER_S
+from ..core.site_step import Site
+from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
 from ..core.vectors import Array
+from ..execution import virtual
+from ..execution.fused import FusedRun
 from ..execution.virtual import simulate_scenario
 from ..execution.virtual_comparison import find_absent_samples
+from ..fields import field_names
 from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import find_task_errors
 from ..scenario import Expect, Scenario
 from ..scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
-from .record_batches import RecordBatch, join_batches, run_in_batches
+
+BATCH_RECORDS = 1000
+"""Records of a site that are collected before they are passed on."""
+
+
+class RecordBatch(NamedTuple):
+    """Some records of one site, one after the other.
+
+    Attributes:
+        t_ns: nominal time, shape (K,), ns.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
+        e: its error against the reference, Eq. (9), shape (K, m), rad; m in task space.
+        tau: control torque, shape (K, n), N m.
+        tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
+        used: tick of the sample in use, -1 before the first, shape (K, P); of a compiled run none, (K, 0).
+    """
+
+    t_ns: Ints
+    q: Array
+    qd: Array
+    e: Array
+    tau: Array
+    tau_x: Array
+    used: Ints
+
+    def since(self, t_ns: int) -> "RecordBatch":
+        """Returns the records that are later than a time."""
+        return self._part(int(np.searchsorted(self.t_ns, t_ns, side="right")), None)
+
+    def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
+        """Returns the records from one time to another, which is no longer of them."""
+        return self._part(*np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist())
+
+    def reduce(self, into: Array = NO_BUCKETS) -> Array:
+        """Returns the buckets of a judgement with these records added, see `reduce_to_buckets`."""
+        bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
+        return reduce_to_buckets(bucket, self.e, self.qd, self.q, into)
+
+    def _part(self, first: int, last: int | None) -> "RecordBatch":
+        return RecordBatch._make(column[first:last] for column in self)
+
+
+def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
+    """Returns blocks that follow each other as one."""
+    return RecordBatch._make(map(np.concatenate, zip(*blocks, strict=True)))
+
+
+def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
+    q, qd, q_des, tau, tau_x, x = vectors
+    e = find_task_errors(x, q_des, axes) if x.size else q - q_des
+    return RecordBatch(t_ns, q, qd, e, tau, tau_x, used)
+
+
+def _pack_records(axes: Sequence[float], records: Sequence[TickRecord]) -> RecordBatch:
+    rows = [(one.q, one.qd, one.q_des, one.tau, one.tau_x, one.x) for one in records]
+    t_ns = np.array([one.t_ns for one in records], dtype=np.int64)
+    used = np.array([one.used for one in records], dtype=np.int64)
+    return _make_batch(axes, t_ns, used, *map(np.array, zip(*rows, strict=True)))
+
+
+def run_in_batches(
+    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+) -> tuple[float | None, int]:
+    """Runs a scenario in virtual time and passes every site's records on, batch by batch.
+
+    Returns:
+        when the first site left its limits, s, or None; and how many samples came late.
+    """
+    pending: dict[str, list[TickRecord]] = {name: [] for name in take}
+    sites: dict[str, Site] = {}
+    diverged_at_s: float | None = None
+
+    def flush(name: str) -> None:
+        if pending[name]:
+            take[name](_pack_records(scenario.arms[name].axes, pending[name]))
+            pending[name].clear()
+
+    with process.pause_gc():
+        for site, _, output in virtual.execute_virtual(scenario):
+            sites[site.name] = site
+            pending[site.name].append(output)
+            if len(pending[site.name]) == BATCH_RECORDS:
+                flush(site.name)
+            if output.mode is Mode.DIVERGED and diverged_at_s is None:
+                diverged_at_s = output.t_ns / NS_PER_S
+    for name in pending:
+        flush(name)
+    return diverged_at_s, sum(count.late for site in sites.values() for count in site.counts())
+
+
+def run_compiled_in_batches(
+    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+) -> float | None:
+    """Does as `run_in_batches`, in the compiled loop, which does not say which samples are in use.
+
+    Returns:
+        when the first site left its limits, s, or None.
+    """
+    run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
+    columns = [scenario.layout(name).columns() for name in scenario.names]
+    period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
+    while run.ran_s < scenario.duration_s and run.diverged_s is None:
+        run.advance(min(run.ran_s + period_s, scenario.duration_s))
+        for name, place, (t_ns, rows) in zip(scenario.names, columns, run.take_records(), strict=True):
+            if not len(t_ns):
+                continue
+            keys = ("q", "qd", "q_des", "tau", "tau_x", "x")
+            vectors = (rows[:, place.get(key, slice(0, 0))] for key in keys)
+            used = np.zeros((len(t_ns), 0), np.int64)
+            take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+    return run.diverged_s
+
+
+def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
+    """Runs a scenario in the compiled loop; returns all records of each site, and how the run ended."""
+    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
+    records = {name: join_batches(blocks) for name, blocks in kept.items()}
+    found = records.values()
+    trace = RunTrace([one.reduce() for one in found], [one.tau_x[-1] for one in found], diverged_s)
+    return records, classify_run_end(scenario, trace)
 
 
 class Range(NamedTuple):
@@ -273,7 +402,6 @@ def compute_run_metrics(
 
 
 def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
-    """Returns the quantities of a window, of all sites that it is of."""
     parts = [stretch.figures() for stretch in stretches if stretch is not None]
     if len(parts) == 1:
         return parts[0]
@@ -285,7 +413,6 @@ def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
 
 
 def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    """Compares every site's latest angles at the ticks of the first one, in their last second."""
     if not all(len(end.t_ns) for end in ends):  # a site's part ends long before the others'
         return None
     if len({end.q.shape[1] for end in ends}) > 1:  # unlike arms have no angle in common
@@ -300,14 +427,16 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
     tallies = {name: _site_stats(scenario, name) for name in scenario.names}
-    run = run_in_batches(scenario, {name: tally.add for name, tally in tallies.items()})
+    diverged_at_s, late_samples = run_in_batches(
+        scenario, {name: tally.add for name, tally in tallies.items()}
+    )
     made = sum(tally.records for tally in tallies.values())
     return compute_run_metrics(
         scenario,
         tallies,
-        diverged_at_s=run.diverged_at_s,
-        late_samples=run.late_samples,
-        missing=0 if run.diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
+        diverged_at_s=diverged_at_s,
+        late_samples=late_samples,
+        missing=0 if diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
     )
 
 
@@ -345,3 +474,125 @@ def _site_stats(scenario: Scenario, site: str) -> SiteStats:
         for window in scenario.expect.windows
     ]
     return SiteStats(peer_rates, scenario.expect.synchronised_rad, stretches)
+
+
+class ExpectationResult(msgspec.Struct, frozen=True):
+    """One thing that was expected of one run; values in words with their units.
+
+    Attributes:
+        key: the key of [expect] that asked, or a word for what every run must do.
+        margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare, negative is
+            beyond it. None where there is no such number.
+        value: the measured number, in the unit of the limit; None where it is none.
+    """
+
+    key: str
+    held: bool
+    measured: str
+    limit: str
+    margin: float | None = None
+    value: float | None = None
+
+
+def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
+    """Returns an outcome for everything that is asked of a run, in the order of the keys of `Expect`.
+
+    A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
+    """
+    limits = [
+        _compare_with_limit(key, _read_metric(key, metrics), limit)
+        for key in _LIMITS
+        if (limit := getattr(expect, key)) is not None
+    ]
+    missing = f"{metrics.missing} missing"
+    gaps = ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
+    return [
+        *_evaluate_stability(expect, metrics),
+        *limits,
+        *_evaluate_poses(expect, metrics),
+        *([gaps] if expect.no_gaps else []),
+        *_evaluate_windows(expect, metrics),
+        *_evaluate_metrics(expect, metrics),
+    ]
+
+
+def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    wanted, end = expect.stable is not False, metrics.end
+    if expect.stable is not None or end.diverged_at_s is not None:
+        held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
+        yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
+
+
+_UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N", "_ms": "ms", "_s": "s"}
+"""Per ending of a key its unit, for people."""
+
+
+_LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
+
+
+def _find_unit(key: str) -> str:
+    return next((unit for ending, unit in _UNITS.items() if key.endswith(ending)), "")
+
+
+def _read_metric(key: str, metrics: RunMetrics) -> float | None:
+    """Returns what a limit is of; of ages that of the worst link, None if one never had a sample."""
+    if not key.endswith("_ms"):
+        found: float | None = getattr(metrics, re.sub("_(max|min)", "", key).replace("_by_", "_at_"))
+        return found
+    ages = [age.mean_ms if key.startswith("mean") else age.max_ms for age in metrics.ages.values()]
+    known = [age for age in ages if age is not None]
+    choose = min if "_min_" in key else max
+    return choose(known) if known and len(known) == len(ages) else None
+
+
+def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
+    least, unit = "_min_" in key, _find_unit(key)
+    wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
+    if measured is None:
+        return ExpectationResult(key, False, "never", wanted)
+    spare = measured - limit if least else limit - measured
+    text = f"{measured:.4g} {unit}".rstrip()
+    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured)
+
+
+def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    within = expect.end_pose_within_rad
+    for site, wanted in expect.end_pose_rad.items():
+        key = f"end_pose_rad.{site}"
+        limit = f"({', '.join(f'{angle:g}' for angle in wanted)}) ± {within:g} rad"
+        reached = metrics.end_pose_rad.get(site)
+        if reached is None:
+            yield ExpectationResult(key, False, "never", limit)
+            continue
+        off = max(abs(a - b) for a, b in zip(reached, wanted, strict=True))
+        text = f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad"
+        yield ExpectationResult(key, off <= within, text, limit, (within - off) / within)
+
+
+def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    for window, ranges in zip(expect.windows, metrics.windows, strict=True):
+        for key, limits in window.asked:
+            site = f" {window.site}" if window.site else ""
+            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
+            yield _compare_with_range(name, ranges.get(key), limits, _find_unit(key))
+
+
+def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    for key, limits in expect.metrics.items():
+        value, why, _ = metrics.metrics[key]
+        found = None if value is None else Range(value, value)
+        yield _compare_with_range(f"metrics.{key}", found, limits, find_quantity(key).unit, why)
+
+
+def _compare_with_range(
+    name: str, found: Range | None, limits: Sequence[float], unit: str, why: str = "never"
+) -> ExpectationResult:
+    least, most = limits
+    wanted = f"{least:g} to {most:g} {unit}".rstrip()
+    if found is None:
+        return ExpectationResult(name, False, why, wanted)
+    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
+    spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
+    margin = spare / half if half else None
+    value = found.most if found.least == found.most else None
+    return ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)

@@ -31,148 +31,31 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 from msgspec.structs import asdict
 
 from ..analysis.metrics.log_metrics import find_quantity
-from ..analysis.run_end import Stability
 from ..core.jit import is_core_cached
 from ..errors import LawFailed, LogError, ScenarioError, TrilatError
 from ..execution import virtual
 from ..execution.verify import verify
-from ..fields import field_names, is_distribution
+from ..fields import is_distribution
 from ..log.log_reader import open_log
 from ..net.clock import SystemClock
-from ..reporting.result_text import Block, MarkedText
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import Block, MarkedText, TextTable
 from ..results import Result
-from ..scenario import Expect, Scenario, load_scenario
+from ..scenario import Scenario, load_scenario
 from ..scenario.law_consent import list_imported_laws
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
-from .measure_run import Range, RunMetrics, measure_log, measure_virtual_run
+from .measure_run import (
+    ExpectationResult,
+    RunMetrics,
+    evaluate_expectations,
+    measure_log,
+    measure_virtual_run,
+)
 from .study_folder import format_command, format_toml_value, set_options
-
-
-class ExpectationResult(msgspec.Struct, frozen=True):
-    """One thing that was expected of one run; values in words with their units.
-
-    Attributes:
-        key: the key of [expect] that asked, or a word for what every run must do.
-        margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare, negative is
-            beyond it. None where there is no such number.
-        value: the measured number, in the unit of the limit; None where it is none.
-    """
-
-    key: str
-    held: bool
-    measured: str
-    limit: str
-    margin: float | None = None
-    value: float | None = None
-
-
-def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Returns an outcome for everything that is asked of a run, in the order of the keys of `Expect`.
-
-    A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
-    """
-    limits = [
-        _compare_with_limit(key, _read_metric(key, metrics), limit)
-        for key in _LIMITS
-        if (limit := getattr(expect, key)) is not None
-    ]
-    missing = f"{metrics.missing} missing"
-    gaps = ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
-    return [
-        *_evaluate_stability(expect, metrics),
-        *limits,
-        *_evaluate_poses(expect, metrics),
-        *([gaps] if expect.no_gaps else []),
-        *_evaluate_windows(expect, metrics),
-        *_evaluate_metrics(expect, metrics),
-    ]
-
-
-def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    wanted, end = expect.stable is not False, metrics.end
-    if expect.stable is not None or end.diverged_at_s is not None:
-        held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
-        yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
-
-
-_UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N", "_ms": "ms", "_s": "s"}
-"""Per ending of a key its unit, for people."""
-_LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
-
-
-def _find_unit(key: str) -> str:
-    return next((unit for ending, unit in _UNITS.items() if key.endswith(ending)), "")
-
-
-def _read_metric(key: str, metrics: RunMetrics) -> float | None:
-    """Returns what a limit is of; of ages that of the worst link, None if one never had a sample."""
-    if not key.endswith("_ms"):
-        found: float | None = getattr(metrics, re.sub("_(max|min)", "", key).replace("_by_", "_at_"))
-        return found
-    ages = [age.mean_ms if key.startswith("mean") else age.max_ms for age in metrics.ages.values()]
-    known = [age for age in ages if age is not None]
-    choose = min if "_min_" in key else max
-    return choose(known) if known and len(known) == len(ages) else None
-
-
-def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    least, unit = "_min_" in key, _find_unit(key)
-    wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
-    if measured is None:
-        return ExpectationResult(key, False, "never", wanted)
-    spare = measured - limit if least else limit - measured
-    text = f"{measured:.4g} {unit}".rstrip()
-    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured)
-
-
-def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    within = expect.end_pose_within_rad
-    for site, wanted in expect.end_pose_rad.items():
-        key = f"end_pose_rad.{site}"
-        limit = f"({', '.join(f'{angle:g}' for angle in wanted)}) ± {within:g} rad"
-        reached = metrics.end_pose_rad.get(site)
-        if reached is None:
-            yield ExpectationResult(key, False, "never", limit)
-            continue
-        off = max(abs(a - b) for a, b in zip(reached, wanted, strict=True))
-        text = f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad"
-        yield ExpectationResult(key, off <= within, text, limit, (within - off) / within)
-
-
-def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    for window, ranges in zip(expect.windows, metrics.windows, strict=True):
-        for key, limits in window.asked:
-            site = f" {window.site}" if window.site else ""
-            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
-            yield _compare_with_range(name, ranges.get(key), limits, _find_unit(key))
-
-
-def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    for key, limits in expect.metrics.items():
-        value, why, _ = metrics.metrics[key]
-        found = None if value is None else Range(value, value)
-        yield _compare_with_range(f"metrics.{key}", found, limits, find_quantity(key).unit, why)
-
-
-def _compare_with_range(
-    name: str, found: Range | None, limits: Sequence[float], unit: str, why: str = "never"
-) -> ExpectationResult:
-    least, most = limits
-    wanted = f"{least:g} to {most:g} {unit}".rstrip()
-    if found is None:
-        return ExpectationResult(name, False, why, wanted)
-    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
-    spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
-    margin = spare / half if half else None
-    value = found.most if found.least == found.most else None
-    return ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)
 
 
 class TrialResult(NamedTuple):
@@ -292,7 +175,6 @@ def trials(
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
-    """Refuses a scenario that expects nothing, or something of a time that it does not reach."""
     expect, end_s = scenario.expect, scenario.duration_s
     if not expect.asks:
         raise ScenarioError(
@@ -638,5 +520,4 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
 
 
 def _clean(text: str) -> str:
-    """Returns text without the characters that no XML document may hold, not even escaped."""
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

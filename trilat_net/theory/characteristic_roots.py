@@ -139,18 +139,9 @@ class Pencil(NamedTuple):
         return np.flatnonzero(np.abs(self.Ad).sum(axis=(0, 1)))
 
 
-class MovingPart(NamedTuple):
-    """A loop without the states that nothing changes, or that change nothing.
-
-    Attributes:
-        pencil: its characteristic equation.
-        names: of its states.
-        constant: number of states left out, of the loop's too, each with a root at zero.
-    """
-
-    pencil: Pencil
-    names: tuple[str, ...]
-    constant: int
+MovingPart = tuple[Pencil, tuple[str, ...], int]
+"""A loop without the states that nothing changes, or that change nothing: its characteristic equation, the
+names of its states, and the number of states left out, each with a root at zero."""
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
@@ -168,7 +159,7 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     acts = Ad.any(axis=(1, 2))
     E = None if pencil.E is None else pencil.E[kept]
     moving = pencil._replace(A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts], E=E)
-    return MovingPart(moving, tuple(names[place] for place in kept), len(names) - len(kept))
+    return moving, tuple(names[place] for place in kept), len(names) - len(kept)
 
 
 class CharacteristicRoot(NamedTuple):
@@ -346,8 +337,8 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop that moves."""
     Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    moving = extract_moving_part(Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names)
-    return moving._replace(constant=moving.constant + loop.left_out)
+    moving, names, constant = extract_moving_part(Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names)
+    return moving, names, constant + loop.left_out
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
@@ -374,7 +365,6 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    """Returns a matrix of rates without the states that have none, which the others give at once."""
     given = np.flatnonzero(E == 0.0)
     kept = np.setdiff1d(np.arange(len(matrix)), given)
     ours = np.linalg.solve(matrix[np.ix_(given, given)], matrix[np.ix_(given, kept)])

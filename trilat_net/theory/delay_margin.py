@@ -135,7 +135,6 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
-    """Returns the number of roots to the right of the imaginary axis, with conjugates and multiplicities."""
     wanted = 8
     while True:
         roots = characteristic_roots.compute_delay_spectrum(loop, wanted).roots
@@ -150,7 +149,7 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
 
     And whether roots are on it for every delay, as G has an eigenvalue of modulus 1 at every frequency.
     """
-    pencil = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0)).pencil
+    pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
     if not len(pencil.delays):
         return [], False
     with characteristic_roots.limit_blas_threads():
@@ -165,7 +164,6 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
 
 
 def _merge(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
-    """Returns crossings, sorted, with those of one frequency and delay counted together."""
     merged: list[AxisCrossing] = []
     for one in sorted(crossings):
         last = merged[-1] if merged else None
@@ -212,7 +210,6 @@ class _FrequencySweep:
         return counts
 
     def search(self, low: float, high: float) -> list[AxisCrossing]:
-        """Returns the crossings between two frequencies whose counts differ."""
         ends = self.count_outside(np.array([low, high]))
         if ends[0] == ends[1]:
             return []

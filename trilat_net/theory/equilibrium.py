@@ -32,7 +32,7 @@ from .site_dynamics import (
     lay_out_arguments,
     place_arm,
 )
-from .textbook_task import SINGULAR
+from .textbook_arm import SINGULAR
 
 MAX_PROLONGATION = 8.0
 """A run that is not at rest goes on for up to this multiple of its duration."""
@@ -324,7 +324,6 @@ def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None
 
 
 def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: int) -> Equilibrium:
-    """Returns an equilibrium with what laws of one's own remember after so many ticks at its pose."""
     theta_hat = rest.theta_hat.copy()
     for n, (site, x) in enumerate(
         zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)

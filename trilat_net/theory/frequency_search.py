@@ -104,7 +104,6 @@ def _refine(
     w_rad_s: Array,
     find_wide: Callable[[NDArray[Any]], NDArray[np.bool_]],
 ) -> tuple[Array, NDArray[Any]]:
-    """Returns frequencies and a function's values at them, halving the steps that its values call wide."""
     values = function(w_rad_s)
     for _ in range(_ROUNDS):
         wide = find_wide(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))

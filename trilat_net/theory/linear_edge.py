@@ -177,7 +177,6 @@ class _GrowthRate:
         return -np.inf if self._root is None else self._root.s.real
 
     def close_edge(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
-        """Returns the edge between two (value, real part) of different signs."""
         (low, at_low), (high, _) = left, right
         if self.integer:
             while high - low > 1.0:

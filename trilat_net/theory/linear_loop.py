@@ -25,7 +25,7 @@ from ..laws.linear_form import LinearForm, Place
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
-from .textbook_task import PLACE_COORDINATES, evaluate_reference
+from .textbook_arm import PLACE_COORDINATES, evaluate_reference
 
 _DEPENDENT = 1e-9
 """Rows of a regressor that are dependent to this, relative to the largest, are."""
@@ -152,16 +152,11 @@ def differentiate_references(
             found[i, int(j)] = row[j] * np.eye(len(shared[i]))
         if len(shared[i]) > PLACE_COORDINATES and conditions.sites[i].layout.task:
             for peer in {i, *np.flatnonzero(row).tolist()}:
-                found[i, peer] = _differentiate_reference(row, i, peer, shared)
+                poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
+                poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[peer]))
+                moved = evaluate_reference(row, poses[i], poses).imag
+                found[i, peer] = moved / site_dynamics.COMPLEX_STEP
     return found
-
-
-def _differentiate_reference(row: Array, i: int, j: int, shared: list[Array]) -> Array:
-    """Returns the derivative of what site i follows by what j shares, by a complex step."""
-    poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
-    poses[j] = poses[j] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[j]))
-    derivative: Array = evaluate_reference(row, poses[i], poses).imag / site_dynamics.COMPLEX_STEP
-    return derivative
 
 
 def couple_sites(
@@ -226,7 +221,9 @@ def differentiate_rates(
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))
         else:
             effect = rates.tau[:, at.estimate]
-            joints = _find_independent_rows(effect)
+            _, R, order = qr(effect.T, mode="economic", pivoting=True)  # its independent rows
+            sizes = np.abs(np.diag(R))
+            joints = sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
             names = tuple(f"gravity{joint + 1}" for joint in joints)
             jacobian = _replace_estimate(at, rates, effect[joints], names)
             jacobian = jacobian._replace(left_out=at.parameters - len(joints))
@@ -236,13 +233,6 @@ def differentiate_rates(
 
 def _name_motion(joints: int) -> tuple[str, ...]:
     return tuple(f"{kind}{joint + 1}" for kind in ("q", "qd") for joint in range(joints))
-
-
-def _find_independent_rows(matrix: Array) -> list[int]:
-    """Returns as many rows as a matrix has rank, each as independent of those before as can be, in order."""
-    _, R, order = qr(matrix.T, mode="economic", pivoting=True)
-    sizes = np.abs(np.diag(R))
-    return sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
 
 
 def _replace_estimate(
@@ -348,7 +338,6 @@ _Places = dict[tuple[int, Place], slice]
 def _place_form_states(
     conditions: OperatingConditions, forms: Sequence[LinearForm | None], loop: LinearLoop
 ) -> tuple[_Places, list[str]]:
-    """Returns where states and what is sent stand, by site, and the names of all states of the loop."""
     places: _Places = {}
     names = list(loop.names)
     for i, (name, form) in enumerate(zip(conditions.names, forms, strict=True)):
@@ -373,7 +362,6 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    """Adds the blocks of a law at a site to the terms of the loop, by their delays."""
     (places, i), site = where, sites[where[1]]
     ports = np.cumsum([0, *(one.at.joints for one in sites)])
 

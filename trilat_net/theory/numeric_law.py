@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..analysis.arm_rows import Numbers
 from ..core import chain_stages, two_link_stages
 from ..core.compiled_law import plug_law
 from ..core.site_arrays import build_site_arrays
@@ -20,7 +21,6 @@ from ..core.ticks import tick_ns
 from ..core.user_law import LawContext, UserLaw, list_remembered, read_memory
 from ..core.vectors import Array
 from ..errors import ScenarioError
-from .textbook_arm import Numbers
 
 _TICK = 1_000_000
 """The tick at which a law is asked: late, so that nothing begins."""
@@ -60,7 +60,9 @@ class NumericLaw:
         own = np.array(read_memory(self._law))
         self._own, self._keeps_past = len(own), False
         self.memory, self.names = own, _name_memory(self._law, self._own)
-        arguments = self._lay_out(setup)
+        start, rest = np.array(setup.q0), np.zeros(self._layout.joints)
+        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
+        arguments = np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
         past = np.r_[np.zeros(self._layout.joints), setup.q0]
         self._keeps_past = not np.array_equal(self._ask(arguments, past), self._ask(arguments, past + 1e-3))
         if self._keeps_past:
@@ -70,7 +72,6 @@ class NumericLaw:
 
     @property
     def _memory_at(self) -> slice:
-        """Where its memory stands in the arguments: after the angles and speeds."""
         return slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
@@ -94,12 +95,6 @@ class NumericLaw:
             if not np.abs(step).max(initial=0.0) > _STILL:
                 break
         return x[memory]
-
-    def _lay_out(self, setup: SiteSetup) -> Array:
-        n, start = self._layout.joints, np.array(setup.q0)
-        rest = np.zeros(n)
-        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
-        return np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
 
     def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
         """Returns the torque and the rate of the memory; of complex columns with their derivatives."""

@@ -186,7 +186,6 @@ def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetu
 
 
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
-    """Returns the gains of every site, of a plugged law those of its small motions."""
     found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
         law, theta = spec.control, scenario.arms[name].theta
@@ -267,7 +266,6 @@ def _final_dominance(scenario: Scenario, sites: tuple[SiteSetup, ...], notes: li
 
 
 def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
-    """Returns a site with the actors in force at the end, scripted torques constant from then on."""
     setup, end_s = scenario.setup(name), scenario.duration_s
     present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
     if any(

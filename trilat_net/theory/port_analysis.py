@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
-from ..analysis.lyapunov_weights import compute_lyapunov_weights
+from ..analysis.dominance_history import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
@@ -40,9 +40,9 @@ from .port_passivity import (
     llewellyn_parameter,
     llewellyn_rounding,
 )
-from .port_transparency import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
+from .port_response import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
 from .site_dynamics import follow_peers, lay_out_arguments, place_arm
-from .textbook_task import PLACE_COORDINATES
+from .textbook_arm import PLACE_COORDINATES
 
 
 def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) -> OperatingConditions:

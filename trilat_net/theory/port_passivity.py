@@ -189,7 +189,6 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
 
 
 def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
-    """Returns Y with each site's rows and columns divided by the root of the size of its own part."""
     size = np.ones(Y.shape[:2])
     for site in range(int(owner.max()) + 1):
         own = np.flatnonzero(owner == site)

@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.arm_rows import Numbers, PlacedArm, multiply_columns
 from ..core.exogenous import OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
 from .numeric_law import NumericLaw
-from .textbook_arm import Numbers, PlacedArm, PlacedChain, multiply_columns
-from .textbook_task import Following, follow_in_task, follow_joints, share_pose
+from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints, share_pose
 
 COMPLEX_STEP = 1e-30
 SWITCHING_TOLERANCE = 1e-9
@@ -76,7 +76,7 @@ class ArgumentLayout(NamedTuple):
 
     @property
     def q_des(self) -> slice:
-        """The reference, q_id; in task space a pose, see `textbook_task`."""
+        """The reference, q_id; in task space a pose, see `textbook_arm`."""
         return self._input(0)
 
     @property
@@ -127,7 +127,7 @@ class SiteRates(NamedTuple):
         external: the torque of operators and environments that act continuously, shape (n, ...), N m.
         held: the torque of those that are sampled and held, shape (n, ...), N m.
         x: what peers get of the pose, shape (m, ...): the angles, or place and orientation, see
-            `textbook_task.Following`.
+            `textbook_arm.Following`.
         xd: its velocity.
         reflected: the external and held torque as peers get it, a force in task space.
     """
@@ -199,7 +199,6 @@ def _as_columns(values: object, like: Numbers) -> Numbers:
 def _evaluate_law(
     site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """Returns the torque of the law, unclamped, and the rate of its estimate."""
     at, gains = lay_out_arguments(site), site.gains
     q, qd, estimate = x[at.q], x[at.qd], x[at.estimate]
     _, _, e, ed, v, a, *_ = following
@@ -224,7 +223,6 @@ def _evaluate_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    """True where an estimate is at an end of its box and its rate points outward."""
     low, high = _as_columns(site.gains.low, estimate), _as_columns(site.gains.high, estimate)
     down = (estimate.real <= low + SWITCHING_TOLERANCE) & (rate.real < -SWITCHING_TOLERANCE)
     up = (estimate.real >= high - SWITCHING_TOLERANCE) & (rate.real > SWITCHING_TOLERANCE)

@@ -1,12 +1,22 @@
-"""The energy balance closes, to the order of what made the log, and only with every term as it is."""
+"""The energy balance closes, to the order of what made the log, and only with every term as it is.
 
+The energy balance of arms of n joints closes, with friction, stops, walls in space and limits too.
+
+The energy balance of sites that follow with their end effectors closes, and needs every term.
+"""
+
+import dataclasses
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+import trilat_net
+from tests.analysis.rough_arms import rough_log
+from tests.chains import six_joints
 from tests.core.guarded_runs import adaptive_text, stopped_log
+from tests.task_arms import planar_task
 from tests.theory.delay_equations import DelayEquations, equations, inertia
 from tests.theory.energy import balance as balance_by_hand
 from tests.theory.energy import left_null_vector
@@ -16,7 +26,10 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.scenario import load_scenario
+from trilat_net.analysis.certificate.premises import explain_no_functional
+from trilat_net.analysis.certificate.stability_certificate import Certificate, StabilityFinding, certify
+from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from trilat_net.scenario import load_scenario, parse_scenario
 
 from . import runs
 
@@ -230,3 +243,170 @@ def test_a_closed_group_is_balanced_by_itself() -> None:
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
     assert runs.relative(group) <= 1e-4
     assert group.transfer == pytest.approx(np.zeros(len(group.t_s)), abs=1e-9 * group.scale)
+
+
+BAR = 5e-5
+"""Largest unexplained energy as a share of the largest V."""
+
+
+def unexplained(balance: EnergyBalance) -> float:
+    return float(np.abs(balance.unexplained).max() / balance.V.max())
+
+
+def check_six(duration_s: float) -> LogMetrics:
+    """The certificate of a run of six joints, and its metrics."""
+    log = trilat_net.simulate(parse_scenario(six_joints(duration_s, 200.0)))
+    found, metrics = certify(log), compute_log_metrics(log)
+    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
+    assert found.balance is not None
+    assert unexplained(found.balance) <= BAR
+    assert np.abs(found.balance.residual).max() <= BAR * found.balance.V.max()
+    for site, energy in found.energies.items():
+        own = metrics.sites[site]
+        learnt = own["theta_energy_last_j"].value - own["theta_energy_first_j"].value
+        assert learnt == pytest.approx(np.ptp(energy.parts.parameter[[0, -1]]) * np.sign(learnt), rel=1e-6)
+        assert own["unaccounted_j"].value <= 1e-6
+    return metrics
+
+
+def test_energy_of_six_joints_closes_with_the_base_parameters() -> None:
+    metrics = check_six(2.0)
+    estimates = metrics.estimates["s"].base
+    assert estimates is not None
+    assert len(estimates.parameter) == 36
+    assert metrics.sites["s"]["unphysical_links"].value == estimates.consistent_last.count(False)
+
+
+@pytest.mark.long
+def test_energy_of_seven_joints_closes() -> None:
+    text = six_joints(10.0, 200.0).replace("arm6", "arm7").replace("[0.2, 0.2, 0.2, 0.05, 0.05, 0.05]", "0.2")
+    text = text.replace("[10, 10, 10, 2, 2, 2]", "8").replace("[2, 2, 2, 0.5, 0.5, 0.5]", "1.5")
+    for pose in ("0.5, 0.2]", "0.1, 0.0]", "0.3, 0.1]"):
+        text = text.replace(pose, f"{pose[:-1]}, 0.4]")
+    log = trilat_net.simulate(parse_scenario(text))
+    balance = compute_energy_balance(compute_site_energies(log))
+    assert unexplained(balance) <= BAR
+
+
+@pytest.mark.long
+def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
+    check_six(10.0)
+
+
+def test_premises_name_joints_at_limits_and_at_stops() -> None:
+    found = certify(rough_log())
+    premises = {premise.name: premise for premise in found.premises}
+    assert premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
+    assert "s (shoulder_lift)" in premises["torque"].text
+    assert "m2 (elbow)" in premises["stops"].text
+    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE), found.verdict.text
+
+
+def test_every_term_of_a_rough_arm_is_needed() -> None:
+    """Without its friction, its stops or its wall the energy of a site does not add up."""
+    energies = compute_site_energies(rough_log())
+    whole = compute_energy_balance(energies)
+    assert np.abs(whole.unexplained).max() <= 2e-4 * whole.V.max()
+    assert {"stops", "hands", "walls"} == set(whole.external)
+    for site, name in (("s", "friction"), ("m2", "friction"), ("m2", "stops"), ("s", "walls")):
+        energy = energies[site]
+        kinds = {
+            kind: {key: one for key, one in getattr(energy, kind).items() if key != name}
+            for kind in ("dissipation", "work")
+        }
+        lame = dataclasses.replace(energy, **kinds)
+        assert np.abs(lame.unexplained).max() > 50 * np.abs(energy.unexplained).max(), name
+
+
+def test_friction_and_stops_stand_in_the_energies_of_an_arm() -> None:
+    found = compute_log_metrics(rough_log())
+    for own in found.sites.values():
+        assert own["friction_j"].value > 1.0
+        assert own["unaccounted_j"].value <= 0.02
+    assert found.sites["m2"]["walls_j"].value < 0.0  # its stop
+    assert not found.sites["m1"]["walls_j"].applies
+    assert found.walls["s/1"]["force_peak_n"].value > 10.0
+
+
+"""Largest residual as a share of the largest V."""
+
+
+def judge(rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object) -> Certificate:
+    text = planar_task(rate_hz=rate_hz, elbow_rad=elbow_rad)
+    return certify(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
+
+
+def share(found: Certificate, name: str = "residual") -> float:
+    assert found.balance is not None, found.verdict.text
+    return float(np.abs(getattr(found.balance, name)).max() / found.balance.V.max())
+
+
+def test_it_closes_with_order_two() -> None:
+    found = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
+    assert all(one.verdict.finding is StabilityFinding.COVERED for one in found.values())
+    assert share(found[1000]) <= BAR
+    assert share(found[500]) / share(found[1000]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
+    jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
+    box = judge(**{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2})
+    limit = judge(**{"limits.tau_limit_nm": 25.0})
+    for found in (jitter, box, limit):
+        assert share(found) <= BAR
+    assert box.verdict.finding is StabilityFinding.COVERED
+    assert {premise.name for premise in limit.premises if not premise.holds} == {"torque"}
+    assert limit.verdict.rise is not None
+    assert list(limit.verdict.rise.causes) == ["the torque limit"]
+
+
+def test_damping_near_a_singular_pose_fails_a_premise() -> None:
+    found = judge(elbow_rad=0.15, **{"task.singular_value": 0.3})
+    premise = next(one for one in found.premises if one.name == "singular poses")
+    assert premise.holds is False
+    assert "s from 0 s on" in premise.text
+    assert found.balance is not None
+    assert abs(found.balance.work["singular poses"][-1]) > 0.02 * found.balance.V.max()
+    assert share(found, "unexplained") <= 2e-4
+
+
+@pytest.mark.long
+def test_an_axis_that_only_one_follows_dissipates() -> None:
+    """The arm of seven joints begins beside the plane of its masters, which cannot leave it."""
+    q0 = [0.3, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
+    log = trilat_net.simulate(load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0}))
+    found = certify(log)
+    assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
+    assert share(found) <= BAR
+    assert found.balance is not None
+    taken = found.balance.dissipation["open axes"]
+    assert taken[-1] > 1e-3
+    assert np.diff(taken).min() >= -1e-15
+    for site, energy in compute_site_energies(log).items():
+        terms = {name: one for name, one in energy.dissipation.items() if name != "open axes"}
+        lame = dataclasses.replace(energy, dissipation=terms)
+        if site == "s":
+            assert np.abs(lame.residual).max() > 10 * np.abs(energy.residual).max()
+
+
+def test_following_an_axis_that_peers_leave_free_fails() -> None:
+    found = judge(**{"sites.m.task.axes": ["x"]})
+    premise = next(one for one in found.premises if one.name == "axes")
+    assert premise.holds is False
+    assert "s follows m" in premise.text
+
+
+def test_orientations_have_no_v_and_it_says_why() -> None:
+    text = planar_task(duration_s=0.1).replace("position", "pose").replace("[8.0, 5.0, 1.0]", "5.0")
+    assert "orientations" in explain_no_functional(parse_scenario(text))
+
+
+def test_false_records_break_the_balance() -> None:
+    """Every site's torque is checked against the law in task space."""
+    log = trilat_net.simulate(parse_scenario(planar_task(duration_s=1.0)))
+    energies = compute_site_energies(log)
+    motion = energies["s"].motion
+    assert np.abs(motion.records.tau - motion.law_torque(np.arange(len(motion.r)))).max() <= 1e-9
+    wrong = dataclasses.replace(motion, constants=motion.constants._replace(Kd=1.01 * motion.constants.Kd))
+    assert np.abs(wrong.records.tau - wrong.law_torque(np.arange(len(motion.r)))).max() > 1e-3
+    assert compute_energy_balance(energies).V.max() > 1.0

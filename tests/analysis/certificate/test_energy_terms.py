@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trilat_net.analysis.aligned import AlignedRecords, PeerTrajectory, view_delayed_peer
-from trilat_net.analysis.arm_rows import PlanarArmRows, compute_end_effector
+from trilat_net.analysis.arm_rows import PlanarArmRows
 from trilat_net.analysis.certificate.energy_terms import (
     SiteConstants,
     SiteMotion,
@@ -64,7 +64,7 @@ class Situation:
     def motion(self) -> SiteMotion:
         peers = dict(zip(("a", "b"), self.views, strict=True))
         none = np.zeros_like(self.track.q)
-        tip = compute_end_effector((1.0, 1.0), self.track.q, self.track.qd)
+        tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(self.track.q, self.track.qd)
         return SiteMotion(self.track, EQ, self.shares, peers, TorqueSplit(tip, none, none, none, none))
 
     def v(self, row: int) -> float:

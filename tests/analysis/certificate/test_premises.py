@@ -1,8 +1,17 @@
-"""Each premise, where it holds and where it does not."""
+"""Each premise, where it holds and where it does not.
 
+Walls that are held over a tick: what they give, the damping that takes it, and the premise by its name.
+"""
+
+import numpy as np
 import pytest
 
-from trilat_net.analysis.certificate.premises import Premise
+import trilat_net
+from trilat_net.analysis.certificate.premises import Premise, check_premises, gather_facts
+from trilat_net.analysis.torque_sources import find_wall_energies
+from trilat_net.core.vectors import Array
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import load_scenario
 
 from . import runs
 
@@ -73,3 +82,101 @@ def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     hands = next(p for p in runs.run("wall").certificate.premises if p.name == "hands")
     assert hands.holds is False
     assert hands.text.startswith("the hands and walls gave up to")
+
+
+SITE = "sites.s.environment"
+SAMPLED = {f"{SITE}.0.sampled": True, "rate_hz": 200, "duration_s": 8.0}
+
+
+def run(**changes: object) -> Log:
+    return trilat_net.simulate("windup", {**SAMPLED, **{k.replace("__", "."): v for k, v in changes.items()}})
+
+
+def premise(log: Log) -> Premise | None:
+    return next((one for one in check_premises(gather_facts(log)) if one.name == "walls"), None)
+
+
+def damper(b: float, **more: object) -> list[dict[str, object]]:
+    """The wall of `windup`, and a damper of the arm."""
+    wall = load_scenario("windup").sites["s"].environment[0]
+    place = {"point_m": list(wall.point_m), "normal": list(wall.normal), "stiffness_n_m": wall.stiffness_n_m}
+    return [{"kind": "wall", "sampled": True, **place}, {"kind": "viscous", "damping_nm_s_rad": b, **more}]
+
+
+def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
+    log = run()
+    wall, s = log.scenario.sites["s"].environment[0], log["s"]
+    x = np.cos(s.q[:, 0]) + np.cos(s.q.sum(axis=1))
+    depth = np.maximum(x - wall.point_m[0], 0.0)
+    inside = (depth[:-1] > 0.0) & (depth[1:] > 0.0)
+    leaves = (depth[:-1] > 0.0) & (depth[1:] == 0.0)
+    gives = 0.5 * wall.stiffness_n_m * float((np.diff(x)[inside] ** 2).sum())
+    gives += wall.stiffness_n_m * float((depth[:-1] * -np.diff(x) - 0.5 * depth[:-1] ** 2)[leaves].sum())
+    enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)  # the spring is there, and nobody pressed it
+    gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
+    found = find_wall_energies(log)[0]
+    assert found.site == "s"
+    assert found.gave_j == pytest.approx(gives, rel=0.02)
+    assert found.needed_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
+    assert found.damping_n_s_m == 0.0
+
+
+def test_it_fails_the_premise_by_name() -> None:
+    found = premise(run())
+    assert found is not None
+    assert (found.name, found.holds) == ("walls", False)
+
+
+@pytest.mark.parametrize(("b", "holds"), [(1.0, False), (40.0, True)])
+def test_a_damper_of_the_arm_takes_what_the_wall_gives(b: float, *, holds: bool) -> None:
+    found = premise(run(**{SITE: damper(b), f"{SITE}.0.sampled": True}))
+    assert found is not None
+    assert found.holds is holds
+
+
+def test_a_damper_that_is_sampled_or_gone_takes_nothing() -> None:
+    for more in ({"sampled": True}, {"end_s": 1.0}):
+        found = premise(run(**{SITE: damper(40.0, **more), f"{SITE}.0.sampled": True}))
+        assert found is not None
+        assert found.holds is False
+
+
+def test_a_wall_out_of_reach_or_not_sampled_gives_nothing() -> None:
+    away = premise(run(**{f"{SITE}.0.point_m": [1.9, 0.0]}))
+    assert away is not None
+    assert away.holds
+    assert premise(run(**{f"{SITE}.0.sampled": False})) is None
+
+
+def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = False) -> float:
+    """The least damping b, N s/m, that takes what a held wall gives to a motion, h = 1; v at ends of parts.
+
+    Its speed is straight over each part; it begins and ends at rest in the wall.
+    """
+    parts = v.reshape(ticks, -1)
+    after = np.append(parts[1:, :1], [[0.0]], axis=0)
+    ends = np.hstack([parts, after])
+    dt = 1.0 / parts.shape[1]
+    steps = (0.5 * dt * (ends[:, 1:] + ends[:, :-1])).sum(axis=1)
+    taken = (dt / 3.0 * (ends[:, 1:] ** 2 + ends[:, 1:] * ends[:, :-1] + ends[:, :-1] ** 2)).sum()
+    speed = np.append(0.0, steps[:-1]) if differenced else parts[:, 0]
+    return float((0.5 * K * steps**2 - B * speed * steps).sum() / taken)
+
+
+def test_damping_by_the_sampled_speed_gives_energy() -> None:
+    """Ticks of 1 s, K 2, B 1: K h / 2 + B is 2. Faster motions than half the tick rate are without bound."""
+    ticks, rng = 200, np.random.default_rng(5)
+    t = np.arange(ticks * 400) / 400.0
+    square = np.where(t % 2.0 < 1.0, 1.0, -1.0)  # its speed changes sides at each tick
+    assert most_given(square, ticks, 2.0, 1.0, differenced=True) == pytest.approx(2.0, rel=0.02)
+    harmonics = np.pi * (2.0 * np.arange(20) + 1.0)
+    c, s = np.ones(20) / np.sqrt(20.0), 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
+    many = (c[:, None] * np.cos(harmonics[:, None] * t) - s[:, None] * np.sin(harmonics[:, None] * t)).sum(0)
+    assert most_given(many, ticks, 0.0, 1.0) == pytest.approx(3.1, abs=0.1)
+    for _ in range(50):
+        straight = rng.normal(size=ticks)
+        assert most_given(straight, ticks, 2.0, 1.0) <= 1.5
+        slow = (
+            np.sin(np.pi * rng.uniform(0.0, 1.0) * t + rng.uniform(0.0, 6.0)) * np.sin(np.pi * t / ticks) ** 2
+        )
+        assert most_given(slow, ticks, 2.0, 1.0) <= 1.0

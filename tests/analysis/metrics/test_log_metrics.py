@@ -1,4 +1,15 @@
-"""Logs of every kind: what can be said is said, and what cannot has its reason."""
+"""Logs of every kind: what can be said is said, and what cannot has its reason.
+
+Runs side by side.
+
+Effort and saturation in closed form.
+
+The stiffness that a hand feels at rest.
+
+Force sharing at rest: sum_i (pi_i / K_i) tau_i = 0.
+
+How near estimates came to the truth.
+"""
 
 import json
 import math
@@ -9,11 +20,17 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+from tests.analysis.logs import rewritten
+from trilat_net.analysis.metrics.log_metrics import (
+    compare_metrics,
+    comparison_to_json,
+    compute_log_metrics,
+    metrics_to_json,
+)
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
 
-from .written import simulated
+from .written import pair, simulated, under
 
 GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
@@ -117,3 +134,186 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
     page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
     for quantity in quantities():
         assert f"`{quantity.key}`" in page, quantity.key
+
+
+def test_row_is_largest_of_places_or_their_sum() -> None:
+    log = pair(
+        lambda site, _: {"tau": [3.0 if site == "m" else 4.0, 0.0], "q": [0.1, 0.0], "q_des": [0.0, 0.0]}
+    )
+    found = compare_metrics([log, log], ["a", "b"])
+    assert found.columns == ("a", "b")
+    assert found.row("peak_tau_nm").values == (4.0, 4.0)
+    assert found.row("effort_nm2_s").values == pytest.approx((25.0 * 4.0, 25.0 * 4.0))
+    assert found.row("max_error_rad").values == (0.1, 0.1)
+
+
+def test_what_one_site_lacks_the_whole_run_lacks() -> None:
+    """A largest value of some sites is none of the run; a site that cannot have one takes nothing away."""
+    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    torn = rewritten(log, lambda state: state.site != "m2")
+    row = compare_metrics([log, torn]).row("max_error_rad")
+    assert row.values[0] is not None
+    assert row.values[1] is None
+    assert row.entries[1].why == "m2: no records of m2"
+
+
+def test_rows_that_no_run_could_have_are_left_out() -> None:
+    free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    wall = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
+    keys = [row.quantity.key for row in compare_metrics([free]).rows]
+    assert "force_peak_n" not in keys
+    assert "late_p99_us" not in keys
+    both = compare_metrics([free, wall]).row("force_peak_n")
+    assert both.values == (None, 0.0)
+    with pytest.raises(KeyError):
+        compare_metrics([free]).row("force_peak_n")
+
+
+def test_json_has_a_value_and_a_reason_per_column() -> None:
+    free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    found = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
+    assert found["columns"] == ["log"]
+    for row in found["rows"]:
+        assert (row["values"][0] is None) == (row["unknown"][0] is not None)
+
+
+def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
+    """int (a^2 + b^2 sin^2) dt over whole periods is (a^2 + b^2 / 2) times the time."""
+    a, b = 3.0, 8.0
+    log = pair(lambda _, t_s: {"tau": [a, b * math.sin(2.0 * math.pi * t_s)]})
+    found = compute_log_metrics(log).sites["m"]
+    assert found["effort_nm2_s"].value == pytest.approx((a**2 + b**2 / 2.0) * 4.0, rel=1e-9)
+    assert found["rms_tau_nm"].value == pytest.approx(b / math.sqrt(2.0), rel=1e-9)
+    assert found["peak_tau_nm"].value == pytest.approx(b, rel=1e-9)
+    assert found["saturated_share"].value == 0.0
+
+
+def test_the_share_of_ticks_at_the_limit() -> None:
+    """200 N m is the limit of a scenario that names none; -200 is at it as well."""
+    log = pair(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
+    assert compute_log_metrics(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
+
+
+def test_chatter_is_the_mean_step_of_the_torque() -> None:
+    """A torque that changes sides every tick, and one that never does."""
+    log = pair(lambda _, t_s: {"tau": [0.5 * (-1.0) ** round(1000.0 * t_s), 3.0]})
+    assert compute_log_metrics(log).sites["m"]["chatter_nm"].value == pytest.approx(1.0, rel=1e-12)
+    still = pair(lambda _, __: {"tau": [7.0, 3.0]})
+    assert compute_log_metrics(still).sites["m"]["chatter_nm"].value == 0.0
+
+
+ANCHORED = {
+    "control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0],
+    "rate_hz": 50,
+    "duration_s": 20.0,
+    "sites.m2.hands": [],
+    "sites.m1.hands": [{"kind": "recorded", "points": [[2.0, 0.0, 0.0], [3.0, 5.0, 5.0], [60.0, 5.0, 5.0]]}],
+}
+
+
+def test_learning_gravity_is_spring_that_ties_arms_to_pose() -> None:
+    """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
+    found = compute_log_metrics(simulated("paper", ANCHORED))
+    assert [one.site for one in found.stiffness] == ["m1", "m1"]
+    second = found.stiffness[1]
+    assert second.joint == 2
+    assert second.torque_nm == pytest.approx(5.0)
+    assert second.stiffness_nm_rad == pytest.approx(3.0 * 9.81**2 * 1.2, rel=0.01)
+    # equal torques act on q1 + q2 alone: what joint 1 does is too little to tell, or very stiff
+    first = found.stiffness[0].stiffness_nm_rad
+    assert first is None or abs(first) > 10.0 * second.stiffness_nm_rad
+
+
+def test_where_something_else_moves_arm_ratio_would_be_hands_own() -> None:
+    """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
+    found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
+    assert found.static_windows.value == 2.0
+    assert found.stiffness == []
+
+
+SLOW = {"rate_hz": 50}
+
+
+def test_a_hand_feels_what_the_shares_say() -> None:
+    """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
+    found = compute_log_metrics(simulated("force_sharing", SLOW))
+    assert [pair.pushed + pair.holds for pair in found.sharing_ratios] == ["sm1", "sm2", "sm2"]
+    assert [pair.felt_nm for pair in found.sharing_ratios] == pytest.approx([4.79, 16.4, 5.0], rel=0.02)
+    assert [pair.pushed_nm for pair in found.sharing_ratios] == [pytest.approx(5.0)] * 3
+    assert [pair.joint for pair in found.sharing_ratios] == [1, 1, 1]
+    # beta = (0.444, 0.130, 0.426), Eq. (20): 1 - a23 a32, 1 - a13 a31, 1 - a12 a21
+    beta = (1.0 - 0.2 * 0.2, 1.0 - 0.9 * 0.8, 1.0 - 0.1 * 0.8)
+    expected = [pair.expected_nm.value for pair in found.sharing_ratios]
+    assert expected == pytest.approx([5.0 * beta[2] / beta[0], 5.0 * beta[2] / beta[1], 5.0], rel=1e-6)
+    assert found.run["sharing_off"].value <= 0.01
+
+
+def test_three_loaded_sites_balance() -> None:
+    """Stiffer sites count less: K_i enters, not the shares alone."""
+    settings = {"sites.m1.control.Kp": 60.0, "duration_s": 15.0, **SLOW}
+    found = compute_log_metrics(simulated("force_sharing", settings))
+    assert found.sharing_ratios[0].expected_nm.value == pytest.approx(3.0 * 4.79, rel=0.02)
+    assert found.sharing_ratios[0].off <= 0.01
+    assert found.joint_loads[0].imbalance.value <= 0.01
+
+
+def test_where_gravity_is_learnt_nothing_is_expected() -> None:
+    found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
+    assert found.sharing_ratios
+    for one in found.sharing_ratios:
+        assert one.pushed == "s"
+        assert one.by_wall
+        assert one.holds == "m1"
+        assert one.expected_nm.value is None
+        assert "gravity is learnt" in one.expected_nm.why
+        assert one.off is None
+
+
+def test_arms_that_move_share_nothing() -> None:
+    found = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
+    assert found.static_windows.value is None
+    assert found.run["sharing_off"].why == "no second in which all sites rest under torques that stand"
+
+
+LEARNS = 'control = { law = "adaptive", Gamma = [1.0, 1.0, 2.0, 0.0, 0.0] }'
+THETA = [3.0, 1.0, 1.0, 2.0, 1.0]
+
+
+def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
+    """Learnt are the first three; off by (3, 4, 12) at t = 0, and by that less rate times time later."""
+    rate = [0.1, 0.2, -0.2]
+
+    def motion(_: str, t_s: float) -> dict[str, list[float]]:
+        off = [3.0, 4.0, 12.0]
+        learnt = [THETA[n] + off[n] + rate[n] * t_s for n in range(3)]
+        return {"theta_hat": [*learnt, 7.0, 8.0]}
+
+    measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
+    found, learnt = measured.sites["s"], measured.estimates["s"]
+    assert found["theta_error_first"].value == pytest.approx(13.0)
+    assert found["theta_energy_first_j"].value == pytest.approx(0.5 * (9.0 + 16.0 + 144.0 / 2.0))
+    end_s = 6.0 - 1.0 / 200
+    last = [3.0 + 0.1 * end_s, 4.0 + 0.2 * end_s, 12.0 - 0.2 * end_s]
+    assert found["theta_error_last"].value == pytest.approx(math.hypot(*last))
+    assert found["theta_slope_per_s"].value == pytest.approx(0.3)
+    assert learnt.slope_per_s == pytest.approx([*rate, 0.0, 0.0], abs=1e-9)
+    assert learnt.learnt == [True, True, True, False, False]
+    assert learnt.theta == THETA
+
+
+def test_a_law_that_learns_nothing_says_so() -> None:
+    found = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
+    assert found.value is None
+    assert found.why == "nothing is learnt"
+    assert not found.applies
+
+
+def test_without_a_truth_estimates_are_given_and_not_judged() -> None:
+    log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
+    changes = {"sites.s.plant": "external", "sites.s.arm.known": False, "sites.s.control.theta_hat0": THETA}
+    measured = compute_log_metrics(under(log, changes))
+    assert measured.estimates["s"].theta is None
+    assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()
+    assert measured.sites["s"]["theta_error_last"].why == "theta of the arm is not known"
+    assert measured.sites["s"]["theta_slope_per_s"].value > 0.0
+    assert measured.sites["m1"]["theta_error_last"].value > 0.0

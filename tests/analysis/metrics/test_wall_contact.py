@@ -6,7 +6,7 @@ import pytest
 
 from tests.analysis.logs import rewritten
 from trilat_net.analysis.aligned import align_records
-from trilat_net.analysis.arm_rows import compute_end_effector
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.torque_sources import wall_force
 from trilat_net.core.two_link_arm import JOINTS
@@ -88,7 +88,7 @@ def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = simulated("windup", {"duration_s": 40.0, "rate_hz": 50})
     spec, track = log.scenario.sites["s"], align_records(log)["s"]
-    end_effector = compute_end_effector((spec.arm.l1_m, spec.arm.l2_m), track.q, track.qd)
+    end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
     force = wall_force(spec.environment[0].actor, track.nominal_s, end_effector)
     assert force[50 * 10] == pytest.approx(4.3, abs=0.05)
     assert force[50 * 20] == pytest.approx(8.5, abs=0.1)

@@ -19,8 +19,14 @@ from trilat_net.scenario import load_scenario
 from trilat_net.studies.bench import BenchResults, bench_plan, plan_bench, prepare_bench_folder, run_bench
 from trilat_net.studies.bench.bench_plan import (
     KNOWLEDGE,
+    LINKS,
+    SHORTER_REACH,
+    STUDIES,
+    TASKS,
+    TUNED_ROUND_TRIPS_MS,
     BenchCell,
     BenchPlan,
+    build_settings,
     choose_round_trip,
     find_stale,
     name_settings,
@@ -37,15 +43,7 @@ from trilat_net.studies.bench.bench_results import (
     encode_runs,
 )
 from trilat_net.studies.bench.bench_run import BenchRunItem, find_least_energy, run_bench_task
-from trilat_net.studies.bench.bench_tasks import (
-    LINKS,
-    SHORTER_REACH,
-    STUDIES,
-    TASKS,
-    TUNED_ROUND_TRIPS_MS,
-    build_settings,
-)
-from trilat_net.studies.record_batches import RecordBatch
+from trilat_net.studies.measure_run import RecordBatch
 from trilat_net.studies.tuning import plan_tuning
 from trilat_net.studies.tuning.candidate import CandidateClass, load_tuning_scenario, measure_candidate
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES

@@ -15,7 +15,8 @@ from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.studies.sweep import sweep_cell
 from trilat_net.studies.sweep.sweep_cell import apply_diff, diff_lines
-from trilat_net.studies.sweep.sweep_run import CellItem, build_sim_command, run_cell
+from trilat_net.studies.sweep.sweep_results import build_sim_command
+from trilat_net.studies.sweep.sweep_run import CellItem, run_cell
 
 
 @pytest.fixture

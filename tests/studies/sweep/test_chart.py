@@ -18,15 +18,13 @@ from trilat_net.studies.sweep.stability_map import (
     build_stability_map,
     evaluate_criterion,
     find_criterion_edge,
-    format_override,
-    format_override_value,
     load_place,
     panel_scenarios,
     trace_closed_form,
     trace_linear_analysis,
 )
-from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_run import SweepResults
+from trilat_net.studies.sweep.sweep_plan import format_override, format_override_value, plan_sweep
+from trilat_net.studies.sweep.sweep_results import SweepResults
 from trilat_net.theory import GrowthColumn, compute_growth_column, iterate_linear_edges
 
 from .maps import KEYS, rows

@@ -21,7 +21,7 @@ from trilat_net.studies.sweep.sweep_cell import (
     classify_end,
     is_conclusive,
 )
-from trilat_net.theory.end_pose import certify_run
+from trilat_net.theory.linear_analysis import certify_run
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),

@@ -8,7 +8,7 @@ import trilat_net
 from tests.cli.running import trilat
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
-from trilat_net.studies.sweep.sweep_run import SweepResults, read_results
+from trilat_net.studies.sweep.sweep_results import SweepResults, read_results
 
 KEYS = ["settle_s", "spread_rms_rad", "peak_tau_nm"]
 AXIS = {"link.delay_ms": [20, 200]}

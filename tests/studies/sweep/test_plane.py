@@ -16,10 +16,9 @@ from trilat_net.studies.sweep.stability_map import (
     StableInterval,
     build_plane,
     find_map_edges,
-    label_axis,
-    label_setting,
 )
 from trilat_net.studies.sweep.sweep_cell import CellClass
+from trilat_net.studies.sweep.sweep_plan import label_axis, label_setting
 
 from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 

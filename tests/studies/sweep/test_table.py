@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from trilat_net.errors import UsageError
+from trilat_net.studies.intervals import wilson_interval
 from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, read_results, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_run import (
+from trilat_net.studies.sweep.sweep_results import (
     GRID_POINTS_FILE,
     GridPoint,
     build_result_rows,
@@ -21,7 +22,6 @@ from trilat_net.studies.sweep.sweep_run import (
     encode_results,
     reproduction_duration_s,
     require_polars,
-    wilson_interval,
 )
 
 from .quick import DELAYS, Judge, asked, outcome_of

@@ -8,8 +8,8 @@ from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.law_consent import allow_own_laws
-from trilat_net.studies.measure_run import LinkAge, RunMetrics
-from trilat_net.studies.trials import ExpectationResult, Trial, TrialResult
+from trilat_net.studies.measure_run import ExpectationResult, LinkAge, RunMetrics
+from trilat_net.studies.trials import Trial, TrialResult
 
 QUICK = """
 name = "quick"

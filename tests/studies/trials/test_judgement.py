@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.expect import ExpectWindow
-from trilat_net.studies.measure_run import Range, measure_virtual_run
-from trilat_net.studies.trials import ExpectationResult, evaluate_expectations
+from trilat_net.studies.measure_run import (
+    ExpectationResult,
+    Range,
+    evaluate_expectations,
+    measure_virtual_run,
+)
 
 from .results import CALM, figures
 

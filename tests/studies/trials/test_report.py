@@ -5,13 +5,8 @@ import xml.etree.ElementTree as Xml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.studies.trials import (
-    MAX_FAILURES_SHOWN,
-    ExpectationResult,
-    TrialReport,
-    encode_junit_xml,
-    format_margin,
-)
+from trilat_net.studies.measure_run import ExpectationResult
+from trilat_net.studies.trials import MAX_FAILURES_SHOWN, TrialReport, encode_junit_xml, format_margin
 
 from .results import result
 

@@ -16,8 +16,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory, align_records, view_delayed_peer
-from ..dominance_history import DominanceHistory, trace_dominance
-from ..lyapunov_weights import compute_lyapunov_weights
+from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
 from ..torque_sources import split_torque
 from . import energy_terms
 from .energy_terms import FunctionalParts, Increment, SiteMotion
@@ -108,7 +107,6 @@ class SiteEnergy:
 
 
 def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
-    """Returns the sum of all judged amounts before each row, from 0 on."""
     counted = amounts if judged is None else np.where(judged, amounts, 0.0)
     return np.concatenate([[0.0], np.cumsum(counted)])
 

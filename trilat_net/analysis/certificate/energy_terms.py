@@ -302,7 +302,6 @@ class Increment(NamedTuple):
 
 
 def _trapezoid(site: SiteMotion, left: Array, right: Array, jump: Array | None = None) -> Increment:
-    """Returns the integral of a power, W, over every period by the trapezoid rule."""
     half_s = 0.5 * site.records.h_s
     return Increment(half_s * left, half_s * right, np.zeros(len(left)) if jump is None else jump)
 
@@ -523,7 +522,6 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    """Returns tau of Eq. (13) and Y'r at the end of every period, before its jump, K - 1 rows each."""
     at, c, ends = site.records, site.constants, site.ends
     tau, Yr = at.tau[1:].copy(), site.Yr[1:].copy()
     e = 2.0 * ends.e_middle - at.e[1:]

@@ -232,7 +232,6 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
 
 
 def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
-    """Returns the verdict on the books of all sites."""
     curves = list(_find_curves(log, books))
     least = []
     for one in curves:
@@ -259,7 +258,6 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
 
 
 def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> list[Premise]:
-    """Returns what the verdict rests on: the books add up, torques are not cut off, sampling leaks little."""
     residual = {site: float(np.abs(own.residual).max()) for site, own in books.items()}
     site = max(residual, key=residual.__getitem__)
     text = f"the law of {site} adds up to {residual[site]:.1e} J of {scale:.4g} J, the others closer"

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...log.accounting import Coverage
-from ...log.log_reader import Log, judge_integrity
+from ...log.log_reader import Log
 from ...log.running_digest import Integrity
+from ...log.session_check import judge_integrity
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
-from ..dominance_history import list_losses
+from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses
 from ..following import TaskFollowing
-from ..lyapunov_weights import compute_lyapunov_weights, find_closed_groups, find_kd_scales
 from ..timeline import find_mode_intervals, recorded_end_s
 from ..torque_sources import find_wall_energies, list_sampled_walls
 from .energy_balance import (

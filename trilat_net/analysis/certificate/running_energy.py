@@ -24,8 +24,13 @@ from ..aligned import (
     PeerTrajectory,
     find_unlimited,
 )
-from ..dominance_history import DominanceHistory, evaluate_ramps, forget_ramps, list_scripted_ramps
-from ..lyapunov_weights import find_closed_groups
+from ..dominance_history import (
+    DominanceHistory,
+    evaluate_ramps,
+    find_closed_groups,
+    forget_ramps,
+    list_scripted_ramps,
+)
 from .energy_balance import (
     compute_energy_balance,
     derive_site_energies,
@@ -94,7 +99,6 @@ class RecordWindow:
         return True
 
     def _move(self, first: int) -> None:
-        """Forgets the records before a tick."""
         left = max(0, self.newest + 1 - first)
         for column in (self._floats, self._used, self._known, self._follows, self._rests):
             column[:left] = column[first - self.first :][:left].copy()

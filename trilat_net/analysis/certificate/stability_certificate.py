@@ -180,7 +180,6 @@ class Certificate(Result):
 
     @property
     def _by_twins(self) -> TwinVerdict:
-        """The judgement of the end of the run and of its twins together."""
         if self.twins is None:
             return TwinVerdict(self.end.stability)
         known = {"stable": True, "unstable": False}
@@ -324,7 +323,6 @@ def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVer
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns whether V rose beyond what operator and environment gave, in the theorem or outside of it."""
     balance, sources = run.balance, list(run.balance.external)
     failed = [premise.name for premise in premises if premise.holds is False]
     outside = f"outside the theorem ({', '.join(failed)})"

@@ -137,7 +137,6 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 
 
 def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
-    """Returns what is wanted of every place, by kind and name."""
     found: dict[str, dict[str, MetricValues]] = {
         of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
     }
@@ -228,7 +227,6 @@ def metrics_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
-    """Returns what is no single number: loads, force sharing, stiffness, responses."""
 
     def units(one: ImpedanceEstimate) -> str:
         return metrics.unit(one.unit, one.joint)
@@ -260,7 +258,6 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
-    """Returns an entry of a joint as that of an axis: with its name, and keys that end in other units."""
     number = entry.pop("joint")
     endings = (("_nm_rad", "_n_m"), ("_nm", "_n"), ("_rad", "_m")) if number <= PLACE else ()
     renamed = {}
@@ -279,7 +276,6 @@ def _value_and_why(key: str, one: Metric) -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
-    """Returns a value with null for every number that is not finite, as of logs that left the physics."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

@@ -168,7 +168,6 @@ def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
 
 
 def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Iterator[ImpedanceEstimate]:
-    """Yields the impedance at a site's operator, or, with a site of a wall, the reflection from there."""
     records, by_source, _ = runs[site]
     script, usable = by_source.script, _find_still_rows(runs, site, alone=not wall)
     rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)

@@ -19,7 +19,7 @@ from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ..aligned import find_latest_rows
 from ..arm_rows import build_arm_rows
-from ..lyapunov_weights import find_closed_groups, left_perron_vector
+from ..dominance_history import find_closed_groups, left_perron_vector
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
 from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric

@@ -69,7 +69,6 @@ ROS2_SCHEMAS: dict[str, bytes] = {
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
-    """Packs unsigned numbers of 32 bits and strings, from an offset on."""
     data = b""
     for value in values:
         text = value.encode() + b"\0" if isinstance(value, str) else b""

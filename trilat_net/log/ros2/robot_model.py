@@ -68,7 +68,6 @@ def find_quaternion(turn: Vector) -> Quaternion:
 
 
 def _upright(down: Sequence[float]) -> Quaternion:
-    """Returns the shortest rotation that takes a direction to straight down, (0, 0, -1)."""
     size = math.hypot(*down)
     x, y, z = (each / size for each in down)
     if z > 1.0 - 1e-12:
@@ -152,7 +151,6 @@ def build_robot_model(scenario: Scenario, site: str) -> RobotModel | None:
 
 
 def _turned(rpy: Sequence[float]) -> Quaternion:
-    """Returns the rotation by angles about the fixed axes x, y, z, in this order."""
     roll, pitch, yaw = rpy
     turned = multiply_quaternions(_about((0.0, 0.0, 1.0), yaw), _about((0.0, 1.0, 0.0), pitch))
     return multiply_quaternions(turned, _about((1.0, 0.0, 0.0), roll))
@@ -202,7 +200,6 @@ def _describe(root: Element, site: str, number: int) -> str:
 
 
 def _add_shape(link: Element, to: Vector, colour: str, site: str) -> None:
-    """Adds a rod from a link's origin to a joint that it carries, or a ball where both are at one place."""
     visual = ElementTree.SubElement(link, "visual")
     length = math.hypot(*to)
     middle = " ".join(f"{x / 2.0:.9g}" for x in to)

@@ -54,7 +54,6 @@ class _BucketOutput:
         self._waiting: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Takes a closed bucket: two rows, or one."""
         self.flush(log_ns)
         self._write(*rows[0], log_ns)
         self._waiting = rows[1:]
@@ -125,7 +124,6 @@ class _SiteBuckets:
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def record(self, message: ros2_messages.Record, log_ns: int) -> None:
-        """Takes the record of one tick."""
         tick = message.tick
         if tick < self._first:  # its bucket is closed: with others of that bucket it waits for the next close
             length = 2 * self._half
@@ -147,13 +145,11 @@ class _SiteBuckets:
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes all that is open."""
         self._close(self._bucket + 2 * self._ratio, log_ns)
         self._fast.flush(log_ns)
         self._slow.flush(log_ns)
 
     def _close(self, bucket: int, log_ns: int) -> None:
-        """Closes the open bucket, and begins another."""
         self._flush_late(log_ns)
         if self._open:
             rows = self._decimate(self._open)
@@ -177,7 +173,6 @@ class _SiteBuckets:
             self._late = []
 
     def _decimate(self, records: list[ros2_messages.Record]) -> list[StampedRow]:
-        """Returns the extremes of a bucket: two rows, or one of a single record."""
         records.sort(key=_tick)  # they nearly always are
         stamps_ns = [
             max(0, self._epoch_unix_ns + record.tick * NS_PER_S // self._rate_hz)
@@ -243,7 +238,6 @@ class VizChannels:
             self.takers[topics.key(session, site, topics.LINK)] = buckets.statistics
 
     def _event(self, event: Event, log_ns: int) -> None:
-        """Writes an event with its time of arrival: events sent at once may arrive in another order."""
         stamp_ns = max(0, self._epoch_unix_ns + event.t_ns) if event.t_ns >= 0 else log_ns
         for name, data in ros2_messages.pack_event(event, stamp_ns):
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)

@@ -8,7 +8,6 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,13 +38,8 @@ _TF = "/tf"
 _EVERY = 1000
 """Records between two reports of progress."""
 
-
-class _TimedMessages(NamedTuple):
-    """Messages of one publish time, by topic."""
-
-    log_ns: int
-    publish_ns: int
-    messages: list[tuple[str, bytes]]
+TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
+"""Messages of one publish time, by topic: the log time and the publish time, ns, before them."""
 
 
 def export_ros2(log: Log, path: Path, written: Written = lambda _: None) -> None:
@@ -87,7 +81,6 @@ class _BagChannels:
         self._channels: dict[str, int] = {}
 
     def channel(self, topic: str) -> int:
-        """Returns the number of a channel."""
         if topic not in self._channels:
             kind, about = self._known[topic]
             if kind not in self._schemas:
@@ -122,7 +115,7 @@ class _SiteMessages:
     def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
         return [(part if part == _TF else f"/{self._name}/{part}", data) for part, data in messages]
 
-    def records(self) -> Iterator[_TimedMessages]:
+    def records(self) -> Iterator[TimedMessages]:
         """Yields its records in the order of arrival."""
         part = self._log[self._name]
         log_ns, publish_ns = part.log_time_ns.tolist(), part.publish_time_ns.tolist()
@@ -142,24 +135,24 @@ class _SiteMessages:
                 if count == 1:
                     messages.append((ros2_messages.ROBOT, pack_string(robot.description)))
                 messages.append((_TF, robot.pack(stamp_ns, state.q)))
-            yield _TimedMessages(log_ns[at], publish_ns[at], self._named(messages))
+            yield log_ns[at], publish_ns[at], self._named(messages)
             if not count % _EVERY or count == len(part):
                 self._progress((count - 1) % _EVERY + 1)
 
-    def statistics(self) -> Iterator[_TimedMessages]:
+    def statistics(self) -> Iterator[TimedMessages]:
         """Yields its statistics in the order of arrival."""
         timed = self._log.timed_link_stats(self._name)
         rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
         for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
-            yield _TimedMessages(log_ns, publish_ns, self._named(self._shapes.statistics(stats)))
+            yield log_ns, publish_ns, self._named(self._shapes.statistics(stats))
 
 
-def _events(log: Log) -> Iterator[_TimedMessages]:
+def _events(log: Log) -> Iterator[TimedMessages]:
     timed = log.timed_events()
     rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:
         messages = [(f"/{topic}", data) for topic, data in ros2_messages.pack_event(event, publish_ns)]
-        yield _TimedMessages(log_ns, publish_ns, messages)
+        yield log_ns, publish_ns, messages
 
 
 FORMAT = ExportFormat(export_ros2, "-ros2.mcap")

@@ -10,8 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis.delivery import count_sent, predict_delivery, read_arrivals
-from ...analysis.link_summary import has_one_constant_delay, sample_ages_ns
+from ...analysis.link_summary import (
+    count_sent,
+    has_one_constant_delay,
+    predict_delivery,
+    read_arrivals,
+    sample_ages_ns,
+)
 from ...analysis.site_signals import sample_ages_ms
 from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
 from ...core.vectors import Array

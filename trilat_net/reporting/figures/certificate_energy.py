@@ -54,7 +54,10 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
     with style.time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
         rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
         _draw_functional_of_sites(log, certificate, balance, rows[0])
-        _draw_parts(balance, rows[1], form)
+        for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
+            _draw(balance, rows[1], values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
+        rows[1].set_ylabel("parts of V (J)")
+        _add_panel_legend(rows[1], form)
         _draw_work(balance, rows[2], form)
         _draw_residual(balance, rows[3], form)
         for axes in rows:
@@ -133,13 +136,6 @@ def _draw_functional_of_sites(log: Log, certificate: Certificate, balance: Energ
         _draw(balance, axes, values, **style.site_line(log, site, 1.0))
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
-
-
-def _draw_parts(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None:
-    for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
-        _draw(balance, axes, values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
-    axes.set_ylabel("parts of V (J)")
-    _add_panel_legend(axes, form)
 
 
 def _add_panel_legend(axes: Axes, form: FigureSize) -> None:

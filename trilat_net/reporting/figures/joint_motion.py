@@ -54,7 +54,6 @@ def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _explain_no_twin(log: Log) -> str:
-    """Returns why there is no run without operators, which runs the laws of the log."""
     withheld = (str(law) for law in find_user_laws(log.scenario) if not law.allowed)
     return next(withheld, "") if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
 
@@ -93,7 +92,6 @@ def _draw_joints(
     label: str,
     limits: Sequence[Array] = (),
 ) -> Figure:
-    """Returns a signal over time: a panel per joint, a line per site, dashed ones at its limits."""
     count = len(style.name_joints(log))
     rows = len(style.arrange_joints(count, form.narrow))
     with style.time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
@@ -288,7 +286,6 @@ def draw_parameter_estimates(
 
 
 def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Figure:
-    """Returns the estimates of chains: a panel per parameter, with its smallest and largest number."""
     arm = max((log.scenario.arms[site] for site in sites), key=lambda each: each.counts.joints)
     columns = LINK_PARAMETERS // (2 if form.narrow else 1)
     rows = len(arm.theta) // columns

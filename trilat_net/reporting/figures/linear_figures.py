@@ -18,7 +18,7 @@ from ...theory.delay_margin import MAX_COMMON_DELAY_S
 from ...theory.frequency_search import Minima
 from ...theory.linear_analysis import LinearAnalysis
 from ...theory.port_analysis import PortAnalysis
-from ...theory.port_transparency import Transparency
+from ...theory.port_response import Transparency
 from .. import style
 from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 
@@ -236,7 +236,6 @@ def _plot_case(axes: Axes, at: float, row: Mapping[str, Any], number: int) -> No
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
-    """Draws the period, for how long samples are held, and the ends of stability, with words beside them."""
     needs = facts["needs"]
     bounds = [("one period", 1e3 / needs["rate_hz"], "center"), ("held by links", needs["held_ms"], "top")]
     ages = [one["age_ms"] for one in facts["transports"] if one["age_ms"] is not None]

@@ -17,7 +17,7 @@ from ...analysis.timeline import recorded_end_s
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
-from ...theory.end_pose import certify_run
+from ...theory.linear_analysis import certify_run
 from .. import style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws
@@ -138,7 +138,6 @@ def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
 
 
 def _describe(log: Log, form: FigureSize) -> str:
-    """Returns the run's title and how it ended."""
     last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
     when = "not settled" if last is None else f"settled at {last:.1f} s"
     words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"

@@ -20,7 +20,7 @@ from ...analysis.run_end import classify_log_end
 from ...analysis.twin_growth import MOST_LOG, PushedTwins, PushGrowth, measure_amplitude, measure_twins
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
-from ...execution.log_inputs import explain_no_repetition
+from ...execution.fused import explain_no_repetition
 from ...execution.twins import SMALLEST, TwinPath
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
@@ -98,7 +98,6 @@ def _list_lines(found: PushedTwins) -> Iterator[_Line]:
 
 
 def _trace(path: TwinPath, joints: list[int], to_s: float, step: int) -> tuple[Array, Array]:
-    """Returns times and amplitudes, the largest of so many intervals, with gaps at new pushes."""
     amplitude, end = measure_amplitude(path, joints), int(np.searchsorted(path.t_s, to_s))
     t_s, values = np.zeros(0), np.zeros(0)
     for first, last in pairwise([*path.pushed, max(end, path.pushed[-1] + 1)]):
@@ -109,7 +108,6 @@ def _trace(path: TwinPath, joints: list[int], to_s: float, step: int) -> tuple[A
 
 
 def _draw_rate(axes: Axes, found: PushedTwins, one: PushGrowth, t_s: Array, values: Array) -> None:
-    """Draws the fitted rate of a push as a dashed line above its values, with its words."""
     end_s = found.growth.to_s if one.ended_s is None else one.ended_s
     from_s = found.growth.from_s if one.ended_s is None else 0.5 * (found.at_s + end_s)
     rows = (t_s >= from_s) & (t_s <= end_s) & (values > 0.0)

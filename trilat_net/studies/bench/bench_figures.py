@@ -62,7 +62,6 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
 
 
 def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
-    """Returns the laws that ran in a task."""
     return [one for one in results.plan.laws if any(results.of(task, one[0]))]
 
 
@@ -85,7 +84,6 @@ def _number(place: BenchPlace, quantity: str) -> float:
 
 
 def _mark(axes: Axes, results: BenchResults, task: str, links: list[str]) -> None:
-    """Names the rows of a panel, and marks where a run is open or not stable."""
     rows = _rows(results, task)
     axes.set_yticks(range(len(rows)), [name_law(*one) for one in rows], fontsize=_TEXT_PT)
     axes.grid(visible=False)

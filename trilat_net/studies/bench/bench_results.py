@@ -13,12 +13,10 @@ import msgspec
 import numpy as np
 
 from ...analysis.run_end import EndBehaviour, Stability
-from ...reporting.result_text import Block
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ..intervals import MeanInterval, mean_interval, wilson_interval
-from .bench_plan import BenchCell, BenchPlan, explain_no_cell
-from .bench_tasks import STUDIES, TASKS
+from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
 """A mean force of the wall below this, at the end, is no contact, N."""

@@ -28,12 +28,11 @@ from ...files import make_results_folder, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..record_batches import RecordBatch, run_whole
+from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
-from .bench_plan import BenchCell, BenchPlan, name_settings
+from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, name_settings
 from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
-from .bench_tasks import SHORTER_REACH, TASKS
 
 SLAVE, USER = "s", "m1"
 BOUND_RAD_S = 5.0
@@ -85,7 +84,6 @@ def run_bench_task(task: BenchRunItem) -> BenchRun:
 
 
 def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
-    """Makes a run of so many seconds and its twins, and judges both."""
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
     (records, end), growth = run_whole(scenario), TwinGrowth("none were asked for")
     if end.diverged_at_s is None and twins:
@@ -188,7 +186,6 @@ def _find_push(judged: _JudgedRun) -> tuple[float, float]:
 
 
 def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
-    """Returns the RMS over ticks and joints of q_s - sum_j alpha_sj q_j."""
     peers, own = scenario.peers(SLAVE), records[SLAVE]
     start = np.array([scenario.dominance[SLAVE].get(peer, 0.0) for peer in peers])
     changes = [change for change in scenario.timeline if change.dominance == SLAVE]

@@ -14,14 +14,8 @@ one. `on="tcp://SCHEDULER:8786"` runs the cells on a Dask cluster.
 """
 
 from .sweep_plan import SweepPlan, plan_sweep
-from .sweep_run import (
-    FinishedSweep,
-    SweepResults,
-    open_sweep_folder,
-    prepare_sweep_folder,
-    read_results,
-    run_sweep,
-)
+from .sweep_results import SweepResults, read_results
+from .sweep_run import FinishedSweep, open_sweep_folder, prepare_sweep_folder, run_sweep
 
 __all__ = [
     "FinishedSweep",

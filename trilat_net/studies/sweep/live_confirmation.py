@@ -14,11 +14,11 @@ import numpy as np
 from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from ...scenario import Scenario, parse_scenario
-from .stability_map import label_axis
 from .sweep_cell import CellClass, classify_end
-from .sweep_run import ResultRow
+from .sweep_plan import label_axis
+from .sweep_results import ResultRow
 
 MAX_SESSION_S = 60.0
 """A live session lasts as long as the cell ran: longer ones are passed over, s."""
@@ -132,7 +132,6 @@ GridIndex = tuple[Any, ...]
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    """Returns rows by the numbers of their values along the axes, then law and seed."""
     values = [sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one)) for key in axes]
     numbers = [{value: n for n, value in enumerate(some)} for some in values]
 

@@ -27,7 +27,7 @@ from ...core.vectors import Array
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import COLUMN_IN, FigureSize, make_print_size
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from .stability_map import (
     CELL_CLASSES,
     MapLine,
@@ -116,7 +116,6 @@ def _columns(panels: int, form: FigureSize) -> int:
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    """Draws one panel: cells, hatches, lines."""
     x, y = _bounds(plane.x), _bounds(plane.y)
     axes.grid(visible=False)
     axes.set_facecolor("#f4f4f4")  # where nothing has run
@@ -141,7 +140,6 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
 
 def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
-    """Draws where a line is zero, out to the borders of the outermost cells."""
     x, y = (np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y))
     spare = _extended(_extended(line.spare, y).T, x).T
     inside = [np.diff(one, append=np.inf) > 0.0 for one in (y, x)]  # a border at zero is a place itself
@@ -172,7 +170,6 @@ def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
 
 
 def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
-    """Hatches cells, neighbours in a row as one, so that the hatch is continuous."""
     for i, row in enumerate(where):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
         for start, end in zip(edges[::2], edges[1::2], strict=True):
@@ -247,7 +244,6 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
-    """Draws the legend above the panels: the classes that occur, then the lines."""
     counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
     handles: list[Any] = []
     if plane.judged_by_twins:
@@ -354,7 +350,6 @@ def _format_edge(edge: StableInterval) -> str:
 
 
 def _compare_with_line(edge: StableInterval, values: Sequence[float]) -> list[str]:
-    """Returns which of the values where a line crosses is next to an edge, and how far that is from it."""
     if not values:
         return ["-", "-"]
     value = min(values, key=lambda one: abs(one - edge.middle))

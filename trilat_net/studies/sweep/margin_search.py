@@ -19,23 +19,22 @@ import numpy as np
 
 from ...errors import ScenarioError, UsageError
 from ...files import write_whole
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import TextTable
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.law_consent import list_imported_laws
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
-from .stability_map import (
-    StableInterval,
+from .stability_map import StableInterval, evaluate_criterion, find_criterion_edge
+from .sweep_plan import (
+    SweepCell,
+    SweepPlan,
     build_sweep_command,
-    evaluate_criterion,
-    find_criterion_edge,
     format_override,
     format_override_value,
     label_axis,
 )
-from .sweep_plan import SweepCell, SweepPlan
 
 SCAN_POINTS = 9
 """Values of the scan: islands that are wider than an eighth of the range are seen."""
@@ -97,7 +96,6 @@ def search_key_margin(
 
 
 def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool) -> StableInterval:
-    """Returns an edge between two values that were decided and differ, narrowed from both sides."""
     first, last = ask(low), ask(high)
     low, above = _halved(lambda value: ask(value) is first, low, high, tolerance, whole)
     sharp = ask(above) is not None
@@ -111,7 +109,6 @@ def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, who
 def _halved(
     holds: Callable[[float], bool], low: float, high: float, tolerance: float, whole: bool
 ) -> tuple[float, float]:
-    """Returns the last value at which something holds and the first at which it does not, by bisection."""
     for _ in range(_MOST):
         if high - low <= (1.0 if whole else tolerance * max(abs(low), abs(high))):
             break
@@ -342,7 +339,6 @@ class SweepMargins(Result):
 
 
 def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
-    """Returns where an edge lies and which side is stable, or why there is none."""
     if span is None:
         words = {True: "none: all stable", False: "none: nothing stable", None: "none: nothing decided"}
         return [words[margin.stable], "-"]
@@ -352,7 +348,6 @@ def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
 
 
 def _theory_cells(span: StableInterval | None, value: float | None) -> list[str]:
-    """Returns what theory says, and how far that is from the middle of the edge."""
     if value is None:
         return ["-", "-"]
     difference = "-" if span is None else f"{100.0 * (value / span.middle - 1.0):+.2f} %"

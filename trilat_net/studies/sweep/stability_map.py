@@ -34,80 +34,9 @@ from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
 from ...theory import GrowthColumn, compute_growth_column
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..study_folder import format_command, set_options
 from .sweep_cell import CellClass
-from .sweep_plan import SweepPlan
-from .sweep_run import SweepResults
-
-_UNITS = {
-    "_nm_s_rad": "N m s/rad",
-    "_nm_rad": "N m/rad",
-    "_n_s_m": "N s/m",
-    "_kg_m2": "kg m²",
-    "_n_m": "N/m",
-    "_m_s2": "m/s²",
-    "_rad_s": "rad/s",
-    "_rad": "rad",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_nm": "N m",
-    "_kg": "kg",
-    "_m": "m",
-    "_s": "s",
-}
-"""The longest that a key ends in counts."""
-_GAINS = {"K": "N m/rad", "d": "N m s/rad", "Kp": "N m s/rad", "Kd": "N m s/rad", "Lambda": "1/s"}
-
-
-def label_axis(key: str, scenario: Scenario | None = None) -> str:
-    """Returns the label of an axis, as "delay (ms)" for link.delay_ms."""
-    words, unit = describe_key(key, scenario)
-    return f"{words} ({unit})" if unit else words
-
-
-def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a key with its value, as "delay 200 ms" for link.delay_ms = 200."""
-    words, unit = describe_key(key, scenario)
-    if isinstance(value, bool):
-        value = str(value).lower()
-    number = f"{value:g}" if is_number(value) else str(value).replace("_", " ")
-    return " ".join(word for word in (words, number, unit) if word)
-
-
-def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
-    """Returns what a key sets, in words, and its unit, "" where it has none."""
-    *folders, last = key.split(".")
-    number = ""
-    if last.isdigit() and folders:  # one of several joints or parameters
-        *folders, last, number = *folders, f"[{last}]"
-    endings = [ending for ending in _UNITS if last.endswith(ending)]
-    ending = max(endings, key=len, default="")
-    unit = _GAINS.get(last) or _UNITS.get(ending, "")
-    word = last.removesuffix(ending)
-    if last not in _GAINS and (unit or len(word) > 3):
-        word = word.replace("_", " ")
-    return f"{word}{number}{_describe_owner(folders, scenario)}", unit
-
-
-def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
-    """Returns whose key it is, in words; "" for a group's."""
-    match folders:
-        case ["sites", site, ("hands" | "environment") as group, number]:
-            kind = "hand" if group == "hands" else "environment"
-            if scenario is not None and site in scenario.sites and number.isdigit():
-                some = getattr(scenario.sites[site], group)
-                if int(number) < len(some):
-                    kind = str(some[int(number)].__struct_config__.tag).replace("_", " ")
-            return f", {kind} of {site}"
-        case ["sites", site, *_]:
-            return f" of {site}"
-        case ["links", link, *_]:
-            return f" {link}"
-        case ["dominance", site]:
-            return f"'s share in {site}"
-        case _:
-            return ""
-
+from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
+from .sweep_results import SweepResults
 
 RunCounts = NDArray[np.int64]
 
@@ -247,7 +176,6 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
 
 
 def _title(settings: Sequence[tuple[str, Any]], scenario: Scenario) -> str:
-    """Returns a panel's title: words stand for themselves, numbers with what they are."""
     words = []
     for key, value in settings:
         spaced = value.replace("_", " ") if isinstance(value, str) and key != "law" else value
@@ -369,7 +297,6 @@ def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
 
 
 def _find_asked_share(least: float, ticks: int) -> float:
-    """Returns the share of K T that d must exceed, of reversible shares with that least eigenvalue."""
     phi, w, lag = _tick_angles(ticks)
     asked = [
         (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks) for a in (least, 1.0)
@@ -519,7 +446,6 @@ def trace_linear_analysis(columns: Sequence[GrowthColumn], y: PlaneAxis) -> tupl
 
 
 def _changes(spare: Sequence[float]) -> list[int]:
-    """Returns the places of a column after which it changes between stable and not."""
     pairs = enumerate(pairwise(spare))
     return [n for n, (a, b) in pairs if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)]
 
@@ -630,30 +556,3 @@ def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> Scenari
 def load_place(plan: SweepPlan, fixed: Sequence[str], x: str, y: str, right: float, up: float) -> Scenario:
     """Returns the scenario of a place, of a cell or between some, along the keys x and y."""
     return plan.scenario(*fixed, format_override(x, right), format_override(y, up))
-
-
-def build_sweep_command(plan: SweepPlan, *more: str) -> str:
-    """Returns the command that makes a sweep."""
-    words = set_options(plan.overrides)
-    words += [word for one in plan.axes for word in ("--over", one.asked)]
-    own, count = plan.base.seed, len(plan.seeds)
-    if plan.seeds == tuple(range(own, own + count)):
-        words += ["--seeds", str(count)] if count > 1 else []
-    else:
-        words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
-    words += ["--law", ",".join(plan.laws)] if plan.laws else []
-    words += ["--judge", plan.judge] if plan.judge != "verdict" else []
-    words += [word for key in plan.metrics for word in ("--metric", key)]
-    if plan.longest_s != plan.default_longest_s:
-        words += ["--longest", format_override_value(plan.longest_s)]
-    return format_command("sweep", plan.written.called, *words, *more)
-
-
-def format_override(key: str, value: Any) -> str:
-    """Returns an override that sets a value: a whole number as one, a word as it is."""
-    return f"{key}={format_override_value(value) if is_number(value) else value}"
-
-
-def format_override_value(value: float) -> str:
-    """Returns a number as an override's text, which reads as just that number; whole ones without a point."""
-    return repr(value).removesuffix(".0")

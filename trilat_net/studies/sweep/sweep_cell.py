@@ -206,13 +206,11 @@ def is_conclusive(outcome: CellResult) -> bool:
 
 
 def _pronounced(outcome: CellResult) -> bool:
-    """True where over the second half the largest speed doubled, or that and the largest error halved."""
     error, speed = _changes(outcome)
     return speed >= math.log(2.0) or max(error, speed) <= -math.log(2.0)
 
 
 def _changes(outcome: CellResult) -> tuple[float, float]:
-    """Returns by how much the logarithms of the largest |e| and |qd| change over the second half."""
     half_s = 0.5 * outcome.ran_s
     return half_s * (outcome.error_rate_per_s or 0.0), half_s * (outcome.speed_rate_per_s or 0.0)
 

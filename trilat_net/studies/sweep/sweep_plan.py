@@ -24,7 +24,7 @@ from ...scenario.imported_law import name_law_classes
 from ...scenario.law_consent import allow_own_laws
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
-from ..study_folder import format_toml_value
+from ..study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")
@@ -154,7 +154,6 @@ def _listed(key: str, text: str) -> tuple[str, ...]:
 
 
 def _split(text: str, mark: str) -> list[str]:
-    """Returns the parts between marks that stand in no bracket and in no quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:
@@ -170,7 +169,6 @@ def _split(text: str, mark: str) -> list[str]:
 
 
 def _read(text: str) -> Any:
-    """Returns the value of an override's text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -392,7 +390,6 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
 def _law_overrides(
     written: ExperimentText, overrides: Sequence[str], base: Scenario, law: str
 ) -> tuple[str, ...]:
-    """Returns what puts a law into force at every site."""
     ours = [name for name in LAWS if name != "own"]
     if law not in ours and ":" not in law:
         hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
@@ -406,7 +403,6 @@ def _law_overrides(
 
 
 def _refuse_unfit(plan: SweepPlan, law: int) -> None:
-    """Refuses an axis with a value that makes no scenario or no difference, and corners that cannot run."""
     origin = [law] + [0] * len(plan.axes)
     for n, one in enumerate(plan.axes, 1):
         seen: dict[str, str] = {}
@@ -445,3 +441,102 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
         raise ScenarioError(problem, path=error.path, source=plan.written.called) from None
     return scenario
+
+
+_UNITS = {
+    "_nm_s_rad": "N m s/rad",
+    "_nm_rad": "N m/rad",
+    "_n_s_m": "N s/m",
+    "_kg_m2": "kg m²",
+    "_n_m": "N/m",
+    "_m_s2": "m/s²",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_ms": "ms",
+    "_hz": "Hz",
+    "_nm": "N m",
+    "_kg": "kg",
+    "_m": "m",
+    "_s": "s",
+}
+"""The longest that a key ends in counts."""
+
+
+_GAINS = {"K": "N m/rad", "d": "N m s/rad", "Kp": "N m s/rad", "Kd": "N m s/rad", "Lambda": "1/s"}
+
+
+def label_axis(key: str, scenario: Scenario | None = None) -> str:
+    """Returns the label of an axis, as "delay (ms)" for link.delay_ms."""
+    words, unit = describe_key(key, scenario)
+    return f"{words} ({unit})" if unit else words
+
+
+def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
+    """Returns a key with its value, as "delay 200 ms" for link.delay_ms = 200."""
+    words, unit = describe_key(key, scenario)
+    if isinstance(value, bool):
+        value = str(value).lower()
+    number = f"{value:g}" if is_number(value) else str(value).replace("_", " ")
+    return " ".join(word for word in (words, number, unit) if word)
+
+
+def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
+    """Returns what a key sets, in words, and its unit, "" where it has none."""
+    *folders, last = key.split(".")
+    number = ""
+    if last.isdigit() and folders:  # one of several joints or parameters
+        *folders, last, number = *folders, f"[{last}]"
+    endings = [ending for ending in _UNITS if last.endswith(ending)]
+    ending = max(endings, key=len, default="")
+    unit = _GAINS.get(last) or _UNITS.get(ending, "")
+    word = last.removesuffix(ending)
+    if last not in _GAINS and (unit or len(word) > 3):
+        word = word.replace("_", " ")
+    return f"{word}{number}{_describe_owner(folders, scenario)}", unit
+
+
+def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
+    """Returns whose key it is, in words; "" for a group's."""
+    match folders:
+        case ["sites", site, ("hands" | "environment") as group, number]:
+            kind = "hand" if group == "hands" else "environment"
+            if scenario is not None and site in scenario.sites and number.isdigit():
+                some = getattr(scenario.sites[site], group)
+                if int(number) < len(some):
+                    kind = str(some[int(number)].__struct_config__.tag).replace("_", " ")
+            return f", {kind} of {site}"
+        case ["sites", site, *_]:
+            return f" of {site}"
+        case ["links", link, *_]:
+            return f" {link}"
+        case ["dominance", site]:
+            return f"'s share in {site}"
+        case _:
+            return ""
+
+
+def build_sweep_command(plan: SweepPlan, *more: str) -> str:
+    """Returns the command that makes a sweep."""
+    words = set_options(plan.overrides)
+    words += [word for one in plan.axes for word in ("--over", one.asked)]
+    own, count = plan.base.seed, len(plan.seeds)
+    if plan.seeds == tuple(range(own, own + count)):
+        words += ["--seeds", str(count)] if count > 1 else []
+    else:
+        words += ["--seeds", ",".join(map(str, plan.seeds)) + ("," if count == 1 else "")]
+    words += ["--law", ",".join(plan.laws)] if plan.laws else []
+    words += ["--judge", plan.judge] if plan.judge != "verdict" else []
+    words += [word for key in plan.metrics for word in ("--metric", key)]
+    if plan.longest_s != plan.default_longest_s:
+        words += ["--longest", format_override_value(plan.longest_s)]
+    return format_command("sweep", plan.written.called, *words, *more)
+
+
+def format_override(key: str, value: Any) -> str:
+    """Returns an override that sets a value: a whole number as one, a word as it is."""
+    return f"{key}={format_override_value(value) if is_number(value) else value}"
+
+
+def format_override_value(value: float) -> str:
+    """Returns a number as an override's text, which reads as just that number; whole ones without a point."""
+    return repr(value).removesuffix(".0")

@@ -25,7 +25,7 @@ import msgspec
 import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
-from ...analysis.lyapunov_weights import find_closed_groups, left_perron_vector
+from ...analysis.dominance_history import find_closed_groups, left_perron_vector
 from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...core.ticks import NS_PER_S
@@ -38,7 +38,7 @@ from ...scenario.operators.kernel_operators import JointSpring, Wall
 from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ...scenario.validate import refuse_live_only
 from ..intervals import mean_interval
-from ..record_batches import RecordBatch, run_whole
+from ..measure_run import RecordBatch, run_whole
 from ..study_folder import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 

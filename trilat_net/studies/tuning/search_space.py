@@ -105,7 +105,9 @@ class SearchSpace(NamedTuple):
 
     def controls(self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
         """Returns the control of every site; gains of chains that make a torque have a number per joint."""
-        longest_ms = 0.5 * _find_longest_trip_ms(scenario)
+        mean_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
+        trips = (there + mean_ms["->".join(reversed(name.split("->")))] for name, there in mean_ms.items())
+        longest_ms = 0.5 * max(trips)
         tables = {name: self._write(scenario, name, knowledge, gains, longest_ms) for name in scenario.names}
         weights = weigh_joints(scenario)
         for table in tables.values() if weights else ():
@@ -132,12 +134,6 @@ class SearchSpace(NamedTuple):
             longest_ms,
         )
         return {"law": law, **self.kind.write_control(gains, at)}
-
-
-def _find_longest_trip_ms(scenario: Scenario) -> float:
-    """Returns the longest mean round trip between two sites, ms."""
-    mean_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
-    return max(there + mean_ms["->".join(reversed(name.split("->")))] for name, there in mean_ms.items())
 
 
 _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
@@ -169,7 +165,6 @@ _KNOWN = "known"
 
 
 def _list_search_spaces() -> Iterator[SearchSpace]:
-    """Yields where each law is searched that says so."""
     for name, kind in BUILT_IN.items():
         knobs = tuple(
             TunedGain(gain, tune[2], tune[0], tune[1], *tune[3:]) for gain, tune in kind.tune.items()

@@ -20,8 +20,7 @@ from matplotlib.lines import Line2D
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import SITE_COLOURS
-from ...reporting.result_text import Block
-from ...reporting.text_table import TextTable
+from ...reporting.result_text import Block, TextTable
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
