@@ -14,7 +14,7 @@ import msgspec
 import typer
 
 from ..reporting import terminal_output as terminal
-from ..reporting.text_table import TextTable
+from ..reporting.result_text import TextTable
 from ..studies.executor import open_worker_pool
 from ..studies.study_folder import RunJournal
 from . import options

@@ -11,7 +11,7 @@ from ..errors import UsageError
 from ..net.clock import SystemClock, make_system_clock
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
-from ..reporting.summary_text import MARKS
+from ..reporting.result_text import MARKS
 from . import options
 from .options import flag, value
 

@@ -21,6 +21,8 @@ from .terminal_output import MAX_LETTERS, sanitize
 if TYPE_CHECKING:
     from rich.table import Table
 
+MARKS = {"ok": "[green]ok[/green]  ", "warn": "[yellow]warn[/yellow]", "fail": "[red]fail[/red]"}
+"""Of findings, by their state."""
 NO_STYLES: Mapping[str, str] = MappingProxyType({})
 
 

@@ -18,7 +18,7 @@ from ..log.log_reader import Log
 from ..log.recover import Recovery
 from ..log.session_check import LogCheckResult
 from ..results import Result
-from .result_text import Block, MarkedText, TextTable
+from .result_text import MARKS, Block, MarkedText, TextTable
 
 MOST_LINES = 12
 """Lines of each kind; summary.json has the rest."""
@@ -269,9 +269,6 @@ def _link_line(link: LinkEffect) -> str:
         f"{a:.4g} ms old on average, {b:.4g} ms at most" for a, b in zip(mean, largest, strict=True)
     )
     return f"link {link.link}: samples in use were {before}; are {after}"
-
-
-MARKS = {"ok": "[green]ok[/green]  ", "warn": "[yellow]warn[/yellow]", "fail": "[red]fail[/red]"}
 
 
 def compose_doctor(found: Result) -> Iterator[Block]:
