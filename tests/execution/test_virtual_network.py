@@ -3,9 +3,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.ticks import Arrival, Mode, TickRecord
+from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickRecord
 from trilat_net.execution.virtual_network import (
     Deliveries,
+    RecordedNetwork,
     complete_deliveries,
     recorded_deliveries,
     retime_deliveries,
@@ -42,19 +43,24 @@ def in_order(under_way: Way) -> Way:
     return held
 
 
+def record(k: int) -> TickRecord:
+    """The record of a tick at which nothing moves."""
+    two, five = [0.0] * 2, [0.0] * 5
+    return TickRecord(k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], [])
+
+
 def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
     """The records of a site at 1 kHz, but for the ones that are lost."""
     at: dict[int, list[Arrival]] = {}
     for (peer, tick), ticks in way.items():
         if ticks is not None:
             at.setdefault(tick + ticks, []).append(Arrival(peer, tick, (), (), 1000 * ticks))
-    two, five = [0.0] * 2, [0.0] * 5
     payloads = [
         encode_state(
             "s",
             1,
             PEERS,
-            TickRecord(k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []),
+            record(k),
             at.get(k, []),
             0,
             0,
@@ -130,3 +136,12 @@ def test_at_other_rates_what_never_came_does_not_come() -> None:
     doubled = retime_deliveries(came, 1000, 1000, [1000, 1000], [2000, 1000])
     assert not {(0, 100), (0, 101)} & entries(doubled)
     assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)
+
+
+def test_of_too_many_assumed_samples_the_newest_arrive() -> None:
+    """A tick takes MAX_ARRIVALS; behind a long gap of a log more may be assumed to have come."""
+    ticks = range(MAX_ARRIVALS + 5)
+    network = RecordedNetwork({"s": {9: [(0, tick, 0) for tick in ticks]}}, {"s": ["m1"]})
+    for tick in ticks:
+        network.send("m1", record(tick))
+    assert [one.tick for one in network.deliver("s", 9)] == [*ticks[5:]]
