@@ -7,8 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.core.chain_references import chain_references
-from trilat_net.analysis.arm_rows import HANGING_RAD, ArmRows, ChainArmRows, PlanarArmRows
-from trilat_net.analysis.metrics.motion_metrics import (
+from trilat_net.analysis.arm_rows import (
+    HANGING_RAD,
+    ArmRows,
+    ChainArmRows,
+    PlanarArmRows,
     find_base_parameters,
     find_consistent_links,
     find_pseudo_inertias,

@@ -59,9 +59,6 @@ class TextTable(NamedTuple):
     def rich(self) -> "Table":
         """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow."""
         from rich.table import Table
-        from rich.text import Text
-
-        from .terminal_output import sanitize
 
         table = Table(box=None, pad_edge=False, show_header=any(self.titles))
         for title, right in zip(self.titles, self.to_the_right, strict=True):
