@@ -79,7 +79,7 @@ class SiteView:
         rule = scenario.sites[name].on_stale
         self.glides, self.peers = rule.action == "glide", scenario.peers(name)
         self.layout = scenario.layout(name) if rule.rule.degrades else None
-        self.hand = find_live_hand(scenario.sites[name].hands)
+        self.hand = find_live_hand(scenario.sites[name].hands, is_open=True)
         self.reception, self.window = SiteReception(scenario, name, boot), window
         self.holder = ""
         self.dropped: Counter[str] = Counter()

@@ -111,7 +111,7 @@ def run_demo(
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         sites, recorder = _start(scenario, folder, session, endpoints)
         display.say(f"others connect to {', '.join(endpoints)}")
-        for name in scenario.external:
+        for name in scenario.outside:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
             display.say(f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}")
         attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints, display.say)

@@ -20,10 +20,6 @@ from trilat_net.scenario.operators.kernel_operators import LiveHand
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""
-FARTHEST = 100.0
-"""Largest coordinate of a target, m or rad; what is further is no arm's."""
-STRONGEST = 10.0
-"""Largest force that is taken, in parts of the hand's limit; up to that it is limited."""
 
 
 class HandServer:
@@ -46,7 +42,6 @@ class HandServer:
         self._site, self._hand, self._inbox, self._dropped = site, hand, inbox, dropped
         self._rules = hand.rules(rate_hz, arm.counts)
         self._place = angles if hand.mode == "joint" else lambda: arm.end_effector(angles())
-        self._farthest = STRONGEST * hand.force_limit_n if hand.mode == "force" else FARTHEST
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)
         self._names: dict[int, str] = {}
@@ -84,7 +79,7 @@ class HandServer:
             self._dropped["hand: stranger"] += 1
         elif message.grip and (other or len(target) != self._rules.size):
             self._dropped[f"hand: no {'force' if pushes else 'target'} of {self._rules.size} numbers"] += 1
-        elif message.grip and math.hypot(*target) > self._farthest:
+        elif message.grip and math.hypot(*target) > self._rules.farthest:
             self._dropped["hand: out of range"] += 1
         else:
             if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:

@@ -273,7 +273,7 @@ class Bridge:
             topic, change = ends.topic(name, "set_dominance"), partial(running.set_dominance, name)
             self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
             graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
-        for name in [one for one in scenario.names if find_live_hand(scenario.sites[one].hands) is not None]:
+        for name in scenario.open_hands:
             hand = open_hand(bus, clock, session, name, scenario, "ros2")
             last, kind, read, act = describe_target(scenario, name, hand, self._sites[name].frame)
             topic = ends.topic(name, last)
@@ -337,7 +337,7 @@ def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
     """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it, what it does."""
-    live = find_live_hand(scenario.sites[site].hands)
+    live = find_live_hand(scenario.sites[site].hands, is_open=True)
     assert live is not None
     axes = len(scenario.arms[site].end_effector(scenario.sites[site].q0_rad))
     if live.mode == "joint":
@@ -443,7 +443,7 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
             return False
         scenario = parse_embedded(met.scenario, ends.session)
         refuse_other_robots(ends.table, scenario)
-        for site in scenario.external:
+        for site in scenario.outside:
             if site not in robots:
                 robot, names = ends.table.robots.get(site, RobotTable()), list_joint_names(scenario, site)
                 robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
@@ -478,8 +478,8 @@ def open_robot(
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
     """Raises UsageError if the table has the robot of a site without an external arm."""
     for site, robot in table.robots.items():
-        if site not in scenario.external and (robot != RobotTable() or site not in scenario.names):
-            able = ", ".join(scenario.external) or "none"
+        if site not in scenario.outside and (robot != RobotTable() or site not in scenario.names):
+            able = ", ".join(scenario.outside) or "none"
             raise UsageError(f"--names: sites.{site}: there is no external arm; sites with one: {able}")
 
 

@@ -284,10 +284,10 @@ def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenari
         UsageError: nobody can hold that arm.
     """
     find_site(scenario, site)
-    live = find_live_hand(scenario.sites[site].hands)
+    live = find_live_hand(scenario.sites[site].hands, is_open=True)
     if live is None:
-        able = [name for name, spec in scenario.sites.items() if find_live_hand(spec.hands) is not None]
-        others = f"; they can at {', '.join(able)}" if able else ""
+        able = ", ".join(scenario.open_hands)
+        others = f"; they can at {able}" if able else ""
         raise UsageError(
             f"nobody can take hold of {site}: the scenario has no operator of kind 'live' there{others}"
         )

@@ -30,7 +30,7 @@ from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, to_core_change
-from trilat_net.scenario.imported_law import ImportedLaw
+from trilat_net.scenario.imported_code import ImportedLaw
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder
@@ -120,7 +120,7 @@ class SiteParts:
     def _meet_outside_arm(self) -> None:
         name, session, dropped = self.name, self.options.session, self.stats.dropped
         measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
-        if name in self.scenario.external:
+        if name in self.scenario.outside:
             ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             connection = self.options.connection
             reached = connection.reach(connection.listen or connection.connect or ())  # its own, or a router

@@ -10,7 +10,7 @@ from typing import Any
 from tests.transmission import VARIANTS
 from tests.virtual_runs import Array, sampled
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.scenario.code_consent import allow_own_code
 
 ARM = {
     "l1_m": 1.0,
@@ -80,7 +80,7 @@ def unit_scenario(
     sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
 ) -> Scenario:
     """The scenario of `unit_text`."""
-    return allow_own_laws(parse_scenario(unit_text(sites, control, **more), "unit"))
+    return allow_own_code(parse_scenario(unit_text(sites, control, **more), "unit"))
 
 
 def last_rows(scenario: Scenario, *times_s: float) -> list[dict[str, Array]]:

@@ -58,7 +58,7 @@ if _TYPE_CHECKING:
     from .scenario import read_template as read_template
     from .scenario.delay_traces import import_trace as import_trace
     from .scenario.describe import describe_scenario as describe_scenario
-    from .scenario.imported_law import new_law as new_law
+    from .scenario.imported_code import new_law as new_law
     from .scenario.simulated_arm import SimulatedArm as SimulatedArm
     from .studies.trials import check as check
     from .studies.trials import trials as trials
@@ -83,7 +83,7 @@ _NAMES = {
     "trilat_net.reporting.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
-    "trilat_net.scenario.imported_law": "new_law",
+    "trilat_net.scenario.imported_code": "new_law",
     "trilat_net.scenario.delay_traces": "import_trace",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.studies.trials": "check trials",

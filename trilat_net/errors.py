@@ -65,8 +65,8 @@ class ScenarioError(TrilatError):
         self.source = source
 
 
-class LawWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """A control law that a log names, and that nobody here allowed to run."""
+class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
+    """A law, hand or plant that a log names, and that nobody here allowed to run."""
 
     exit_code = 4
 
@@ -141,6 +141,18 @@ class LawFailed(RunFailed):
     def __reduce__(self) -> tuple[object, ...]:
         """Restores the error of another process."""
         return partial(LawFailed, site=self.site, law=self.law, tick=self.tick), (self.problem,)
+
+
+class PlantFailed(RunFailed):
+    """A plant of one's own that raised, or whose motion is none of its arm."""
+
+    def __init__(self, problem: str, site: str) -> None:
+        super().__init__(problem)
+        self.problem, self.site = problem, site
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Restores the error of another process."""
+        return PlantFailed, (self.problem, self.site)
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md

@@ -184,7 +184,7 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
 
 def field_names(kind: StructType) -> tuple[str, ...]:
     """Returns the keys of a type."""
-    return kind.__struct_fields__
+    return kind.__struct_encode_fields__
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:

@@ -14,7 +14,7 @@ from typer.main import get_command
 
 from trilat_net.cli import app, main
 from trilat_net.core.jit import compiling_notice
-from trilat_net.scenario.imported_law import allowed_laws
+from trilat_net.scenario.imported_code import allowed_code
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
 """The same as a process of its own."""
@@ -76,7 +76,7 @@ def simulated(folder: Path, scenario: str, *settings: str, seconds: str = "2") -
 
 
 def trilat(*arguments: str | Path, cwd: Path) -> Done:
-    allowed_laws.clear()
+    allowed_code.clear()
     out, err = io.StringIO(), io.StringIO()
     code: object = None
     with (

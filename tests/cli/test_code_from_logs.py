@@ -13,8 +13,8 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, trilat
 from tests.log_editing import edited, opened
-from trilat_net.errors import LawWithheld, ScenarioError, UsageError
-from trilat_net.scenario.imported_law import allowed_laws
+from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
+from trilat_net.scenario.imported_code import allowed_code
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
 """A module that begins so tells that it was imported."""
@@ -46,7 +46,7 @@ tn.certify(log), tn.metrics(log), tn.rerun(log, ["m1"]), tn.figure(log, "overvie
 def withheld(run):
     try:
         run()
-    except tn.errors.LawWithheld:
+    except tn.errors.CodeWithheld:
         return True
 assert withheld(lambda: tn.rerun(log, ["s"]))
 assert withheld(lambda: tn.certify(log, own_laws=True))
@@ -101,10 +101,10 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
     monkeypatch.chdir(tmp_path)
-    before = dict(allowed_laws)
-    allowed_laws.clear()
+    before = dict(allowed_code)
+    allowed_code.clear()
     yield tmp_path
-    allowed_laws.update(before)  # logs that other tests keep name laws
+    allowed_code.update(before)  # logs that other tests keep name laws
 
 
 def _marks(words: list[str], law: str) -> tuple[Any, ...]:
@@ -245,7 +245,7 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
     log.save("own.mcap")
     assert tn.verify("own.mcap").passed
     assert tn.rerun("run.mcap", ["s"], {"sites.s.control.law": "ownlaw:Spring"}).sites["s"].executed == 50
-    with pytest.raises(LawWithheld):
+    with pytest.raises(CodeWithheld):
         tn.rerun("run.mcap", ["s"])
 
 
@@ -265,7 +265,7 @@ def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
     )
     made = trilat("sim", "two_sites", "--duration", "0.05", "--set", "control.law=quick:Spring", cwd=folder)
     assert made.code == 0
-    allowed_laws.clear()
+    allowed_code.clear()
     shown = subprocess.run(
         [*COMMAND, "verify", "laws/two_sites.mcap", "--law", "laws/quick.py"],
         cwd=place,

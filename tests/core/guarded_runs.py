@@ -12,7 +12,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import Scenario, parse_scenario, to_core_change
-from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.scenario.run_changes import make_site_order
 
 TEXT = """
@@ -62,7 +62,7 @@ def adaptive_text() -> str:
 def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
     """The scenario of the rule, with limits of all sites or of one."""
     overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
-    return allow_own_laws(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
+    return allow_own_code(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))
 
 
 def ordered(scenario: Scenario, orders: dict[str, dict[int, str]], ticks: int = 0) -> Log:

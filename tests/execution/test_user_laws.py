@@ -15,7 +15,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import load_scenario, to_core_change
-from trilat_net.scenario.law_consent import find_user_laws
+from trilat_net.scenario.code_consent import find_user_laws
 from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
 
 LAW = "tests.laws:Adaptive"

@@ -19,7 +19,7 @@ from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import find_free_endpoints
-from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.scenario.code_consent import allow_own_code
 
 PAPER = ("m1", "m2", "s")
 BEGUN = "the session begins"
@@ -235,7 +235,7 @@ def whole(*paths: Path, in_full: bool = True) -> Log:
 
 def with_own_laws(log: Log) -> Log:
     """A log of which the laws may run: it is of a session of the test."""
-    allow_own_laws(log.scenario)
+    allow_own_code(log.scenario)
     return log
 
 

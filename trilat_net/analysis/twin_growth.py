@@ -482,7 +482,7 @@ def twin(
     Raises:
         UsageError: there is no such push, instant or range.
         LogError: the log cannot be read, or not be executed again.
-        LawWithheld: a law of it may not run.
+        CodeWithheld: a law of it may not run.
     """
     log = log if isinstance(log, Log) else open_log(log)
     scenario, asked = log.scenario, push.items() if isinstance(push, Mapping) else [*map(_read_push, push)]

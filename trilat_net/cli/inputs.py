@@ -75,7 +75,7 @@ def new_law_command(
     force: options.ForceOption = False,
 ) -> None:
     """Writes a control law of your own, working and with comments, and its test."""
-    from ..scenario.imported_law import name_skeleton_class, new_law
+    from ..scenario.imported_code import name_skeleton_class, new_law
 
     law, test = new_law(file, force=force)
     code = f"{law.stem}:{name_skeleton_class(law.stem)}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import LawWithheld, RunFailed, UsageError
+from ..errors import CodeWithheld, RunFailed, UsageError
 from ..net.clock import Clock, SystemClock, make_system_clock
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
@@ -185,8 +185,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 def _conclude(parts: list[Path], *, png: bool) -> None:
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
-    if conclusion.exit_code == LawWithheld.exit_code:
-        raise LawWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
+    if conclusion.exit_code == CodeWithheld.exit_code:
+        raise CodeWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
     if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):

@@ -36,12 +36,14 @@ class HandRules(NamedTuple):
         rate_hz: tick rate of the site.
         speed_limit: largest speed of the target, m/s or rad/s.
         from_arm: true: the target begins where the arm is; false: it is a force, which begins at 0.
+        farthest: largest norm of a goal that is taken, m, rad or N.
     """
 
     size: int
     rate_hz: int
     speed_limit: float = math.inf
     from_arm: bool = True
+    farthest: float = math.inf
 
 
 class HandCommand(NamedTuple):

@@ -26,6 +26,7 @@ from .site_arrays import (
     MAX_CHANGES,
     MAX_RAMPS,
     LinkRoom,
+    SiteArrays,
     build_site_arrays,
     build_tick_buffers,
     take_change,
@@ -227,6 +228,11 @@ class Site:
     def life_reason(self) -> LifeReason:
         """Why it last changed its mode, under the rule `glide`."""
         return LifeReason(self._site["reason"].item())
+
+    @property
+    def arrays(self) -> SiteArrays:
+        """What it is made of, as the next tick will find it; to be read, not written."""
+        return self._arrays
 
     @property
     def q(self) -> list[float]:

@@ -13,9 +13,9 @@ handed over at the first tick after it: none is in use earlier (L2).
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +36,18 @@ from ..core.fused_run import (
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
-from ..core.site_arrays import select_site, stack_site_arrays, take_change
+from ..core.live_hand import HandInForce
+from ..core.own_hand import OwnHand
+from ..core.site_arrays import SiteArrays, select_site, stack_site_arrays, take_change
 from ..core.site_setup import SiteSetup
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
 from ..core.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError
 from ..log.log_reader import Log
 from ..scenario import Scenario
-from ..scenario.law_consent import find_user_laws
+from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
+from ..scenario.operators.own_hand import make_hand_players
 from ..scenario.validate import refuse_external_arms
 
 
@@ -106,6 +109,15 @@ def _largest_ratio(scenario: Scenario) -> int:
     return math.ceil(max(rates_hz) / min(rates_hz))
 
 
+class HandActor(Protocol):
+    """A live hand in a compiled run: `hand` says at which ticks `take` needs the arm as it then is."""
+
+    hand: OwnHand
+
+    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+        """Returns what it does in tick k, see `HandInForce`."""
+
+
 class RunTotals(NamedTuple):
     """Numbers of a whole run.
 
@@ -153,20 +165,29 @@ class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
     Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
-    `keep` of a site's last records are kept for `take_records`. With `inputs` it is a recorded run again.
+    `keep` of a site's last records are kept for `take_records`. With `inputs` it is a recorded run again;
+    else hands of one's own act, and `hands` in their place: the loop pauses where one is asked.
 
     Raises:
         ScenarioError: see `check_fusable`; or a law cannot be made.
     """
 
     def __init__(
-        self, scenario: Scenario, apart_rad: float = 0.01, keep: int = 0, inputs: RunInputs | None = None
+        self,
+        scenario: Scenario,
+        apart_rad: float = 0.01,
+        keep: int = 0,
+        inputs: RunInputs | None = None,
+        hands: Mapping[str, HandActor] = {},
     ) -> None:
         check_fusable(scenario)
         self._scenario = scenario
         self._apart_rad = apart_rad
         self._inputs = inputs or make_prompt_inputs(len(scenario.names))
         setups = [scenario.setup(name) for name in scenario.names]
+        self._hands: dict[int, HandActor] = {}
+        if inputs is None:
+            self._meet_hands({**make_hand_players(scenario, scenario.names), **hands}, setups)
         changes = self._inputs.changes
         self._tables = stack_site_arrays(setups, len(changes), self._inputs.longest_us, self._inputs.late_ns)
         self._changes = deque(changes)
@@ -188,7 +209,18 @@ class FusedRun:
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self._taken_ticks = [0] * count
+        self._acted: dict[int, int] = {}
         self.ran_s = 0.0
+
+    def _meet_hands(self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]) -> None:
+        """Makes room for what hands do, of every tick; each is asked at ticks of its own."""
+        self._hands = {i: hands[setup.name] for i, setup in enumerate(setups) if setup.name in hands}
+        if self._hands:
+            rows = [_find_live_row(setup) if i in self._hands else -1 for i, setup in enumerate(setups)]
+            size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
+            acts = np.zeros((len(setups), 0, 1 + 2 * size))
+            feed = self._inputs.feed._replace(hands=acts, hand_rows=np.array(rows))
+            self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
         tables, count = self._tables, len(setups)
@@ -229,6 +261,34 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
+        """Steps every site up to a time, in pieces within which no hand is asked."""
+        while self._hands and self.diverged_s is None:
+            before_ns = min(self._let_act(i) for i in self._hands)
+            if before_ns > last_ns:
+                break
+            self._step_piece(before_ns - 1)
+        self._step_piece(last_ns)
+
+    def _let_act(self, i: int) -> int:
+        """Lets the hand of a site act at the ticks before it is asked again; returns the time of that, ns."""
+        progress, hand, acts = self._progress[i], self._hands[i], self._inputs.feed.hands
+        k, rate_hz = int(progress["tick"]), int(progress["rate_hz"])
+        if progress["t_ns"] == NEVER_NS:
+            return NEVER_NS
+        if k < self._acted.get(i, 0):
+            return tick_ns(self._acted[i], rate_hz)
+        arrays, size = select_site(self._tables, i, self._layouts[i]), (acts.shape[2] - 1) // 2
+        while True:
+            act = HandInForce.read(hand.take(k, arrays))
+            own = len(act.target)
+            acts[i, k, 0], acts[i, k, 1 : 1 + own] = act.grip, act.target
+            acts[i, k, 1 + size : 1 + size + own] = [x + v for x, v in zip(act.target, act.rate, strict=True)]
+            k += 1
+            if k >= hand.hand.find_next(k - 1) or k >= progress["ticks"]:
+                self._acted[i] = k
+                return tick_ns(k, rate_hz)
+
+    def _step_piece(self, last_ns: int) -> None:
         rows = (self._progress, self._taken, self._sent, self._inputs.feed, self._peaks, self._sums)
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
@@ -277,6 +337,11 @@ class FusedRun:
         grown = np.full((len(ticks), math.ceil(most_s * BUCKETS_PER_S) + 1, self._peaks.shape[2]), -1.0)
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
+        if self._hands:
+            feed = self._inputs.feed
+            acts = np.zeros((len(ticks), max(ticks), feed.hands.shape[2]))
+            acts[:, : feed.hands.shape[1]] = feed.hands
+            self._inputs = self._inputs._replace(feed=feed._replace(hands=acts))
 
     def step_to(self, last_ns: int) -> None:
         """Makes the planned ticks up to a time, ns since the epoch; a diverged run stays as it is."""
@@ -489,16 +554,21 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 
 def _stack_hands(log: Log, ticks: int) -> tuple[Array, IntArray]:
     setups = [log.scenario.setup(name)._replace(own=None) for name in log.scenario.names]
-    live = [[n for n, one in enumerate(setup.actors) if one.acts in LIVE_KINDS] for setup in setups]
+    rows = list(map(_find_live_row, setups))
     size = max((setup.layout.hand - 3) // 2 for setup in setups)
-    if not any(live):
+    if max(rows) < 0:
         return np.zeros((len(setups), 0, 1)), np.full(len(setups), -1)
     hands = np.zeros((len(setups), ticks, 1 + 2 * size))
     for i, name in enumerate(log.scenario.names):
-        if live[i]:
+        if rows[i] >= 0:
             own, acted = (setups[i].layout.hand - 3) // 2, log[name].hand
             target, rate = acted[:, 3 : 3 + own], acted[:, 3 + own :]
             hands[i, : len(acted), 0] = acted[:, 0]
             hands[i, : len(acted), 1 : 1 + own] = target
             hands[i, : len(acted), 1 + size : 1 + size + own] = target + rate
-    return hands, np.array([one[0] if one else -1 for one in live])
+    return hands, np.array(rows)
+
+
+def _find_live_row(setup: SiteSetup) -> int:
+    """Returns which of a site's torque sources is its live hand; -1: it has none."""
+    return next((n for n, one in enumerate(setup.actors) if one.acts in LIVE_KINDS), -1)

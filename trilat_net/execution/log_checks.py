@@ -13,8 +13,8 @@ from ..log.accounting import MIN_COVERAGE
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
-from ..scenario.imported_law import LawConsents, allowed_laws
-from ..scenario.law_consent import find_user_laws
+from ..scenario.code_consent import find_user_laws
+from ..scenario.imported_code import CodeConsents, allowed_code
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
@@ -88,12 +88,12 @@ def run_log_checks(
     return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
 
 
-def check_log_files(sources: Sequence[str], min_coverage: float, allowed: LawConsents) -> list[Finding]:
+def check_log_files(sources: Sequence[str], min_coverage: float, allowed: CodeConsents) -> list[Finding]:
     """Returns a line per check of a log in files, in a worker where `allowed` laws may run.
 
     A user law that cannot be made fails one.
     """
-    allowed_laws.update(allowed)
+    allowed_code.update(allowed)
     log = open_log(*sources)
     try:
         return run_log_checks(log, virtual=True, min_coverage=min_coverage).findings

@@ -36,7 +36,7 @@ from ..log.site_log import SiteLog
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result
-from ..scenario.law_consent import find_user_laws
+from ..scenario.code_consent import find_user_laws
 from .rerun_execution import (
     RerunExecution,
     RerunOverrides,
@@ -315,7 +315,7 @@ def rerun(
         LogError: the log cannot be read, or does not tell enough.
         UsageError: the sites are not named, or in two ways.
         ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
-        LawWithheld: the law of an executed site is code from outside that may not run.
+        CodeWithheld: the law of an executed site is code from outside that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)

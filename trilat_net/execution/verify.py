@@ -33,7 +33,7 @@ from ..log.session_check import judge_integrity
 from ..log.site_log import SiteLog
 from ..net.messages import STATE_VECTORS, State
 from ..scenario import Scenario, parse_core_change
-from ..scenario.law_consent import find_user_laws
+from ..scenario.code_consent import find_user_laws
 from ..scenario.run_changes import count_skipped_ticks
 from .resumption import ArrivalEntry, RecordedInputs, read_output
 

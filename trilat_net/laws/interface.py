@@ -146,7 +146,8 @@ class LawSettings(Frozen, frozen=True):
 
         def make(context: LawContext) -> UserLaw:
             check_law_class_at(self.kind, self.tag, context, sites, scheme)
-            return make_law(self.kind, self.tag, context, asdict(self))
+            law: UserLaw = make_instance(self.kind, self.tag, context, asdict(self))
+            return law
 
         return make
 
@@ -299,16 +300,15 @@ def _find_written(kind: Any) -> list[str]:
     return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
 
 
-def make_law(kind: Any, code: str, context: LawContext, settings: dict[str, Any]) -> UserLaw:
-    """Returns a law as its class makes it with settings.
+def make_instance(kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = "") -> Any:
+    """Returns a law, or what else a class makes of its context and settings; errors call the key `path`.
 
     Raises:
         ScenarioError: it raised.
     """
     try:
-        law: UserLaw = kind(context, **settings)
+        return kind(context, **settings)
     except (Exception, SystemExit) as error:  # the user's code
         given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-        raise ScenarioError(f"{code} {problem}", path=f"sites.{context.site}.control") from None
-    return law
+        raise ScenarioError(f"{code} {problem}", path=path or f"sites.{context.site}.control") from None

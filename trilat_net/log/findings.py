@@ -6,7 +6,7 @@ Invariant: a finding with a problem has not passed; problems beyond `MAX_LISTED_
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ..errors import LawWithheld
+from ..errors import CodeWithheld
 from ..results import Result
 
 MAX_LISTED_PROBLEMS = 1000
@@ -87,9 +87,9 @@ class CheckReport(Result):
 
     @property
     def exit_code(self) -> int:
-        """1 if a check failed, else that of `LawWithheld` if one was not judged, else 0."""
+        """1 if a check failed, else that of `CodeWithheld` if one was not judged, else 0."""
         failed = any(finding.judged and not finding.passed for finding in self.findings)
-        return 1 if failed else 0 if self.passed else LawWithheld.exit_code
+        return 1 if failed else 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""

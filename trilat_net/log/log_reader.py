@@ -35,8 +35,8 @@ from ..net.topics import count_under_way
 from ..net.wire import decode
 from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
+from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
-from ..scenario.law_consent import LawFiles, allow_logged_laws
 from ..scenario.operators.kernel_operators import find_live_hand
 from .accounting import LAST, SessionAccounts
 from .data_tables import (
@@ -508,7 +508,7 @@ def open_log(
                 shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
     log = Log(merge_parts(parts))
-    allow_logged_laws(log.scenario, law, other_version=other_version, remember=remember)
+    allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
     return log
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..analysis.site_signals import shared_unit
-from ..errors import LawFailed, LawWithheld, RunFailed, ScenarioError
+from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError
 from ..execution.log_checks import check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.accounting import MIN_COVERAGE
@@ -20,7 +20,7 @@ from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
-from ..scenario.imported_law import allowed_laws
+from ..scenario.imported_code import allowed_code
 from ..theory.linear_analysis import certify_run
 from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
 from .result_text import Block, MarkedText, TextTable
@@ -59,7 +59,7 @@ class Conclusion(CheckReport):
 
     def headline(self) -> str:
         """Returns whether every check passed, and where the page is."""
-        words = {0: "passed", LawWithheld.exit_code: "not all was judged"}
+        words = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
         return f"{words.get(self.exit_code, 'FAILED')}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
@@ -94,7 +94,7 @@ def conclude(
 
     lines: list[Finding] = []
     with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
-        checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_laws))
+        checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_code))
         twin = _run_without_operators(log)
         certificate = certify_run(log, min_coverage=min_coverage)
         notes = [*format_run_lines(log), f"certificate: {certificate.verdict.text}"]

@@ -214,7 +214,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 def warn_user_laws(log: "Log") -> None:
     """Warns of code outside the log, which an execution of the log runs, or may not run."""
-    from ..scenario.law_consent import find_user_laws
+    from ..scenario.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
         print_note(f"executing this log runs code from outside: {law}" if law.allowed else str(law))

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Union
 
 from ..laws.interface import ControlLaw, LawSettings, name_of_class
-from .imported_law import ImportedLaw
+from .imported_code import ImportedLaw
 
 _ROOM = "trilat_net.laws"
 

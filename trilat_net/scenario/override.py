@@ -12,7 +12,7 @@ from typing import Any
 from ..errors import ScenarioError
 from ..fields import TomlTable, check_keys, field_names, suggest_nearest
 from .delay_models import DELAY_MODELS
-from .imported_law import ImportedLaw, name_law_classes
+from .imported_code import ImportedLaw, name_law_classes
 from .laws import LAWS
 from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario

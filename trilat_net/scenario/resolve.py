@@ -41,9 +41,10 @@ from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
 from .expect import Expect, check_window_keys, number_window_joints
-from .imported_law import LAW_PATH_PATTERN, read_law_source
+from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
+from .own_plant import resolve_plant
 from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
 from .urdf import MAX_CHARACTERS
 
@@ -185,7 +186,7 @@ def _resolve_control(written: Any, default: TomlTable, path: str, counts: Vector
 def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: str) -> TomlTable:
     inherited = default if default.get("law") == code else {}
     settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
-    if not re.fullmatch(LAW_PATH_PATTERN, code):
+    if not re.fullmatch(CLASS_PATTERN, code):
         raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
     if "settings" in settings:
         raise ScenarioError(
@@ -194,7 +195,7 @@ def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: s
         )
     if "sends" in settings:
         raise ScenarioError("is declared by the class of the law, not here", path=f"{path}.sends")
-    source = read_law_source(code, f"{path}.law")
+    source = read_code(code, f"{path}.law")
     sends = msgspec.to_builtins(read_sends(source.content, source.file, code, f"{path}.law"))
     return {"law": "own", "code": code, "source_sha256": source.sha256, "settings": settings, "sends": sends}
 
@@ -260,6 +261,8 @@ def _resolve_site(
         site["limits"] = {**usual, **site["limits"]}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
         site["limits"] = {"tau_rate_limit_nm_s": GLIDE_TAU_RATE_NM_S, **site["limits"]}
+    if "plant" in site:
+        site["plant"] = resolve_plant(site["plant"], f"{path}.plant")
     site.setdefault("role", "master")
     site.setdefault("rate_hz", tables.get("rate_hz", 1000))
     site |= draws.draw_numbers({key: site[key] for key in ("q0_rad", "qd0_rad_s")}, path)

@@ -16,8 +16,8 @@ import tomli_w
 from ..errors import ScenarioError
 from ..fields import suggest_nearest
 from ..files import open_regular
-from .imported_law import name_law_classes
-from .law_consent import allow_own_laws
+from .code_consent import allow_own_code
+from .imported_code import name_law_classes
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
 from .resolve import resolve_scenario
 from .scenario_types import Scenario, SiteSpec
@@ -95,13 +95,13 @@ def load_scenario(
             expanded = expand_overrides(source, parse_overrides(overrides))
             changed = parse_scenario(source.text, source.name, expanded) if overrides else source
             laws = [one.get("law") if isinstance(one, dict) else one for one in expanded.values()]
-            return allow_own_laws(changed, laws)
+            return allow_own_code(changed, laws)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)
     in_file = not isinstance(source, Mapping) and "\n" not in str(source)
     called = found.called if in_file else "scenario"
-    return allow_own_laws(parse_scenario(found.text, called, overrides, found.folder))
+    return allow_own_code(parse_scenario(found.text, called, overrides, found.folder))
 
 
 class ExperimentText(NamedTuple):
@@ -125,7 +125,7 @@ class ExperimentText(NamedTuple):
         """
         if self.folder is None:
             return load_scenario(parse_scenario(self.text, self.called, folder=None), overrides)
-        return allow_own_laws(parse_scenario(self.text, self.called, overrides, self.folder))
+        return allow_own_code(parse_scenario(self.text, self.called, overrides, self.folder))
 
 
 def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:

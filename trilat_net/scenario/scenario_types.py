@@ -34,6 +34,7 @@ from .expect import Expect
 from .laws import ChosenLaw
 from .operators import Environment, Operator
 from .operators.kernel_operators import find_live_hand
+from .own_plant import OwnPlant
 from .resting_arm import add_credible_box, find_rest_gains
 
 
@@ -126,7 +127,8 @@ class SiteSpec(Frozen, frozen=True):
         qd0_rad_s: start velocity, rad/s.
         on_stale: its rule for a peer whose samples are too old.
         task: what it follows: joints, or its end effector.
-        plant: "simulated"; or "external": an arm outside of the program, whose state is measured.
+        plant: "simulated"; "external": an arm outside of the program, whose state is measured; or a class of
+            one's own that moves the arm.
     """
 
     role: Literal["master", "slave"]
@@ -140,7 +142,7 @@ class SiteSpec(Frozen, frozen=True):
     task: Task = Task()
     hands: tuple[Operator, ...] = ()
     environment: tuple[Environment, ...] = ()
-    plant: Literal["simulated", "external"] = "simulated"
+    plant: Literal["simulated", "external"] | OwnPlant = "simulated"
 
 
 SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale, "task": Task}
@@ -362,8 +364,19 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def external(self) -> tuple[str, ...]:
+        """The sites whose arms are measured: they are outside of the program, or plants of one's own."""
+        return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
+
+    @property
+    def outside(self) -> tuple[str, ...]:
         """The sites whose arms are outside of the program."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
+    @property
+    def open_hands(self) -> tuple[str, ...]:
+        """The sites whose arms anybody may hold who comes."""
+        found = {name: find_live_hand(spec.hands, is_open=True) for name, spec in self.sites.items()}
+        return tuple(name for name, hand in found.items() if hand is not None)
 
     @property
     def sites_may_return(self) -> bool:
@@ -404,7 +417,7 @@ class Scenario(Frozen, frozen=True, dict=True):
                 if change.dominance == site
             ),
             on_stale=spec.on_stale.rule,
-            external=spec.plant == "external",
+            external=spec.plant != "simulated",
             own=control.maker(len(self.sites), self.scheme),
             theta_known=spec.arm.known,
             chain=arm.chain,

@@ -8,7 +8,7 @@ import functools
 import operator
 import threading
 from collections.abc import Collection, Sequence
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -25,8 +25,9 @@ from .delay_models import LinkBase
 from .delay_models.kernel_delays import ConstantDelay, TraceDelay
 from .distributions import dotted_key
 from .expect import find_expect_problem
-from .imported_law import ImportedLaw
+from .imported_code import ImportedLaw
 from .operators import kernel_operators
+from .operators.own_hand import ProgramHand
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6
@@ -43,7 +44,10 @@ def refuse_external_arms(scenario: Scenario, given: Collection[str] = ()) -> Non
         if name not in given:
             raise ScenarioError(
                 "is external: that arm is outside of the program, and such a scenario runs live only; "
-                "plant = 'simulated' runs it in virtual time",
+                "plant = 'simulated' runs it in virtual time"
+                if name in scenario.outside
+                else "is a plant of one's own, which moves in `trilat sim` and live, and not here: "
+                "plant = 'simulated' takes the arm of the scenario",
                 path=f"sites.{name}.plant",
                 source=scenario.name,
             )
@@ -61,7 +65,7 @@ def check_outside_arms(scenario: Scenario) -> None:
     Raises:
         ScenarioError: with the path of the first key that is missing.
     """
-    for name in scenario.external:
+    for name in scenario.outside:
         site = scenario.sites[name]
         for key in OUTSIDE_LIMITS:
             if getattr(site.limits, key) is None:
@@ -128,14 +132,14 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
 
 def _check_plant(path: str, site: SiteSpec) -> None:
     """Refuses what contradicts that an arm is in the program, or outside of it."""
-    external = site.plant == "external"
+    external = site.plant != "simulated"
     if not site.arm.known and not external:
         raise ScenarioError(
             "a simulated arm moves by its masses: leave it true, or set plant = 'external' for an arm "
             "outside of the program",
             path=f"{path}.arm.known",
         )
-    if site.arm.dead_man and not external:
+    if site.arm.dead_man and site.plant != "external":
         raise ScenarioError(
             "is for an arm outside of the program (plant = 'external'): nobody is near a simulated one",
             path=f"{path}.arm.dead_man",
@@ -143,13 +147,19 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     for group in ("hands", "environment") if external else ():
         if getattr(site, group):
             raise ScenarioError(
-                "an arm outside of the program is pushed outside of it: leave them out",
+                "an arm outside of the program, or of a plant of one's own, is pushed there: leave them out",
                 path=f"{path}.{group}",
             )
 
 
+def _list_words(hint: Any) -> tuple[str, ...]:
+    """Returns the words that a type of words, or of words and tables, takes."""
+    parts = get_args(hint)
+    return sum((_list_words(part) or (part,) * isinstance(part, str) for part in parts), ())
+
+
 _CHOICES = {
-    key: get_args(kind.__annotations__[key])
+    key: _list_words(kind.__annotations__[key])
     for kind, key in (
         (Scenario, "scheme"),
         (SiteSpec, "role"),
@@ -189,6 +199,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_live_hands(site, f"sites.{name}.hands")
+        _check_own_hand(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     _check_received(scenario)
     for name, link in scenario.links.items():
@@ -379,16 +390,26 @@ def _check_actors(actors: Sequence[operators.Operator | operators.Environment], 
 def _check_live_hands(site: SiteSpec, path: str) -> None:
     """Refuses a second live hand of an arm, and one of an arm that is outside of the program."""
     live = [n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)]
-    if live and site.plant == "external":
+    if live and site.plant != "simulated":
         raise ScenarioError(
-            "is a live hand, and the arm is outside of the program: who holds that arm is measured "
-            "there, as tau_x of its measurements",
+            "is a live hand, and the arm is outside of the program, or a plant of one's own: who holds that "
+            "arm is measured there, as tau_x of its measurements",
             path=f"{path}[{live[0]}].kind",
         )
     if len(live) > 1:
         raise ScenarioError(
             f"is a second live hand besides {path}[{live[0]}]; an arm has one", path=f"{path}[{live[1]}].kind"
         )
+
+
+def _check_own_hand(site: SiteSpec, path: str) -> None:
+    """Refuses a hand of one's own that cannot be asked at ticks of its site."""
+    for n, hand in enumerate(site.hands):
+        if isinstance(hand, ProgramHand) and site.rate_hz % hand.rate_hz:
+            raise ScenarioError(
+                f"must divide the site's tick rate, {site.rate_hz} Hz, is {hand.rate_hz}",
+                path=f"{path}[{n}].rate_hz",
+            )
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:

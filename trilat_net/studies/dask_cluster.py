@@ -20,7 +20,8 @@ from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
 from ..log.log_layout import collect_provenance
 from ..net.clock import SystemClock
-from ..scenario.imported_law import ImportedLaw, read_law_source
+from ..scenario.code_consent import ImportedCode
+from ..scenario.imported_code import read_code
 
 CONNECT_S = 10.0
 """A scheduler that does not answer within this time, or has no worker by then, is given up."""
@@ -81,7 +82,7 @@ def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
     missing = []
     for code, sha256 in laws:
         try:
-            found = read_law_source(code, "control.law").sha256
+            found = read_code(code, "control.law").sha256
         except ScenarioError:
             found = ""
         if found != sha256:
@@ -147,7 +148,7 @@ class DaskCluster:
         """How many items its workers run at the same time."""
         return sum(worker["nthreads"] for worker in self._client.scheduler_info()["workers"].values())
 
-    def require(self, laws: Sequence[ImportedLaw]) -> WorkerRequirements:
+    def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
         """Returns what every worker must have, and checks those that are there.
 
         Raises:

@@ -20,7 +20,7 @@ from ..errors import RunFailed, UsageError
 from ..files import require_libraries
 from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
-from ..scenario.imported_law import LawConsents, allowed_laws
+from ..scenario.imported_code import CodeConsents, allowed_code
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 
 T = TypeVar("T")
@@ -61,7 +61,7 @@ def run_batch(
     function: Callable[[T], Any],
     items: Sequence[T],
     required: WorkerRequirements | None,
-    allowed: LawConsents,
+    allowed: CodeConsents,
 ) -> _BatchResult:
     """Runs a function on the items of a batch, in whatever worker, in which the `allowed` laws may run.
 
@@ -70,7 +70,7 @@ def run_batch(
     """
     if required is not None:
         check_this_worker(required)
-    allowed_laws.update(allowed)
+    allowed_code.update(allowed)
     clock = SystemClock()
     began_ns = clock.monotonic_ns()
     results: list[Any] = []
@@ -216,7 +216,7 @@ class WorkerPool:
             if not batch:
                 return
             numbers, items = map(list, zip(*batch, strict=True))
-            work: Any = (function, items, self._required, dict(allowed_laws))
+            work: Any = (function, items, self._required, dict(allowed_code))
             try:
                 future = self._executor.submit(run_batch, *work)
             except BrokenExecutor:

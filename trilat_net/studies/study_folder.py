@@ -22,7 +22,7 @@ from ..errors import ScenarioError
 from ..files import describe_write_error
 from ..log.log_layout import collect_provenance
 from ..process import join_words
-from ..scenario.imported_law import name_law_classes
+from ..scenario.imported_code import name_law_classes
 from .executor import Progress, WorkerPool
 
 

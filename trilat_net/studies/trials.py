@@ -44,7 +44,7 @@ from ..net.clock import SystemClock
 from ..reporting.result_text import Block, MarkedText, TextTable
 from ..results import Result
 from ..scenario import Scenario, load_scenario
-from ..scenario.law_consent import list_imported_laws
+from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
@@ -385,7 +385,7 @@ def run_trials(
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    laws = list_imported_laws(trial.scenario for trial in batch)
+    laws = list_imported_code(trial.scenario for trial in batch)
     longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:

@@ -19,7 +19,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
-from ..scenario.imported_law import ImportedLaw
+from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.kernel_operators import Chirp, Multisine
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads

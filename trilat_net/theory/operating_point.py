@@ -26,7 +26,7 @@ from ..files import find_page
 from ..laws.linear_form import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
-from ..scenario.imported_law import ImportedLaw
+from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms

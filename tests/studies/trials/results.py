@@ -7,7 +7,7 @@ import msgspec
 from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.scenario.law_consent import allow_own_laws
+from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.studies.measure_run import ExpectationResult, LinkAge, RunMetrics
 from trilat_net.studies.trials import Trial, TrialResult
 
@@ -59,7 +59,7 @@ def figures(**changes: Any) -> RunMetrics:
 
 
 def quick(**overrides: Any) -> Scenario:
-    return allow_own_laws(parse_scenario(QUICK, "quick", overrides))
+    return allow_own_code(parse_scenario(QUICK, "quick", overrides))
 
 
 def result(

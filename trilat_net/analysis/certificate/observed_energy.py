@@ -16,7 +16,7 @@ from ...core.site_setup import Scheme, StaleAction
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...results import JsonObject
-from ...scenario.imported_law import ImportedLaw
+from ...scenario.imported_code import ImportedLaw
 from ..arm_rows import build_arm_rows
 from .premises import Premise
 

@@ -40,7 +40,7 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     The drives of an arm outside of the program got tau; their torque in between is unknown: the trapezoid.
     """
     spec = scenario.sites[records.site]
-    if spec.plant == "external":
+    if spec.plant != "simulated":
         return 0.5 * (records.tau[:-1] + records.tau[1:])
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
     return records.held_torque(np.asarray(spec.limits.tau_limit_nm), digital=digital)

@@ -24,7 +24,7 @@ from ...core.chain import LINK_PARAMETERS
 from ...core.vectors import Array
 from ...execution.virtual_comparison import simulate_without_operators
 from ...log.log_reader import Log
-from ...scenario.law_consent import find_user_laws
+from ...scenario.code_consent import find_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless

@@ -22,6 +22,10 @@ from ..operators import ActorBase, Holding, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
+FARTHEST = 100.0
+"""Largest norm of a live hand's target, m or rad; what is further is no arm's."""
+STRONGEST = 10.0
+"""Largest force of one that is taken, in parts of its limit; up to that it is limited."""
 _AXES_WORDS = {
     "stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
@@ -218,6 +222,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """
 
     words: ClassVar[Mapping[str, str]] = _AXES_WORDS
+    is_open: ClassVar[bool] = True
+    """True: whoever comes may take hold."""
 
     mode: Literal["tip", "joint", "force"] = "tip"
     stiffness_n_m: fields.NotNegativeAxes = (300.0,)
@@ -247,9 +253,11 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def rules(self, rate_hz: int, counts: fields.VectorCounts) -> HandRules:
         """Returns what somebody who holds an arm of such vectors may do."""
         if self.mode == "joint":
-            return HandRules(counts.joints, rate_hz, self.speed_limit_rad_s)
-        pushes = self.mode == "force"
-        return HandRules(counts.axes, rate_hz, math.inf if pushes else self.speed_limit_m_s, not pushes)
+            return HandRules(counts.joints, rate_hz, self.speed_limit_rad_s, farthest=FARTHEST)
+        if self.mode == "force":
+            strongest = STRONGEST * self.force_limit_n
+            return HandRules(counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest)
+        return HandRules(counts.axes, rate_hz, self.speed_limit_m_s, farthest=FARTHEST)
 
     def _source(self) -> TorqueSource:
         stiffness, damping, limit = self.stiffness_n_m, self.damping_n_s_m, self.force_limit_n
@@ -267,9 +275,10 @@ LIVE_KEYS = {
 """The keys of a live hand by its mode."""
 
 
-def find_live_hand(operators: Iterable[ActorBase]) -> LiveHand | None:
-    """Returns the live hand among a site's operators, or None."""
-    return next((one for one in operators if isinstance(one, LiveHand)), None)
+def find_live_hand(operators: Iterable[ActorBase], *, is_open: bool = False) -> LiveHand | None:
+    """Returns the live hand among a site's operators, or None; `is_open`: one that anybody may hold."""
+    hands = (one for one in operators if isinstance(one, LiveHand))
+    return next((one for one in hands if one.is_open or not is_open), None)
 
 
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):

@@ -22,7 +22,7 @@ from ...files import write_whole
 from ...reporting.result_text import TextTable
 from ...results import Result
 from ...scenario import Scenario
-from ...scenario.law_consent import list_imported_laws
+from ...scenario.code_consent import list_imported_code
 from ...theory import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
@@ -206,7 +206,7 @@ def search_margins(
         cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
         seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
         searches += [MarginItem(plan, cell, seed, within) for seed in seeds]
-    laws = list_imported_laws([plan.base])
+    laws = list_imported_code([plan.base])
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(search_margin_task, searches, progress)
 

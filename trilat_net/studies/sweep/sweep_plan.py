@@ -20,8 +20,8 @@ from ...analysis.metrics.log_metrics import find_quantity
 from ...errors import ScenarioError, UsageError
 from ...fields import is_number, suggest_nearest
 from ...scenario import Scenario, apply_overrides
-from ...scenario.imported_law import name_law_classes
-from ...scenario.law_consent import allow_own_laws
+from ...scenario.code_consent import allow_own_code
+from ...scenario.imported_code import name_law_classes
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ..study_folder import format_command, format_toml_value, set_options
@@ -354,7 +354,7 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
     written, texts = ExperimentText(facts["source"], facts["text"], folder), tuple(facts["overrides"])
-    base = allow_own_laws(written.load(texts))
+    base = allow_own_code(written.load(texts))
     axes = tuple(map(parse_axis, facts["over"]))
     forced = {law: _law_overrides(written, texts, base, law) for law in facts["laws"]}
     more = (facts["longest_s"], facts.get("judge", "verdict"), tuple(facts.get("metrics", ())))

@@ -20,7 +20,7 @@ from ...execution.virtual import simulate_scenario
 from ...files import make_results_folder, write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
-from ...scenario.law_consent import list_imported_laws
+from ...scenario.code_consent import list_imported_code
 from ...scenario.laws import identify_law
 from .. import executor
 from ..study_folder import (
@@ -301,7 +301,7 @@ def run_sweep(
             journal.add(entry)
         before, began_ns = set(journal.done), clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(before)
-        laws = list_imported_laws([plan.base])
+        laws = list_imported_code([plan.base])
         workers = on if left else None
         with executor.open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers

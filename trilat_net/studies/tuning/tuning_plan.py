@@ -25,7 +25,7 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...results import Result
 from ...scenario import Scenario
-from ...scenario.imported_law import name_law_classes
+from ...scenario.imported_code import name_law_classes
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import search_space
 from .candidate import (

@@ -1,4 +1,4 @@
-"""Which laws from outside may run: those of one's own scenario, and for a log those whose file one names.
+"""Which code from outside may run: that of one's own scenario, and for a log that whose file one names.
 
 Invariant: what a log or a member of a session names may run if a person names its file, and that has the hash
 that the log names, unless another version is asked for.
@@ -7,7 +7,7 @@ that the log names, unless another version is asked for.
 import json
 import os
 import re
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,7 +16,9 @@ import msgspec
 
 from ..errors import ScenarioError, UsageError
 from ..files import make_folder, write_whole
-from .imported_law import ImportedLaw, LawConsent, allowed_laws, check_law_class, read_law_source
+from .imported_code import CodeConsent, ImportedLaw, allowed_code, check_class, read_code
+from .operators.own_hand import ProgramHand
+from .own_plant import OwnPlant
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -25,24 +27,29 @@ LawFiles = str | Path | Sequence[str | Path]
 """The file of a law, or those of several."""
 
 
-def list_imported_laws(scenarios: "Iterable[Scenario]") -> list[ImportedLaw]:
-    """Returns the laws of users' own that some scenarios need."""
-    controls = (site.control for scenario in scenarios for site in scenario.sites.values())
-    return [control for control in controls if isinstance(control, ImportedLaw)]
+ImportedCode = ImportedLaw | ProgramHand | OwnPlant
+"""What a scenario may have that is a class from outside."""
 
 
-def allow_own_laws(scenario: "Scenario", codes: Container[Any] | None = None) -> "Scenario":
-    """Returns a scenario of which laws may run: all, of one that a person names, or those that they name."""
-    for law in list_imported_laws([scenario]):
-        if codes is None or law.code in codes:
-            allowed_laws[law.code, law.source_sha256] = LawConsent(None, law.source_sha256)
+def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
+    """Returns the laws, hands and plants of users' own that some scenarios need."""
+    sites = [site for scenario in scenarios for site in scenario.sites.values()]
+    found = (one for site in sites for one in (site.control, *site.hands, site.plant))
+    return [one for one in found if isinstance(one, ImportedCode)]
+
+
+def allow_own_code(scenario: "Scenario", codes: Container[Any] | None = None) -> "Scenario":
+    """Returns a scenario of which code may run: all, of one that a person names, or that which they name."""
+    for one in list_imported_code([scenario]):
+        if codes is None or one.code in codes:
+            allowed_code[one.code, one.source_sha256] = CodeConsent(None, one.source_sha256)
     return scenario
 
 
-def allow_logged_laws(
+def allow_logged_code(
     scenario: "Scenario", law: LawFiles = (), *, other_version: bool = False, remember: bool = False
 ) -> None:
-    """Lets those laws of a log run that are in files, or in remembered ones, see `open_log`.
+    """Lets that code of a log run that is in files, or in remembered ones, see `open_log`.
 
     Raises:
         UsageError: a file is none that the log names, or another version of it; or there is none.
@@ -51,13 +58,13 @@ def allow_logged_laws(
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember are about a file: give --law FILE too")
-    named = list(dict.fromkeys((one.code, one.source_sha256) for one in list_imported_laws([scenario])))
+    named = {(one.code, one.source_sha256): one.method for one in list_imported_code([scenario])}
     known: dict[str, str] = {}
     with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
         known = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, str]) if named else {}
     for code, sha256 in named:
         if sha256 in known:
-            allowed_laws.setdefault((code, sha256), LawConsent(Path(known[sha256]), sha256))
+            allowed_code.setdefault((code, sha256), CodeConsent(Path(known[sha256]), sha256))
     for file in files:
         sha256 = _allow_file(file, named, other_version=other_version)
         if remember:
@@ -66,9 +73,9 @@ def allow_logged_laws(
             write_whole(_find_store(), json.dumps(known, indent=1))
 
 
-def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: bool) -> str:
-    """Lets a file run as the laws that have its hash, or else its name; returns its hash."""
-    source = read_law_source("", "--law", file.resolve())
+def _allow_file(file: Path, named: Mapping[tuple[str, str], str], *, other_version: bool) -> str:
+    """Lets a file run as the code that has its hash, or else its name; returns its hash."""
+    source = read_code("", "--law", file.resolve())
     now = source.sha256
     stem = (source.file.parent if file.stem == "__init__" else file).stem
     alike = [key for key in named if re.split(r"[.:]", key[0])[-2] == stem]
@@ -81,8 +88,8 @@ def _allow_file(file: Path, named: Sequence[tuple[str, str]], *, other_version: 
             versions = f"its sha256 is {now[:16]}, and was {sha256[:16]}"
             problem = f"is not the file that ran as {code}: {versions}"
             raise UsageError(f"--law {file}: {problem}; --other-version takes it all the same")
-        check_law_class(source, code, "--law")
-        allowed_laws[code, sha256] = LawConsent(source.file, now)
+        check_class(source, code, "--law", named[code, sha256])
+        allowed_code[code, sha256] = CodeConsent(source.file, now)
     return now
 
 
@@ -123,10 +130,10 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
             sites[key] = (*sites.get(key, ()), name)
     found = []
     for (code, sha256), owners in sites.items():
-        consent, now, file = allowed_laws.get((code, sha256)), "", None
+        consent, now, file = allowed_code.get((code, sha256)), "", None
         with suppress(ScenarioError):
-            source = read_law_source(code, "", consent and consent.file)
-            check_law_class(source, code, "")
+            source = read_code(code, "", consent and consent.file)
+            check_class(source, code, "")
             now, file = source.sha256, source.file
         allowed = consent is not None and consent.sha256 == now
         changed = "" if now in ("", sha256) else f"its sha256 is {now[:16]}, and was {sha256[:16]}"

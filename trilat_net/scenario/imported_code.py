@@ -2,8 +2,8 @@
 
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
-the package that contains it. `import_law_class` is the one door to code from outside: it opens for
-`allowed_laws`, if the file is still that one and defines a law of that name.
+the package that contains it. `import_class` is the one door to code from outside: it opens for
+`allowed_code`, if the file is still that one and defines a law of that name.
 """
 
 import ast
@@ -18,34 +18,34 @@ from importlib import resources
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 from msgspec import Meta, field
 
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
-from ..errors import LawWithheld, ScenarioError, UsageError
+from ..errors import CodeWithheld, ScenarioError, UsageError
 from ..fields import suggest_nearest
 from ..files import find_page, open_regular, refuse_existing, write_whole
-from ..laws.interface import LawSettings, check_law_class_at, make_law
+from ..laws.interface import LawSettings, check_law_class_at, make_instance
 from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 
-LAW_PATH_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
+CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
 
 
-class LawConsent(NamedTuple):
+class CodeConsent(NamedTuple):
     """A file that may run: where it is, None for where Python finds its module; and its SHA-256."""
 
     file: Path | None
     sha256: str
 
 
-LawConsents = dict[tuple[str, str], LawConsent]
-allowed_laws: LawConsents = {}
+CodeConsents = dict[tuple[str, str], CodeConsent]
+allowed_code: CodeConsents = {}
 """What may run in this process, by the code and the hash that a scenario names; workers are given it."""
-_executed: dict["LawSource", Any] = {}
+_executed: dict["CodeSource", Any] = {}
 """Modules of the files that were executed."""
 
 
@@ -59,7 +59,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
         sends: what it sends to its peers, as its class declares it.
     """
 
-    code: Annotated[str, Meta(pattern=LAW_PATH_PATTERN, max_length=200)]
+    method: ClassVar[str] = "torque"
+
+    code: Annotated[str, Meta(pattern=CLASS_PATTERN, max_length=200)]
     source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     settings: dict[str, Any] = field(default_factory=dict)
     sends: SentVectorSpecs = field(default_factory=dict)
@@ -69,7 +71,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = import_law_class(self.code, self.source_sha256, f"{path}.law")
+            kind = import_class(self.code, self.source_sha256, f"{path}.law")
             check_law_class_at(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
@@ -78,12 +80,13 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
                     f"of that class, and law = {self.code!r} to take what is there",
                     path=f"sites.{context.site}.control.sends",
                 )
-            return make_law(kind, self.code, context, self.settings)
+            law: UserLaw = make_instance(kind, self.code, context, self.settings)
+            return law
 
         return make
 
 
-class LawSource(NamedTuple):
+class CodeSource(NamedTuple):
     """The file of a law, as it is: where, its content, and the SHA-256 of that."""
 
     file: Path
@@ -91,7 +94,7 @@ class LawSource(NamedTuple):
     sha256: str
 
 
-def read_law_source(code: str, path: str, file: Path | None = None) -> LawSource:
+def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
     """Returns a law's file, or that which Python finds, of which nothing runs; errors call the key `path`.
 
     Raises:
@@ -103,7 +106,7 @@ def read_law_source(code: str, path: str, file: Path | None = None) -> LawSource
             content = stream.read()
     except OSError as error:
         raise ScenarioError(f"{place} cannot be read: {error.strerror}", path=path) from None
-    return LawSource(place, content, hashlib.sha256(content).hexdigest())
+    return CodeSource(place, content, hashlib.sha256(content).hexdigest())
 
 
 def _find_file(code: str, path: str) -> Path:
@@ -141,23 +144,23 @@ def _find_spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def import_law_class(code: str, sha256: str, path: str) -> Any:
-    """Returns the class of a law that a scenario names by a hash, from the file that may run for it.
+def import_class(code: str, sha256: str, path: str, method: str = "torque") -> Any:
+    """Returns the class that a scenario names by a hash, from the file that may run for it.
 
     Raises:
-        LawWithheld: none may.
-        ScenarioError: it is not as it was when it was let, or defines no such law: nothing has run; or it
-            cannot be imported.
+        CodeWithheld: none may.
+        ScenarioError: it is not as it was when it was let, or defines no such class: nothing has run; or
+            it cannot be imported.
     """
     module, _, name = code.partition(":")
-    if (consent := allowed_laws.get((code, sha256))) is None:
+    if (consent := allowed_code.get((code, sha256))) is None:
         problem = f"{code} is code from outside, which may not run: --law FILE lets its file (in Python"
-        raise LawWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
-    source = read_law_source(code, path, consent.file)
+        raise CodeWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
+    source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
         problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
-        raise ScenarioError(f"{problem} there, or write law = {code!r} to take the one that is", path=path)
-    check_law_class(source, code, path)
+        raise ScenarioError(f"{problem} there, or write {code!r} anew to take the one that is", path=path)
+    check_class(source, code, path, method)
     folders = source.file.parents  # its own, or that of its package
     depth = min(module.count(".") + (source.file.stem == "__init__"), len(folders) - 1)
     with _searching(consent.file and folders[depth]):
@@ -169,21 +172,29 @@ def import_law_class(code: str, sha256: str, path: str) -> Any:
     return getattr(found, name)
 
 
-def check_law_class(source: LawSource, code: str, path: str) -> None:
-    """Refuses a file that does not define the class of a law, by its syntax alone: nothing of it runs.
+PAGES = {
+    "torque": ("law", "own-controller.md"),
+    "act": ("hand", "policies.md"),
+    "step": ("plant", "policies.md"),
+}
+"""What a class is called that has such a method, and the page that describes it."""
+
+
+def check_class(source: CodeSource, code: str, path: str, method: str = "torque") -> None:
+    """Refuses a file that does not define a class with a method, by its syntax alone: nothing of it runs.
 
     Raises:
-        ScenarioError: it is no Python, or has no such class, or that neither a torque nor a base.
+        ScenarioError: it is no Python, or has no such class, or that neither the method nor a base.
     """
+    kind, page = PAGES[method]
     name, classes = code.partition(":")[2], parse_classes(source.content, source.file, path)
     if name not in classes:
-        hint = suggest_nearest(name, list(classes)) or f"; see {find_page('own-controller.md')}"
+        hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
         raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
     node = classes[name]
     named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
-    if not (node.bases or node.keywords or node.decorator_list or "torque" in named):
-        page = find_page("own-controller.md")
-        raise ScenarioError(f"{code} is no law: it has no torque; see {page}", path=path)
+    if not (node.bases or node.keywords or node.decorator_list or method in named):
+        raise ScenarioError(f"{code} is no {kind}: it has no {method}; see {find_page(page)}", path=path)
 
 
 def _import(module: str, sha256: str) -> Any:
@@ -194,7 +205,7 @@ def _import(module: str, sha256: str) -> Any:
     return found
 
 
-def _execute(module: str, source: LawSource) -> Any:
+def _execute(module: str, source: CodeSource) -> Any:
     """Returns a module of the content that was checked, and of nothing that is cached beside the file."""
     if source in _executed:
         return _executed[source]

@@ -1,0 +1,178 @@
+"""A hand of one's own in a scenario: `{ kind = "own", class = "package.module:Class", ... }`.
+
+Invariant: naming the class runs nothing. A hand that fails lets go at that tick and is not asked again, and
+the run goes on without it: whoever else holds the arm, and all other sites, never notice.
+"""
+
+import math
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+
+from msgspec import Meta, field
+
+from ... import fields
+from ...core.own_hand import HandContext, HandProgram, HandView, OwnHand
+from ...core.site_arrays import SiteArrays
+from ...core.ticks import NS_PER_S, tick_ns
+from ...laws.interface import make_instance
+from ..imported_code import CLASS_PATTERN, import_class, read_code
+from ..operators import Holding
+from .kernel_operators import LiveHand
+
+if TYPE_CHECKING:
+    from ..scenario_types import Scenario
+
+OWN_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "settings")
+
+
+class ProgramHand(
+    LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
+):
+    """An operator that is a class of one's own: it sees what its site knows, and moves, turns or pushes.
+
+    It takes hold at its first action. All else is as of a live hand; nobody else can hold the arm.
+
+    Attributes:
+        code: its class, as in "my_policy:Reach".
+        rate_hz: how often it is asked, Hz; the tick rate of the site is a multiple of it.
+        delay_ms: time from what it sees to what it does: it may think for so long.
+        process: true: live it runs in a process of its own (`trilat hand`), else in that of the site.
+        source_sha256: hash of the file of its class.
+        settings: the arguments of its class, by name.
+    """
+
+    is_open: ClassVar[bool] = False
+    method: ClassVar[str] = "act"
+    words: ClassVar[Mapping[str, str]] = {
+        **LiveHand.words,
+        "class": "a class, as in 'my_policy:Reach'",
+        "rate_hz": "a whole number from 10 to 1000, Hz",
+        "delay_ms": "a time from 0 to 1000 ms",
+        "process": "true or false",
+        "settings": "a table of the arguments of its class",
+        "source_sha256": "the hash of its file; leave it out",
+    }
+
+    code: Annotated[str, Meta(pattern=CLASS_PATTERN, max_length=200)]
+    source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
+    rate_hz: Annotated[int, Meta(ge=10, le=1000)] = 50
+    delay_ms: Annotated[float, Meta(ge=0.0, le=1000.0)] = 20.0
+    process: bool = False
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
+        """Names the file of its class by a hash, and does as a live hand."""
+        code, place = table.get("class"), f"{path}.class"
+        if isinstance(code, str) and "source_sha256" not in entry:
+            table["source_sha256"] = read_code(code, place).sha256
+        kept = {key: table.pop(key) for key in OWN_KEYS if key in table}
+        super().complete(table, entry, holding, path)
+        table |= kept
+
+
+def find_own_hand(scenario: "Scenario", site: str) -> ProgramHand | None:
+    """Returns the hand of one's own at a site, or None."""
+    return next((one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None)
+
+
+class HandSite(NamedTuple):
+    """A site as its hand of one's own needs it, which is asked `rate_hz` times a second.
+
+    Attributes:
+        delay_s: time from what it sees to what it does, s.
+    """
+
+    scenario: "Scenario"
+    name: str
+    spec: LiveHand
+    rate_hz: int
+    delay_s: float
+
+    def describe(self) -> HandContext:
+        """Returns what its program knows before it begins."""
+        scenario, name, spec = self.scenario, self.name, self.spec
+        rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name].counts)
+        seed = zlib.crc32(f"{scenario.seed}/{name}".encode())
+        limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
+        own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, seed)
+        return HandContext(name, scenario.peers(name), spec.mode, rules.size, *own)
+
+    def make_hand(self) -> OwnHand:
+        """Returns the hand."""
+        tick_rate_hz, arm = self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
+        place: Callable[[Sequence[float]], Sequence[float]] = arm.end_effector
+        if self.spec.mode == "joint":
+            place = list
+        delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
+        return OwnHand(self.spec.rules(tick_rate_hz, arm.counts), tick_rate_hz // self.rate_hz, delay, place)
+
+
+class HandPlayer:
+    """A hand of one's own at its site: asks its class, lets it act, and lets go of the arm if it fails.
+
+    Attributes:
+        hand: when it is asked and acts.
+        failure: why it failed; "": it did not.
+        news: ticks, and sentences on what it has done that no event names yet.
+
+    Raises:
+        CodeWithheld: its class may not run.
+        ScenarioError: it cannot be made.
+    """
+
+    def __init__(self, scenario: "Scenario", site: str, spec: ProgramHand) -> None:
+        self.failure, self.news = "", list[tuple[int, str]]()
+        self._site, self._code, self._layout = site, spec.code, scenario.layout(site)
+        self._rate_hz = scenario.sites[site].rate_hz
+        at = HandSite(scenario, site, spec, spec.rate_hz, spec.delay_ms * 1e-3)
+        self.hand, self._program = at.make_hand(), make_program(spec, at.describe())
+
+    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+        """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
+        if self.hand.is_asked(k) and not self.failure:
+            self.ask(k, self.hand.view(k, arrays, self._layout))
+        step = self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist())
+        self.news += [(k, self._tell(k, change)) for _, change in step.changes]
+        return step.vector
+
+    def ask(self, k: int, view: HandView) -> None:
+        """Asks its class at tick k."""
+        try:
+            self.hand.decide(k, self._program.act(view), k)
+        except (Exception, SystemExit) as error:  # the user's code
+            self.fail(k, f"{type(error).__name__}: {error}")
+
+    def fail(self, k: int, problem: str) -> None:
+        """Lets go at tick k, for good."""
+        self.failure = f"the hand {self._code} of {self._site} failed at tick {k}: {problem}"
+        self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
+        self.hand.let_go(k)
+
+    def _tell(self, k: int, change: str) -> str:
+        return f"{self._site}: {self._code} {change} at t = {tick_ns(k, self._rate_hz) / NS_PER_S:.3f} s"
+
+
+def make_program(spec: ProgramHand, context: HandContext) -> HandProgram:
+    """Returns the program of a hand.
+
+    Raises:
+        CodeWithheld: its class may not run.
+        ScenarioError: it cannot be made.
+    """
+    path = f"sites.{context.site}.hands"
+    kind = import_class(spec.code, spec.source_sha256, f"{path}.class", spec.method)
+    made: HandProgram = make_instance(kind, spec.code, context, spec.settings, path=path)
+    return made
+
+
+def make_hand_players(scenario: "Scenario", sites: Iterable[str]) -> dict[str, HandPlayer]:
+    """Returns the players of all hands of one's own at some sites.
+
+    Raises:
+        CodeWithheld: a class may not run.
+        ScenarioError: one cannot be made.
+    """
+    found = ((name, find_own_hand(scenario, name)) for name in sites)
+    return {name: HandPlayer(scenario, name, spec) for name, spec in found if spec is not None}
