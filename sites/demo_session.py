@@ -27,6 +27,7 @@ from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.operators.own_hand import place_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 
 from .monitor import SessionDisplay, SessionMonitor
@@ -164,6 +165,11 @@ def _start(
         )
         for n, name in enumerate(scenario.names)
     ]
+    for n, name in enumerate(scenario.names):
+        at = place_own_hand(scenario, name)
+        if at is not None and at.runs_alone:
+            words = ["hand", name, "--scenario", str(file), "--session", session]
+            sites.append(_Child(f"hand-{name}", [*words, *connect[n], *patience], output))
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
     return sites, _Child(topics.RECORDER, [*arguments, *patience, "--force"], output)
 

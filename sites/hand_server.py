@@ -8,18 +8,26 @@ time. What is refused is counted by reason.
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
+from trilat_net.core.own_hand import HandView
+from trilat_net.core.site_arrays import SiteArrays
 from trilat_net.core.ticks import tick_ns
-from trilat_net.errors import WireError
+from trilat_net.errors import SessionError, WireError
 from trilat_net.net.bus import Inbox
-from trilat_net.net.requests import HandMessage
-from trilat_net.net.wire import decode
+from trilat_net.net.clock import Clock
+from trilat_net.net.requests import HandMessage, HandViewMessage, PeerSeen
+from trilat_net.net.wire import decode, encode
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators.kernel_operators import LiveHand
+from trilat_net.scenario.operators.own_hand import HandPlayer, HandSite
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""
+POLL_NS = 5_000_000
 
 
 class HandServer:
@@ -47,7 +55,7 @@ class HandServer:
         self._names: dict[int, str] = {}
         self.news: list[tuple[int, str]] = []
 
-    def take(self, k: int) -> list[float]:
+    def take(self, k: int, _arrays: SiteArrays) -> list[float]:
         """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
         commands = []
         for _ in range(MESSAGES_KEPT):
@@ -88,3 +96,83 @@ class HandServer:
             self._names[message.boot] = message.source or f"hand {message.boot:08x}"
             return HandCommand(message.boot, message.n, message.grip, tuple(target), message.sent_ns)
         return None
+
+
+class RemoteHand(HandPlayer):
+    """A hand of one's own in a process of its own, which is sent what it sees and sends what it decides.
+
+    Of what comes only the program of its class is taken; what is decided too late acts at once, and counts.
+    """
+
+    def __init__(
+        self,
+        at: HandSite,
+        boot: int,
+        inbox: Inbox,
+        publish: Callable[[bytes], None],
+        dropped: Counter[str],
+    ) -> None:
+        super().__init__(at, self)
+        self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
+        self._every = at.scenario.sites[at.name].rate_hz // at.rate_hz
+        self._asked, self._source = -1, at.source
+
+    def act(self, now: HandView) -> None:
+        """Decides nothing itself."""
+
+    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+        """Returns what it does in tick k, by the decisions that have come."""
+        for _ in range(MESSAGES_KEPT):
+            if (message := self._read()) is None:
+                break
+            self._decide(k, message)
+        return super().take(k, arrays)
+
+    def ask(self, k: int, view: HandView) -> None:
+        """Sends it what it sees."""
+        seen = _list_numbers(view) | {"peers": [PeerSeen(**_list_numbers(one)) for one in view.peers]}
+        self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **seen)))
+        self._asked = k
+
+    def wait_for_first(
+        self, stopped: Callable[[], bool], clock: Clock, give_up_ns: int, say: Callable[[str], None]
+    ) -> bool:
+        """Waits until its program is there; False if `stopped` comes first.
+
+        Raises:
+            SessionError: it did not come in time.
+        """
+        say(f"waits for its hand {self._code}: trilat hand {self._site} --scenario FILE")
+        while not stopped():
+            if self._read() is not None:
+                return True
+            if clock.monotonic_ns() > give_up_ns:
+                raise SessionError(f"{self._site} waited in vain for its hand {self._code}")
+            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+        return False
+
+    def _read(self) -> HandMessage | None:
+        while (waiting := self._inbox.poll()) is not None:
+            try:
+                message = decode(waiting[1], HandMessage)
+            except WireError as error:
+                self._dropped[f"hand: {error.reason}"] += 1
+                continue
+            if (message.site, message.source) == (self._site, self._source):
+                return message
+            self._dropped["hand: stranger"] += 1
+        return None
+
+    def _decide(self, k: int, message: HandMessage) -> None:
+        asked = message.n * self._every
+        if self.failure or asked > self._asked:  # before the first question it only says that it is there
+            return
+        self._dropped["hand: late"] += asked + self.hand.delay < k
+        try:
+            self.hand.decide(asked, (message.target or message.force) if message.grip else None)
+        except ValueError as error:
+            self.fail(k, str(error))
+
+
+def _list_numbers(view: Any) -> dict[str, Any]:
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in view._asdict().items()}

@@ -6,6 +6,7 @@ declares itself alive is ready for its session.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.site_step import Site
@@ -32,13 +33,15 @@ from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, to_core_change
 from trilat_net.scenario.imported_code import ImportedLaw
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
+from trilat_net.scenario.operators.own_hand import HandPlayer, make_program, place_own_hand
+from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder
 
 from .change_server import ChangeServer
+from .code_watchdog import CodeWatchdog, WatchedCode
 from .external_arm import MEASUREMENTS_KEPT, DeadManSwitch, ExternalArm
-from .hand_server import MESSAGES_KEPT, HandServer
-from .law_watchdog import LawWatchdog
+from .hand_server import MESSAGES_KEPT, HandServer, RemoteHand
 from .peer_monitor import PeerMonitor
 from .retransmit_buffer import RetransmitBuffer
 from .site_loop import StateBlock, make_sample_readers, may_hold_samples
@@ -87,8 +90,9 @@ class SiteParts:
         peers, session = self.site.peers, options.session
         self.rates = [scenario.sites[peer].rate_hz for peer in peers]
         self.stats = LoopStats(self.site, self.boot, self.rates)
+        self.watchdog = CodeWatchdog()
         law = scenario.sites[name].control
-        self.watchdog = LawWatchdog(self.site, law.code, clock) if isinstance(law, ImportedLaw) else None
+        self.step = self.site.step if not isinstance(law, ImportedLaw) else self._watch_law(law)
         self.rings = [
             bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
             for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
@@ -96,11 +100,12 @@ class SiteParts:
         self.arm: ExternalArm | None = None
         self.switch: DeadManSwitch | None = None
         self._meet_outside_arm()
-        self.hand: HandServer | None = None
-        if (live := find_live_hand(scenario.sites[name].hands)) is not None:
-            inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
-            meets = (scenario.arms[name], inbox, self.stats.dropped, lambda: self.site.q)
-            self.hand = HandServer(name, self.site.rate_hz, live, *meets)
+        self.plant: PlantPlayer | None = None
+        if isinstance(plant := scenario.sites[name].plant, OwnPlant):
+            watch = self._watch(f"the plant {plant.code}", self.site.rate_hz)
+            self.plant = PlantPlayer(scenario, name, plant, watch)
+        self.hand: HandServer | HandPlayer | None = None
+        self._meet_hand()
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
@@ -116,6 +121,34 @@ class SiteParts:
         inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
         self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
         warm_up(scenario, name, clock)
+
+    def _watch(self, name: str, rate_hz: int) -> Callable[..., Any]:
+        """Returns what calls code of one's own under the watchdog; one that is too slow raises."""
+        code = WatchedCode(name, rate_hz, lambda _, problem: TimeoutError(problem), self.clock)
+        self.watchdog.codes.append(code)
+        return code.run
+
+    def _watch_law(self, law: ImportedLaw) -> Callable[[TickInput], TickRecord]:
+        code = watch_law(self.site, law.code, self.clock)
+        self.watchdog.codes.append(code)
+        return lambda tick: code.run(tick.k, lambda: self.site.step(tick))
+
+    def _meet_hand(self) -> None:
+        name, bus, session = self.name, self.bus, self.options.session
+        live, at = find_live_hand(self.scenario.sites[name].hands), place_own_hand(self.scenario, name)
+        if live is None:
+            return
+        if at is not None and not at.runs_alone:
+            watch = self._watch(f"the hand {at.program}", at.rate_hz)
+            self.hand = HandPlayer(at, make_program(at), watch)
+            return
+        inbox, dropped = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT), self.stats.dropped
+        if at is not None:
+            publish = bus.publisher(topics.key(session, name, topics.VIEW))
+            self.hand = RemoteHand(at, self.boot, inbox, publish, dropped)
+            return
+        meets = (self.scenario.arms[name], inbox, dropped, lambda: self.site.q)
+        self.hand = HandServer(name, self.site.rate_hz, live, *meets)
 
     def _meet_outside_arm(self) -> None:
         name, session, dropped = self.name, self.options.session, self.stats.dropped
@@ -176,13 +209,23 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     site = Site(setup)
     try:
         if isinstance(law, ImportedLaw):
-            with LawWatchdog(site, law.code, clock or SystemClock()) as watchdog:
-                _warm(setup, site, watchdog.step)
+            code = watch_law(site, law.code, clock or SystemClock())
+            with CodeWatchdog(code):
+                _warm(setup, site, lambda tick: code.run(tick.k, lambda: site.step(tick)))
         else:
             _warm(setup, site, site.step)
     except LawFailed as failed:
         problem = f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
         raise LawFailed(problem, site=name, law=failed.law, tick=failed.tick) from None
+
+
+def watch_law(site: Site, law: str, clock: Clock) -> WatchedCode:
+    """Returns the step of a site under a user's law, as a watchdog knows it."""
+
+    def fail(k: int, problem: str) -> LawFailed:
+        return LawFailed(problem, site=site.name, law=law, tick=k)
+
+    return WatchedCode(f"the law {law}", site.rate_hz, fail, clock)
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:

@@ -7,7 +7,7 @@ can have, or for some seconds.
 
 import signal
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 
 from msgspec.structs import asdict
 
@@ -25,7 +25,7 @@ from trilat_net.core.ticks import (
     find_life_reason,
     tick_ns,
 )
-from trilat_net.errors import LawFailed, PeerLeft, RunFailed, SessionError
+from trilat_net.errors import LawFailed, PeerLeft, PlantFailed, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -44,6 +44,7 @@ from trilat_net.scenario.run_changes import count_skipped_ticks
 from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
+from .hand_server import RemoteHand
 from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
@@ -102,6 +103,10 @@ def take_part(parts: SiteParts) -> int:
     give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
     if parts.arm is not None and not parts.arm.wait_for_first(stopped, give_up_ns, parts.say):
         return parts.interrupt.exit_code
+    if isinstance(parts.hand, RemoteHand):
+        waits = (stopped, parts.clock, give_up_ns, parts.say)
+        if not parts.hand.wait_for_first(*waits):
+            return parts.interrupt.exit_code
     running = join_session(parts, give_up_ns)
     if running is None:
         return parts.interrupt.exit_code
@@ -161,7 +166,7 @@ class RunningSite:
         self._status_s = self._told_s = 0
         self._given_up, self._held_s = False, -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
-        self._step = site.step if parts.watchdog is None else parts.watchdog.step
+        self._step = parts.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.boots = epoch.boots
@@ -201,7 +206,7 @@ class RunningSite:
         self._publish_setup()
         order, name = encode(ChangeRequest(order="stop")), parts.name
         here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
-        with make_site_known(*here, order), parts.watchdog or nullcontext():
+        with make_site_known(*here, order), parts.watchdog:
             ticks = parts.scenario.ticks(name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
@@ -251,10 +256,14 @@ class RunningSite:
         """Steps the site; None if its law failed, which ends the run."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
-        hand = () if parts.hand is None else parts.hand.take(k)
+        hand = () if parts.hand is None else parts.hand.take(k, parts.site.arrays)
         try:
+            if parts.plant is not None:
+                measured = parts.plant.state
             self._output = self._step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
-        except LawFailed as failed:
+            if parts.plant is not None:
+                parts.plant.move(self._output)
+        except (LawFailed, PlantFailed) as failed:
             self._failure = failed
             return None
         return self._output
@@ -397,7 +406,7 @@ class RunningSite:
             kind, self._failure = "diverged", RunFailed(describe_divergence(parts.name, output))
         if self._failure is not None:
             self._publish(kind, str(self._failure))
-        if parts.watchdog is not None and (hiccups := parts.watchdog.describe_hiccups()):
+        for hiccups in filter(None, (code.describe_hiccups() for code in parts.watchdog.codes)):
             self._publish("law", hiccups)
             parts.say(hiccups)
         about, why = self._find_cause()

@@ -11,7 +11,7 @@ import pytest
 
 from recorder import backfill, record_process, session_recording
 from recorder.play import player
-from sites import change_server, external_arm, law_watchdog, retransmit_buffer, site_process
+from sites import change_server, code_watchdog, external_arm, retransmit_buffer, site_process
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
@@ -168,9 +168,9 @@ STATED: list[tuple[str, str, float, float]] = [
     ("network.md", "less than 500 ppm", 500, offset.DRIFT_LIMIT / 1e3),
     ("network.md", "follow a line to 1 ppm", 1, offset.WANDER / 1e3),
     ("own-controller.md", "at most 1024 numbers", 1024, user_law.MAX_LAW_MEMORY),
-    ("own-controller.md", "three quarters of the period", 0.75, law_watchdog.SHARE),
-    ("own-controller.md", "at half a second of overtime", 0.5, law_watchdog.MOST_NS / 1e9),
-    ("own-controller.md", "for 50 ms at most", 50, law_watchdog.HICCUP_NS / 1e6),
+    ("own-controller.md", "three quarters of the period", 0.75, code_watchdog.SHARE),
+    ("own-controller.md", "at half a second of overtime", 0.5, code_watchdog.MOST_NS / 1e9),
+    ("own-controller.md", "for 50 ms at most", 50, code_watchdog.HICCUP_NS / 1e6),
     ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
     ("recording.md", "it flushes every 80 ms", 80, record_process.FLUSH_NS / 1e6),
     ("recording.md", "the last 4096 events", 4096, retransmit_buffer.EVENTS_KEPT),

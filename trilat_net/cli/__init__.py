@@ -74,7 +74,7 @@ def _main(
 
 
 _FIRST = (
-    "demo", "live", "site", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router",
+    "demo", "live", "site", "hand", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router",
     "ros2", "sim", "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay",
     "rerun", "log", "test", "sweep", "bench", "linear",
 )  # fmt: skip

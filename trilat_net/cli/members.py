@@ -84,6 +84,43 @@ def site_command(
     raise typer.Exit(run_site(chosen, name, how, terminal.print_line))
 
 
+@options.command("m2 --scenario my_run.toml")
+def hand_command(
+    name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
+    scenario: Annotated[str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)],
+    session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
+    join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the site, s.")] = 60.0,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Runs the hand of your own at a site in a process of its own: kind = "own", process = true.
+
+    It sees what the site sees, and decides; the site lets each decision act after the hand's delay_ms.
+
+    Options:
+        name: Name of the site in the scenario.
+        scenario: The scenario that the site runs: a shipped name, or path of a TOML file.
+    """
+    from sites.hand_process import run_hand
+
+    from ..net.connection import default_endpoints
+    from ..net.zenoh_config import OPERATOR
+    from ..scenario import find_site
+
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    identity = options.check_session_name(session or chosen.name)
+    places = default_endpoints(identity, chosen.names, encrypted=reach.keys is not None)
+    find_site(chosen, name)
+    connection = options.MemberOptions(None, *reach).resolve((), [places[name]]).require(OPERATOR)
+    with Interrupt() as interrupt:
+        run_hand(chosen, name, identity, connection, interrupt, terminal.print_line, join_timeout)
+    if interrupt.requested():
+        raise typer.Exit(interrupt.exit_code)
+
+
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
     from ..scenario import find_site
 

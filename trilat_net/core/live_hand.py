@@ -163,9 +163,10 @@ def advance_hand(
     changes: list[tuple[int, str]] = []
     now = memory
     if now.target:
-        now = now._replace(target=tuple(x + v * h_s for x, v in zip(now.target, now.rate, strict=True)))
+        target = tuple([x + v * h_s for x, v in zip(now.target, now.rate, strict=True)])
         grip = min(now.grip + firmer, 1.0) if now.source else max(now.grip - firmer, 0.0)
-        now = now._replace(grip=grip) if now.source or grip > 0.0 else HandMemory(before=now.before)
+        held = now.source or grip > 0.0
+        now = now._replace(target=target, grip=grip) if held else HandMemory(before=now.before)
     for command in commands:
         now, outcome = _take_command(rules, now, t_ns, command, place)
         if outcome in (TAKEN, RELEASED):

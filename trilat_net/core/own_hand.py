@@ -97,11 +97,11 @@ class OwnHand:
     Args:
         rules: what it may do.
         every: ticks from one question to the next.
-        delay: ticks from what it sees to what it does.
+        delay: see below.
         place: returns where the arm is by its joint angles, in the coordinates of the target.
 
     Attributes:
-        late: how many decisions came later than their delay.
+        delay: ticks from what it sees to what it does.
     """
 
     def __init__(
@@ -111,8 +111,7 @@ class OwnHand:
         delay: int,
         place: Callable[[Sequence[float]], Sequence[float]],
     ) -> None:
-        self.late = 0
-        self._rules, self._every, self._delay = rules, every, delay
+        self._rules, self._every, self.delay = rules, every, delay
         self._place = place
         self._due: deque[tuple[int, HandCommand]] = deque()
         self._memory = HandMemory()
@@ -158,8 +157,8 @@ class OwnHand:
             peers,
         )
 
-    def decide(self, k: int, goal: Sequence[float] | None, now: int) -> None:
-        """Takes in what it decided by what it saw at tick k, before tick `now` is made.
+    def decide(self, k: int, goal: Sequence[float] | None) -> None:
+        """Takes in what it decided by what it saw at tick k.
 
         One that is older than the newest is passed over.
 
@@ -175,8 +174,7 @@ class OwnHand:
             raise ValueError(f"it acts with a norm of {size:g}, at most {self._rules.farthest:g} is taken")
         if k <= self._newest:
             return
-        self._newest, due = k, k + self._delay
-        self.late += due < now
+        self._newest, due = k, k + self.delay
         command = HandCommand(
             PROGRAM, k // self._every, goal is not None, numbers, tick_ns(due, self._rules.rate_hz)
         )

@@ -36,7 +36,6 @@ from ..core.fused_run import (
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
-from ..core.live_hand import HandInForce
 from ..core.own_hand import OwnHand
 from ..core.site_arrays import SiteArrays, select_site, stack_site_arrays, take_change
 from ..core.site_setup import SiteSetup
@@ -187,7 +186,7 @@ class FusedRun:
         setups = [scenario.setup(name) for name in scenario.names]
         self._hands: dict[int, HandActor] = {}
         if inputs is None:
-            self._meet_hands({**make_hand_players(scenario, scenario.names), **hands}, setups)
+            self._meet_hands({**make_hand_players(scenario), **hands}, setups)
         changes = self._inputs.changes
         self._tables = stack_site_arrays(setups, len(changes), self._inputs.longest_us, self._inputs.late_ns)
         self._changes = deque(changes)
@@ -277,16 +276,17 @@ class FusedRun:
             return NEVER_NS
         if k < self._acted.get(i, 0):
             return tick_ns(self._acted[i], rate_hz)
-        arrays, size = select_site(self._tables, i, self._layouts[i]), (acts.shape[2] - 1) // 2
-        while True:
-            act = HandInForce.read(hand.take(k, arrays))
-            own = len(act.target)
-            acts[i, k, 0], acts[i, k, 1 : 1 + own] = act.grip, act.target
-            acts[i, k, 1 + size : 1 + size + own] = [x + v for x, v in zip(act.target, act.rate, strict=True)]
-            k += 1
-            if k >= hand.hand.find_next(k - 1) or k >= progress["ticks"]:
-                self._acted[i] = k
-                return tick_ns(k, rate_hz)
+        arrays, size = self.arrays(i), (acts.shape[2] - 1) // 2
+        acted = [hand.take(k, arrays)]
+        until = min(hand.hand.find_next(k), int(progress["ticks"]))
+        acted += [hand.take(later, arrays) for later in range(k + 1, until)]
+        block = np.array(acted)
+        own = (block.shape[1] - 3) // 2
+        target, rate = block[:, 3 : 3 + own], block[:, 3 + own :]
+        acts[i, k:until, 0], acts[i, k:until, 1 : 1 + own] = block[:, 0], target
+        acts[i, k:until, 1 + size : 1 + size + own] = target + rate
+        self._acted[i] = until
+        return tick_ns(until, rate_hz)
 
     def _step_piece(self, last_ns: int) -> None:
         rows = (self._progress, self._taken, self._sent, self._inputs.feed, self._peaks, self._sums)
@@ -368,6 +368,10 @@ class FusedRun:
             if isinstance(law, PlainLaw):
                 own, its = np.array(law.memory), np.array(other._laws[i].memory)
                 law.recall((its + factor * (own - its)).tolist())
+
+    def arrays(self, i: int) -> SiteArrays:
+        """Returns what a site is made of, as its next tick will find it; to be read, not written."""
+        return select_site(self._tables, i, self._layouts[i])
 
     def push(self, field: str, by: Array) -> None:
         """Adds to a field of every site's state, shape (N, n)."""

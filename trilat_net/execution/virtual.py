@@ -188,7 +188,7 @@ class OwnCode(NamedTuple):
             CodeWithheld: a class may not run.
             ScenarioError: one cannot be made.
         """
-        return cls(make_hand_players(scenario, scenario.names), make_plant_players(scenario))
+        return cls(make_hand_players(scenario), make_plant_players(scenario))
 
 
 def check_virtual(scenario: Scenario) -> None:

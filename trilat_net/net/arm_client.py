@@ -69,7 +69,7 @@ class SiteSender:
         """Sends the next message, and returns it."""
         about = {"site": self._site, "boot": self.boot, "n": self.number + 1}
         now = {"sent_ns": self._clock.monotonic_ns()}
-        message = kind(**about, **(now | fields))  # type: ignore[arg-type]
+        message = kind(**(about | now | fields))  # type: ignore[arg-type]
         self.number += 1
         self.repeat(message)
         return message

@@ -1,4 +1,4 @@
-"""Messages between two parties: pings, changes, backfill, external arms and their switches, live hands.
+"""Messages between two parties: pings, changes, backfill, external arms and their switches, hands.
 
 Invariant: none of these is logged. Their effects are: a change as an event, a backfilled message as
 itself, a measurement as q and qd of the record of the tick that used it, a hand as `hand` of the records of
@@ -160,3 +160,37 @@ class HandMessage(Request, frozen=True, kw_only=True):
     target: list[float] = []
     force: list[float] = []
     sent_ns: Instant
+
+
+class PeerSeen(Request, frozen=True, kw_only=True):
+    """A peer in a `HandViewMessage`, as `PeerView`."""
+
+    alpha: float
+    tick: int
+    age_s: float
+    new: int
+    q: list[float]
+    qd: list[float]
+    tau_x: list[float]
+
+
+class HandViewMessage(Request, frozen=True, kw_only=True):
+    """What a hand of one's own in a process of its own sees at a tick, as `HandView`, and decides by.
+
+    Attributes:
+        site: the site whose arm it holds.
+        boot: of the site.
+    """
+
+    site: str
+    boot: U64
+    k: TickNumber
+    t_s: float
+    q: list[float]
+    qd: list[float]
+    pose: list[float]
+    q_des: list[float]
+    tau_x: list[float]
+    target: list[float]
+    grip: float
+    peers: list[PeerSeen]

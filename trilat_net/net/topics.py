@@ -15,7 +15,7 @@ STOP = "stop"
 """What every member may ask of a site; all other changes are asked for under `SET`."""
 SAMPLE = "sample"
 PAST, STATS = "past", "stats"
-MEASURED, HAND, ENABLE = "measured", "hand", "enable"
+MEASURED, HAND, ENABLE, VIEW = "measured", "hand", "enable", "view"
 STATS_PER_SECOND = 10
 
 

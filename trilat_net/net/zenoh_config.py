@@ -289,7 +289,7 @@ class _Role(NamedTuple):
 
 
 SITE_ROLE = _Role(
-    publishes=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.MEASURED),
+    publishes=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.MEASURED, topics.VIEW),
     answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
     asks=(topics.INFO, topics.PING, topics.STOP),
@@ -304,7 +304,7 @@ RECORDER_ROLE = _Role(
 OPERATOR_ROLE = _Role(
     publishes=(),
     answers=(),
-    hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS),
+    hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS, topics.VIEW),
     asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     addresses=(topics.HAND, topics.ENABLE),
 )

@@ -12,7 +12,7 @@ import importlib
 import keyword
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
@@ -33,6 +33,15 @@ CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
 """Per imported module of a law the hash of its file at that time."""
+
+
+Watch = Callable[[int, Callable[[], Any]], Any]
+"""Calls code of a user's own at a tick, and returns what it gives."""
+
+
+def call_plainly(_k: int, call: Callable[[], Any]) -> Any:
+    """Calls it, as in virtual time, where nobody waits."""
+    return call()
 
 
 class CodeConsent(NamedTuple):

@@ -20,7 +20,7 @@ from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError
 from ..fields import Frozen
 from ..laws.interface import make_instance
-from .imported_code import CLASS_PATTERN, import_class, read_code
+from .imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -104,9 +104,9 @@ class PlantPlayer:
         ScenarioError: it cannot be made.
     """
 
-    def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant) -> None:
+    def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
         spec, path = scenario.sites[site], f"sites.{site}.plant"
-        self._site, self._code, self._h_s = site, plant.code, 1.0 / spec.rate_hz
+        self._site, self._code, self._h_s, self._watch = site, plant.code, 1.0 / spec.rate_hz, watch
         seed = zlib.crc32(f"{scenario.seed}/{site}".encode())
         kind = import_class(plant.code, plant.source_sha256, path, plant.method)
         context = PlantContext(site, scenario, spec.q0_rad, self._h_s, seed)
@@ -120,7 +120,8 @@ class PlantPlayer:
             PlantFailed: it raised, or says no motion of such an arm.
         """
         try:
-            q, qd, *rest = self._program.step(np.array(output.tau), self._h_s)
+            given = np.array(output.tau), self._h_s
+            q, qd, *rest = self._watch(output.tick, lambda: self._program.step(*given))
             found = [[float(one) for one in vector] for vector in (q, qd, *rest[:1])]
         except (Exception, SystemExit) as error:  # the user's code
             raise self._failed(output.tick, f"{type(error).__name__}: {error}") from error

@@ -6,7 +6,7 @@ the run goes on without it: whoever else holds the arm, and all other sites, nev
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 from msgspec import Meta, field
@@ -16,7 +16,7 @@ from ...core.own_hand import HandContext, HandProgram, HandView, OwnHand
 from ...core.site_arrays import SiteArrays
 from ...core.ticks import NS_PER_S, tick_ns
 from ...laws.interface import make_instance
-from ..imported_code import CLASS_PATTERN, import_class, read_code
+from ..imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
 from ..operators import Holding
 from .kernel_operators import LiveHand
 
@@ -72,11 +72,6 @@ class ProgramHand(
         table |= kept
 
 
-def find_own_hand(scenario: "Scenario", site: str) -> ProgramHand | None:
-    """Returns the hand of one's own at a site, or None."""
-    return next((one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None)
-
-
 class HandSite(NamedTuple):
     """A site as its hand of one's own needs it, which is asked `rate_hz` times a second.
 
@@ -89,6 +84,21 @@ class HandSite(NamedTuple):
     spec: LiveHand
     rate_hz: int
     delay_s: float
+
+    @property
+    def program(self) -> str:
+        """What the scenario calls its class."""
+        return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
+
+    @property
+    def runs_alone(self) -> bool:
+        """True if live it runs in a process of its own."""
+        return isinstance(self.spec, ProgramHand) and self.spec.process
+
+    @property
+    def source(self) -> str:
+        """What its messages are known by: its class, and the scenario that has it."""
+        return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
         """Returns what its program knows before it begins."""
@@ -116,18 +126,14 @@ class HandPlayer:
         hand: when it is asked and acts.
         failure: why it failed; "": it did not.
         news: ticks, and sentences on what it has done that no event names yet.
-
-    Raises:
-        CodeWithheld: its class may not run.
-        ScenarioError: it cannot be made.
     """
 
-    def __init__(self, scenario: "Scenario", site: str, spec: ProgramHand) -> None:
+    def __init__(self, at: HandSite, program: HandProgram, watch: Watch = call_plainly) -> None:
+        self._program, self._watch = program, watch
         self.failure, self.news = "", list[tuple[int, str]]()
-        self._site, self._code, self._layout = site, spec.code, scenario.layout(site)
-        self._rate_hz = scenario.sites[site].rate_hz
-        at = HandSite(scenario, site, spec, spec.rate_hz, spec.delay_ms * 1e-3)
-        self.hand, self._program = at.make_hand(), make_program(spec, at.describe())
+        self._site, self._code, self._layout = at.name, at.program, at.scenario.layout(at.name)
+        self._rate_hz = at.scenario.sites[at.name].rate_hz
+        self.hand = at.make_hand()
 
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
         """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
@@ -140,13 +146,13 @@ class HandPlayer:
     def ask(self, k: int, view: HandView) -> None:
         """Asks its class at tick k."""
         try:
-            self.hand.decide(k, self._program.act(view), k)
+            self.hand.decide(k, self._watch(k, lambda: self._program.act(view)))
         except (Exception, SystemExit) as error:  # the user's code
             self.fail(k, f"{type(error).__name__}: {error}")
 
     def fail(self, k: int, problem: str) -> None:
         """Lets go at tick k, for good."""
-        self.failure = f"the hand {self._code} of {self._site} failed at tick {k}: {problem}"
+        self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.let_go(k)
 
@@ -154,25 +160,32 @@ class HandPlayer:
         return f"{self._site}: {self._code} {change} at t = {tick_ns(k, self._rate_hz) / NS_PER_S:.3f} s"
 
 
-def make_program(spec: ProgramHand, context: HandContext) -> HandProgram:
+def place_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
+    """Returns a site with its hand of one's own, or None if it has none."""
+    spec = next((one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None)
+    return None if spec is None else HandSite(scenario, site, spec, spec.rate_hz, spec.delay_ms * 1e-3)
+
+
+def make_program(at: HandSite) -> HandProgram:
     """Returns the program of a hand.
 
     Raises:
         CodeWithheld: its class may not run.
         ScenarioError: it cannot be made.
     """
-    path = f"sites.{context.site}.hands"
+    path, spec = f"sites.{at.name}.hands", at.spec
+    assert isinstance(spec, ProgramHand)
     kind = import_class(spec.code, spec.source_sha256, f"{path}.class", spec.method)
-    made: HandProgram = make_instance(kind, spec.code, context, spec.settings, path=path)
+    made: HandProgram = make_instance(kind, spec.code, at.describe(), spec.settings, path=path)
     return made
 
 
-def make_hand_players(scenario: "Scenario", sites: Iterable[str]) -> dict[str, HandPlayer]:
-    """Returns the players of all hands of one's own at some sites.
+def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
+    """Returns the players of all hands of one's own, by site.
 
     Raises:
         CodeWithheld: a class may not run.
         ScenarioError: one cannot be made.
     """
-    found = ((name, find_own_hand(scenario, name)) for name in sites)
-    return {name: HandPlayer(scenario, name, spec) for name, spec in found if spec is not None}
+    placed = (place_own_hand(scenario, name) for name in scenario.names)
+    return {at.name: HandPlayer(at, make_program(at)) for at in placed if at is not None}

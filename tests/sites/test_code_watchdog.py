@@ -1,11 +1,11 @@
-"""A law is too slow by its own computing time, never by the machine's lateness; one hiccup ends nothing."""
+"""Code is too slow by its own computing time, never by the machine's lateness; one hiccup ends nothing."""
 
 import signal
 from collections.abc import Callable
 
 import pytest
 
-from sites.law_watchdog import HICCUP_NS, MOST_NS, SHARE, LawWatchdog
+from sites.code_watchdog import HICCUP_NS, MOST_NS, SHARE, CodeWatchdog, WatchedCode
 from tests.core.sites import setup
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
@@ -34,15 +34,20 @@ class Steps:
         self.evicted += self._evicts
         return tick
 
-    def overtime(self) -> LawWatchdog:
-        return LawWatchdog(self, "laws:Law", self.clock, lambda: (self.computed_ns, self.evicted))
+    def overtime(self) -> WatchedCode:
+        about = ("the law laws:Law", self.rate_hz, fail_of("s", "laws:Law"), self.clock)
+        return WatchedCode(*about, lambda: (self.computed_ns, self.evicted))
 
 
-def ended(steps: Steps, overtime: LawWatchdog | None = None) -> int | None:
+def fail_of(site: str, law: str) -> Callable[[int, str], Exception]:
+    return lambda k, problem: LawFailed(problem, site=site, law=law, tick=k)
+
+
+def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:
     overtime = overtime or steps.overtime()
     for k in range(TICKS):
         try:
-            overtime.step(TickInput(k))
+            overtime.run(k, lambda k=k: steps.step(TickInput(k)))
         except LawFailed as failed:
             return failed.tick
     return None
@@ -106,9 +111,10 @@ class Hanging:
 def test_a_law_that_does_not_come_back_is_stopped() -> None:
     site = Site(setup("s", "two_sites")._replace(own=Hanging))
     before = signal.getsignal(signal.SIGALRM)
-    with LawWatchdog(site, "laws:Hanging", SystemClock()) as overtime:
+    watched = WatchedCode("the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock())
+    with CodeWatchdog(watched):
         with pytest.raises(LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"):
-            overtime.step(TickInput(0))
+            watched.run(0, lambda: site.step(TickInput(0)))
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
     assert signal.getsignal(signal.SIGALRM) is before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -1,0 +1,329 @@
+"""A Gymnasium environment: one user of an experiment acts, by what that user knows over the network.
+
+Invariant: an episode is a run in virtual time, of which the scenario, the seed and the actions say all; saved
+as a log it verifies. A step is a fixed number of ticks. What is observed, and when an action acts, is as of a
+hand of one's own (`OwnHand`), so that what is trained here can hold an arm live, unchanged.
+
+    env = tn.make_env("paper", user="m2", vary={"link.delay_ms": (0, 400)})
+    observation, info = env.reset(seed=1)
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from msgspec.structs import replace
+
+from ..core.own_hand import HandView, OwnHand
+from ..core.site_arrays import SiteArrays
+from ..core.ticks import tick_ns
+from ..core.vectors import Array
+from ..errors import UsageError
+from ..execution.fused import FusedRun
+from ..execution.virtual import simulate_scenario
+from ..scenario import Scenario, find_site, load_scenario
+from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
+from ..scenario.operators.own_hand import HandSite
+
+ENV_ID = "trilat_net/Teleoperation-v0"
+FAR_RAD, FAST_RAD_S, FAR_S = 1e3, 1e3, 1e6
+"""Bounds of what is observed, where nothing tighter is known."""
+
+
+class Scene(NamedTuple):
+    """What is true of an episode at a step, and the user need not know.
+
+    Attributes:
+        t_s: time since the epoch, s.
+        q: joint angles by site, rad, shape (n,).
+        end_effector_m: place of the end effector by site, m.
+        view: what the user sees.
+    """
+
+    t_s: float
+    q: dict[str, Array]
+    end_effector_m: dict[str, Array]
+    view: HandView
+
+
+class Judgement(NamedTuple):
+    """What a task says of a step."""
+
+    reward: float
+    succeeded: bool = False
+    failed: bool = False
+
+
+class Task(Protocol):
+    """What is to be done in an episode."""
+
+    goal: Array
+    """What of it the user sees; its shape and its bounds, `bound`, never change."""
+    bound: float
+
+    def begin(self, random: np.random.Generator, scene: Scene) -> None:
+        """Draws the task of an episode."""
+
+    def judge(self, scene: Scene) -> Judgement:
+        """Returns the reward of a step, and whether the task is done or has failed."""
+
+
+class Reach:
+    """The slave's end effector is brought to a place that is drawn, and stays there.
+
+    The reward of a step is minus the distance, m, times the step, s; and 1 once it was there for `stay_s`.
+
+    Args:
+        site: whose end effector.
+        radius_m: how far from its start the places lie, at most.
+        within_m: how near it has to come.
+        stay_s: for how long.
+    """
+
+    def __init__(
+        self, site: str = "s", radius_m: float = 0.3, within_m: float = 0.02, stay_s: float = 0.3
+    ) -> None:
+        self.goal, self.bound = np.zeros(2), 100.0
+        self._site, self._radius_m, self._within_m, self._stay_s = site, radius_m, within_m, stay_s
+        self._since_s = self._last_s = 0.0
+
+    def begin(self, random: np.random.Generator, scene: Scene) -> None:
+        """Draws a place around the start, evenly over the area."""
+        start = scene.end_effector_m[self._site]
+        way = random.normal(size=len(start))
+        share = random.uniform() ** (1.0 / len(start))
+        self.goal = start + self._radius_m * share * way / np.linalg.norm(way)
+        self._since_s = self._last_s = scene.t_s
+
+    def judge(self, scene: Scene) -> Judgement:
+        """Returns the reward."""
+        apart_m = float(np.linalg.norm(scene.end_effector_m[self._site] - self.goal))
+        step_s, self._last_s = scene.t_s - self._last_s, scene.t_s
+        if apart_m > self._within_m:
+            self._since_s = scene.t_s
+        done = scene.t_s - self._since_s >= self._stay_s
+        return Judgement(-apart_m * step_s + float(done), succeeded=done)
+
+
+class ActedHand:
+    """The user's hand: it is told at each step what to do."""
+
+    def __init__(self, at: HandSite) -> None:
+        self.hand: OwnHand = at.make_hand()
+        self._layout = at.scenario.layout(at.name)
+
+    def view(self, k: int, arrays: SiteArrays) -> HandView:
+        """Returns what the user sees at tick k."""
+        return self.hand.view(k, arrays, self._layout)
+
+    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+        """Returns what it does in tick k, see `HandInForce`."""
+        return self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist()).vector
+
+
+class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
+    """One user of an experiment, in steps; `make_env` says what its arguments mean."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(
+        self,
+        scenario: Any = "paper",
+        set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - as in all of the interface
+        *,
+        user: str = "m2",
+        mode: str = "",
+        rate_hz: int = 50,
+        delay_ms: float = 20.0,
+        duration_s: float | None = None,
+        task: Task | None = None,
+        vary: Mapping[str, Sequence[Any]] = {},
+        leads: str = "s",
+    ) -> None:
+        self._user, self._mode, self._rate_hz, self._delay_s = user, mode, rate_hz, delay_ms * 1e-3
+        self._vary, self._leads = vary, leads
+        self.task: Task = task or Reach(leads)
+        self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
+        if self._base.sites[user].rate_hz % rate_hz:
+            raise UsageError(f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}")
+        self._every = self._base.sites[user].rate_hz // rate_hz
+        far = self._place(self._base).describe()
+        self._most = (
+            far.limit if far.mode == "force" else FAR_RAD if far.mode == "joint" else self._find_reach()
+        )
+        self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), np.float64)
+        self._begin(self._base)
+        self.task.begin(np.random.default_rng(0), self._look())
+        self.observation_space: Any = self._describe_observation()
+
+    def _prepare(self, scenario: Scenario) -> Scenario:
+        """Returns an experiment in which the user has a live hand and no other operator holds that arm."""
+        find_site(scenario, self._user)
+        find_site(scenario, self._leads)
+        spec = scenario.sites[self._user]
+        hand = find_live_hand(spec.hands, is_open=True) or LiveHand()
+        if self._mode:
+            hand = replace(hand, mode=self._mode)
+        sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
+        drawn = {key: one for key, one in scenario.drawn.items() if f"{self._user}.hands" not in key}
+        return replace(scenario, sites=sites, drawn=drawn)
+
+    def _place(self, scenario: Scenario) -> HandSite:
+        hand = find_live_hand(scenario.sites[self._user].hands)
+        assert hand is not None
+        return HandSite(scenario, self._user, hand, self._rate_hz, self._delay_s)
+
+    def _find_reach(self) -> float:
+        """Returns how far from its base the user's end effector gets, m; or how far joints turn, rad."""
+        arm, spec = self._base.arms[self._user], self._base.sites[self._user]
+        if self._place(self._base).spec.mode == "joint":
+            return 2.0 * math.pi
+        if arm.chain is None:
+            return float(sum(arm.lengths_m))
+        return 1.5 * float(np.linalg.norm(arm.end_effector(spec.q0_rad))) + 1.0
+
+    def _begin(self, scenario: Scenario) -> None:
+        self.scenario, at = scenario, self._place(scenario)
+        self._hand = ActedHand(at)
+        self._run = FusedRun(scenario, keep=1, hands={self._user: self._hand})
+        self._run.plan([scenario.ticks(name) for name in scenario.names])
+        self._ticks, self._k = scenario.ticks(self._user), 0
+        self._actions: list[Array] = []
+        self._tick_rate_hz = scenario.sites[self._user].rate_hz
+
+    def _look(self) -> Scene:
+        names, run = self.scenario.names, self._run
+        arms = self.scenario.arms
+        q = {name: run.arrays(n).site[0]["q"][: arms[name].counts.joints] for n, name in enumerate(names)}
+        places = {name: np.array(arms[name].end_effector(q[name])) for name in names}
+        view = self._hand.view(self._k, run.arrays(names.index(self._user)))
+        return Scene(self._k / self._tick_rate_hz, q, places, view)
+
+    def _describe_observation(self) -> spaces.Dict:
+        bounds = {"alpha": 1.0, "grip": 1.0, "age_s": FAR_S, "goal": self.task.bound}
+        observed = self._observe(self._look())
+        return spaces.Dict(
+            {
+                name: spaces.Box(-bounds.get(name, FAR_RAD), bounds.get(name, FAR_RAD), one.shape, np.float64)
+                for name, one in observed.items()
+            }
+        )
+
+    def _observe(self, scene: Scene) -> dict[str, Array]:
+        view = scene.view
+        own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
+        peers = {f"peer_{name}": np.array([getattr(one, name) for one in view.peers]) for name in _OF_PEERS}
+        flat = {name: np.clip(one, -FAR_RAD, FAR_RAD) for name, one in {**own, **peers}.items()}
+        facts = {"alpha": [one.alpha for one in view.peers], "age_s": [one.age_s for one in view.peers]}
+        more = {name: np.array(one) for name, one in {**facts, "grip": [view.grip]}.items()}
+        return flat | more | {"goal": np.array(self.task.goal, dtype=np.float64)}
+
+    def _inform(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
+        """Returns facts of a step; the first two by the names of gym-hil."""
+        row = self._run.arrays(self.scenario.names.index(self._leads)).links
+        peers = self.scenario.peers(self._leads)
+        shares = dict(zip(peers, row["alpha"].tolist(), strict=True))
+        others = {name: share for name, share in shares.items() if name != self._user}
+        first = max(others, key=lambda name: others[name])
+        return {
+            "is_intervention": others[first] > shares.get(self._user, 0.0),
+            "teleop_action": scene.end_effector_m[first],
+            "dominance": shares,
+            "t_s": scene.t_s,
+            "success": succeeded,
+        }
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Begins an episode: draws what varies, its links' randomness and its task.
+
+        `options` are overrides of this episode alone, as in {"link.delay_ms": 200}.
+        """
+        super().reset(seed=seed)
+        drawn = {key: _draw(self.np_random, of) for key, of in self._vary.items()}
+        drawn |= {"seed": int(self.np_random.integers(2**31)), **(options or {})}
+        self._begin(load_scenario(self._base, drawn))
+        self.task.begin(self.np_random, self._look())
+        scene = self._look()
+        return self._observe(scene), self._inform(scene, succeeded=False)
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        """Acts, and moves on by a step."""
+        goal = np.clip(np.asarray(action, dtype=np.float64), -self._most, self._most)
+        self._hand.hand.decide(self._k, goal.tolist())
+        self._actions.append(goal)
+        self._k += self._every
+        self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
+        scene, diverged = self._look(), self._run.diverged_s is not None
+        said = self.task.judge(scene)
+        ended = said.succeeded or said.failed or diverged
+        truncated = self._k + self._every > self._ticks and not ended
+        info = self._inform(scene, succeeded=said.succeeded)
+        return self._observe(scene), said.reward, ended, truncated, info
+
+    def save(self, path: str | Path, *, force: bool = False) -> Path:
+        """Writes the episode so far as a log, which verifies.
+
+        Raises:
+            UsageError: there is no step yet, or the file exists.
+        """
+        if not self._actions:
+            raise UsageError("an episode has a log once it has a step")
+        hand, actions = ActedHand(self._place(self.scenario)), list(self._actions)
+
+        def act(site: Any, k: int) -> list[float]:
+            if hand.hand.is_asked(k) and k // self._every < len(actions):
+                hand.hand.decide(k, actions[k // self._every].tolist())
+            return hand.take(k, site.arrays)
+
+        lasts_s = max(self._k, 1) / self._tick_rate_hz
+        log = simulate_scenario(replace(self.scenario, duration_s=lasts_s), hands={self._user: act})
+        return log.save(path, force=force)
+
+
+_OF_PEERS = ("q", "qd", "tau_x")
+
+
+def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:
+    """Returns one of a list, or of a pair of numbers one between them."""
+    numbers = len(of) == 2 and all(isinstance(one, int | float) for one in of)
+    if isinstance(of, tuple) and numbers:
+        return float(random.uniform(*of))
+    return of[int(random.integers(len(of)))]
+
+
+def make_env(
+    scenario: Any = "paper",
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - as in all of the interface
+    **more: Any,
+) -> TeleoperationEnv:
+    """Returns an experiment as a Gymnasium environment, in which one user is trained.
+
+    >>> env = tn.make_env("two_sites", user="m", duration_s=1)
+    >>> observation, info = env.reset(seed=1)
+    >>> observation["peer_q"].shape
+    (1, 2)
+
+    Args:
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: overrides, as in `{"link.delay_ms": 100}`.
+        more: user: the site whose arm is acted on. mode: "tip", "joint" or "force", see a live hand. rate_hz:
+            steps a second. delay_ms: from what is seen to what is done. duration_s: of an episode. task: what
+            is to be done, by default `Reach`. leads: the site that works. vary: what each episode draws, by
+            key a list, or a pair of numbers.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid.
+        UsageError: the site or the rate is none.
+    """
+    return TeleoperationEnv(scenario, set, **more)
+
+
+if ENV_ID not in gymnasium.registry:
+    gymnasium.register(ENV_ID, entry_point=f"{__name__}:TeleoperationEnv")
