@@ -41,6 +41,8 @@ if _TYPE_CHECKING:
     from .api import verify as verify
     from .api import view as view
     from .core.compiled_law import compiled as compiled
+    from .core.own_hand import HandContext as HandContext
+    from .core.own_hand import HandView as HandView
     from .core.user_law import LawContext as LawContext
     from .core.user_law import LawInput as LawInput
     from .execution.rerun import rerun as rerun
@@ -58,8 +60,12 @@ if _TYPE_CHECKING:
     from .scenario import read_template as read_template
     from .scenario.delay_traces import import_trace as import_trace
     from .scenario.describe import describe_scenario as describe_scenario
-    from .scenario.imported_code import new_law as new_law
+    from .scenario.own_plant import PlantContext as PlantContext
     from .scenario.simulated_arm import SimulatedArm as SimulatedArm
+    from .scenario.skeletons import new_hand as new_hand
+    from .scenario.skeletons import new_law as new_law
+    from .scenario.skeletons import new_plant as new_plant
+    from .studies.gym_environment import make_env as make_env
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -74,6 +80,7 @@ _NAMES = {
     "trilat_net.api": "bench certify check_file compare export info linear margin metrics recover report "
     "simulate sweep tune verify view",
     "trilat_net.core.compiled_law": "compiled",
+    "trilat_net.core.own_hand": "HandContext HandView",
     "trilat_net.core.user_law": "LawContext LawInput",
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
@@ -83,9 +90,11 @@ _NAMES = {
     "trilat_net.reporting.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
-    "trilat_net.scenario.imported_code": "new_law",
     "trilat_net.scenario.delay_traces": "import_trace",
+    "trilat_net.scenario.own_plant": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
+    "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
+    "trilat_net.studies.gym_environment": "make_env",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

@@ -1,5 +1,6 @@
-"""`trilat new law`: a skeleton that works, and its test, which passes."""
+"""`trilat new law`, `hand`, `plant`: skeletons that work, and their tests, which pass."""
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -39,3 +40,32 @@ def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert "1 failed" in done.stdout, "a memory that does not say all is found out"
     assert "FAILED test_stiff.py::test_its_memory_is_all_that_it_keeps" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        ("hand", """--set 'sites.m2.hands=[{kind="own", class="my_hand:MyHand"}]'"""),
+        ("plant", "--set sites.s.plant="),
+    ],
+)
+def test_skeletons_of_hand_and_plant_run(kind: str, key: str, tmp_path: Path) -> None:
+    made = trilat("new", kind, f"my_{kind}.py", cwd=tmp_path)
+    assert made.code == 0
+    assert key in made.out
+    trilat("new", kind, f"my_{kind}.py", cwd=tmp_path).refuses(f"my_{kind}.py", "exists")
+    command = next(line.strip() for line in made.out.splitlines() if "trilat sim" in line)
+    words = [*shlex.split(command)[1:], "--duration", "0.5"]
+    ran = trilat(*words, cwd=tmp_path)
+    assert ran.code == 0, ran.err
+    assert trilat("verify", f"my_{kind}.mcap", cwd=tmp_path).code == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["hand", "plant"])
+def test_tests_of_skeletons_pass(kind: str, tmp_path: Path) -> None:
+    _, test = (tn.new_hand if kind == "hand" else tn.new_plant)(tmp_path / f"my_{kind}.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test.name]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "passed" in done.stdout

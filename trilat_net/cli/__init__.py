@@ -82,7 +82,7 @@ _FIRST = (
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
     "scenario": {"help": "The shipped scenarios and your own."},
-    "new": {"help": "A control law of your own, with its test."},
+    "new": {"help": "A control law, a hand or a plant of your own, with its test."},
     "trace": {"help": "Imports delays that other programs measured."},
     "set": {"callback": options.spread(sessions.set_command)},
     "keys": {"help": "Keys that authenticate members of a session, and sign logs."},

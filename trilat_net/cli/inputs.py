@@ -1,6 +1,7 @@
 """What a run is made of: scenarios, control laws of one's own, measured delays, keys."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -69,21 +70,53 @@ def scenario_new_command(
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
+def _tell_skeleton(kind: str, written: list[Path], key: str, then: Sequence[str]) -> None:
+    """Prints what was written, and how to run it."""
+    from ..scenario.skeletons import name_skeleton_class
+
+    file, test = written
+    code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
+    there = "" if file.parent == Path() else f"cd {file.parent}, and "
+    terminal.print_text(f"{file}: a {kind} that works; {test.name}: its test. Change the {kind}, {there}run")
+    terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
+    for line in (*then, f"pytest {test.name}"):
+        terminal.print_text(f"  {line.format(file.stem)}")
+
+
 @options.command("mylaw.py")
 def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, as in mylaw.py.")],
     force: options.ForceOption = False,
 ) -> None:
     """Writes a control law of your own, working and with comments, and its test."""
-    from ..scenario.imported_code import name_skeleton_class, new_law
+    from ..scenario.skeletons import new_law
 
-    law, test = new_law(file, force=force)
-    code = f"{law.stem}:{name_skeleton_class(law.stem)}"
-    there = "" if law.parent == Path() else f"cd {law.parent}, and "
-    terminal.print_text(f"{law}: a law that works; {test.name}: its test. Change the law, {there}run")
-    terminal.print_text(f"  trilat sim paper --set control.law={code} -o {law.stem}.mcap")
-    terminal.print_text(f"  trilat certify {law.stem}.mcap")
-    terminal.print_text(f"  pytest {test.name}")
+    written = new_law(file, force=force)
+    _tell_skeleton("law", written, "control.law={}", ["trilat certify {}.mcap"])
+
+
+@options.command("myhand.py")
+def new_hand_command(
+    file: Annotated[Path, typer.Argument(help="File to write, as in myhand.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Writes a hand of your own, a program that acts as a user, and its test."""
+    from ..scenario.skeletons import new_hand
+
+    written = new_hand(file, force=force)
+    key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
+    _tell_skeleton("hand", written, key, ["trilat report {}.mcap"])
+
+
+@options.command("myplant.py")
+def new_plant_command(
+    file: Annotated[Path, typer.Argument(help="File to write, as in myplant.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Writes a plant of your own, which moves an arm in the place of the program, and its test."""
+    from ..scenario.skeletons import new_plant
+
+    _tell_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", ["trilat verify {}.mcap"])
 
 
 @options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")

@@ -1,0 +1,100 @@
+"""A hand of one's own acts a fixed time after what it saw, whenever its decision comes (L2 for hands)."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trilat_net.core.live_hand import HandInForce, HandRules
+from trilat_net.core.own_hand import PROGRAM, OwnHand
+
+PLACE = (0.5, -0.25)
+EVERY, DELAY, TICKS = 20, 30, 400
+
+
+def make_hand(delay: int = DELAY, *, from_arm: bool = True) -> OwnHand:
+    rules = HandRules(2, 1000, 1.5, from_arm, 100.0)
+    return OwnHand(rules, EVERY, delay, lambda _: PLACE)
+
+
+def acted(hand: OwnHand, k: int) -> HandInForce:
+    return HandInForce.read(hand.advance(k, lambda: PLACE).vector)
+
+
+def run(decisions: dict[int, tuple[int, Sequence[float] | None]], delay: int = DELAY) -> list[HandInForce]:
+    """Returns what a hand does at every tick, of decisions by the tick at which they come."""
+    hand = make_hand(delay)
+    found = []
+    for k in range(TICKS):
+        for asked, goal in (one for at, one in decisions.items() if at == k):
+            hand.decide(asked, goal)
+        found.append(acted(hand, k))
+    return found
+
+
+@given(st.lists(st.integers(0, DELAY), min_size=5, max_size=5))
+def test_decisions_that_come_in_time_act_alike(thinks: list[int]) -> None:
+    """Each comes after another time of thinking, and not later than its delay."""
+    goals = {EVERY * n: (0.5 + 0.01 * n, -0.25) for n in range(5)}
+    prompt = run({asked: (asked, goal) for asked, goal in goals.items()})
+    pairs = zip(goals.items(), thinks, strict=True)
+    arrivals = sorted((asked + took, asked, goal) for (asked, goal), took in pairs)
+    in_order: dict[int, tuple[int, Sequence[float] | None]] = {}
+    for came, asked, goal in arrivals:
+        if came not in in_order and all(asked > other for other, _ in in_order.values()):
+            in_order[came] = asked, goal
+    later = run(in_order)
+    first = min(in_order)
+    assert [one.number for one in later[:first]] == [-1] * first
+    if len(in_order) == len(goals):
+        assert later == prompt
+
+
+def test_it_takes_hold_after_its_delay() -> None:
+    found = run({0: (0, (0.6, -0.25))})
+    held = [k for k, one in enumerate(found) if one.source == PROGRAM]
+    assert held[0] == DELAY
+    assert found[DELAY].target == PLACE
+
+
+def test_a_decision_that_is_late_acts_at_once() -> None:
+    found = run({DELAY + 7: (0, (0.6, -0.25))})
+    assert [one.source for one in found[DELAY : DELAY + 9]] == [0] * 7 + [PROGRAM] * 2
+
+
+def test_an_older_decision_is_passed_over() -> None:
+    both = run({25: (20, (0.6, -0.25)), 26: (0, (9.0, 9.0))})
+    assert both == run({25: (20, (0.6, -0.25))})
+
+
+def test_none_lets_go_and_the_grip_fades() -> None:
+    found = run({n: (n, (0.6, -0.25)) for n in range(0, 200, EVERY)} | {200: (200, None)})
+    assert found[200 + DELAY].source == 0
+    assert 0.0 < found[200 + DELAY].grip <= 1.0
+    assert found[200 + DELAY + 101].grip == 0.0
+
+
+def test_it_says_when_it_needs_the_arm() -> None:
+    hand = make_hand(delay=50)
+    assert [hand.find_next(k) for k in (0, 19, 20)] == [20, 20, 40]
+    hand.decide(0, (0.6, -0.25))
+    assert [hand.find_next(k) for k in (41, 49, 50)] == [50, 50, 60]
+
+
+@pytest.mark.parametrize(
+    ("goal", "problem"),
+    [
+        ((1.0,), "1 numbers, not 2"),
+        ((1.0, 2.0, 3.0), "3 numbers, not 2"),
+        ((math.nan, 0.0), "not finite"),
+        ((math.inf, 0.0), "not finite"),
+        ((80.0, 80.0), "at most 100 is taken"),
+    ],
+)
+def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -> None:
+    hand = make_hand()
+    with pytest.raises(ValueError, match=problem):
+        hand.decide(0, goal)
+    assert acted(hand, 0).source == 0

@@ -1,0 +1,196 @@
+"""Hands and plants of one's own in virtual time: what acts is recorded, and a log repeats it without them."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.own_code import Follower
+from trilat_net.core.own_hand import HandView
+from trilat_net.core.site_step import Site
+from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
+from trilat_net.execution.fused import FusedRun
+from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.imported_code import allowed_code
+from trilat_net.scenario.operators.own_hand import HandPlayer, place_own_hand
+
+SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
+
+
+def at_m2(kind: str = "Circle", **keys: Any) -> dict[str, Any]:
+    hand = {"kind": "own", "class": f"tests.own_code:{kind}", **keys}
+    return {"sites.m2.hands": [hand], "duration_s": 1.5}
+
+
+def with_plant(kind: str = "Arm", **keys: Any) -> dict[str, Any]:
+    return {"sites.s.plant": {"class": f"tests.own_code:{kind}", **keys}, "duration_s": 1.5}
+
+
+@pytest.fixture
+def kept_consents() -> Iterator[None]:
+    kept = dict(allowed_code)
+    allowed_code.clear()
+    yield
+    allowed_code.update(kept)
+
+
+def without_code(log: SimulatedLog) -> Log:
+    """The log as a stranger opens it, who lets nothing run."""
+    allowed_code.clear()
+    return log
+
+
+@pytest.mark.parametrize("kind", ["Circle", "Follower"])
+@pytest.mark.parametrize(
+    "keys", [{}, {"rate_hz": 100, "delay_ms": 0.0}, {"mode": "joint"}, {"delay_ms": 33.0}]
+)
+@pytest.mark.parametrize("name", ["paper", "free"])
+def test_compiled_run_pauses_where_a_hand_is_asked(name: str, kind: str, keys: dict[str, Any]) -> None:
+    scenario = load_scenario(name, at_m2(kind, **keys))
+    log, run = simulate_scenario(scenario), FusedRun(scenario, keep=2000)
+    run.advance(scenario.duration_s)
+    for (_, rows), site in zip(run.take_records(), scenario.names, strict=True):
+        columns = scenario.layout(site).columns()
+        for signal in SIGNALS:
+            recorded = np.array(getattr(log[site], signal))
+            assert rows[:, columns[signal]].tobytes() == recorded.tobytes(), signal
+
+
+@pytest.mark.usefixtures("kept_consents")
+@pytest.mark.parametrize("kind", ["Circle", "Follower"])
+def test_a_log_repeats_a_hand_without_its_class(kind: str) -> None:
+    log = without_code(tn.simulate("paper", at_m2(kind)))
+    assert log["m2"].hand[-1, 0] == 1.0
+    assert tn.verify(log, virtual=True).passed
+    with pytest.raises(CodeWithheld, match=r"tests\.own_code:.* may not run"):
+        tn.simulate(log)
+
+
+def test_a_hand_sees_its_peers_after_the_delay() -> None:
+    scenario = load_scenario("paper", {**at_m2(), "link.delay_ms": 200})
+    seen: list[HandView] = []
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    player = HandPlayer(at, Follower(at.describe()))
+
+    def take(site: Site, k: int) -> list[float]:
+        if player.hand.is_asked(k):
+            seen.append(player.hand.view(k, site.arrays, scenario.layout("m2")))
+        return player.take(k, site.arrays)
+
+    log = simulate_scenario(scenario, hands={"m2": take})
+    for view in seen[15:]:
+        for peer, name in zip(view.peers, scenario.peers("m2"), strict=True):
+            assert peer.tick == log["m2"].states[view.k - 1].used[name] <= view.k - 1 - 200
+            assert np.array_equal(peer.q, log[name].q[peer.tick])
+            assert peer.age_s == pytest.approx(1e-3 * (view.k - peer.tick))
+        assert np.array_equal(view.q, log["m2"].q[view.k])
+        assert np.array_equal(view.tau_x, log["m2"].tau_x[view.k - 1])
+
+
+@pytest.mark.usefixtures("kept_consents")
+@pytest.mark.parametrize("how", ["raise", "nan", "many", "far", "text"])
+def test_a_hand_that_fails_lets_go_for_good(how: str) -> None:
+    log = tn.simulate("paper", at_m2("Failing", settings={"how": how, "at_s": 0.3}))
+    told = [event.text for event in log.events if event.kind == "hand"]
+    assert [text for text in told if "tests.own_code:Failing failed at tick 300: " in text]
+    assert [text for text in told if "is not asked again" in text]
+    assert len([text for text in told if "failed" in text]) == 1
+    assert log["m2"].hand[305, 2] == 0.0
+    assert log["m2"].hand[299, 2] == 1.0
+    assert log["m2"].hand[450:, 0].max() == 0.0
+    assert log.complete
+    assert tn.verify(without_code(log)).passed
+
+
+def test_letting_go_is_no_failure() -> None:
+    log = tn.simulate("paper", at_m2("Failing", settings={"how": "let go", "at_s": 0.3}))
+    told = [event.text for event in log.events if event.kind == "hand"]
+    assert ["failed" in text for text in told] == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("keys", "path", "problem"),
+    [
+        ({"class": "tests.own_code:Missing"}, "class", "defines no class Missing"),
+        ({"class": "tests.own_code:NoHand"}, "class", "NoHand is no hand: it has no act"),
+        ({"class": "nowhere:Hand"}, "class", "there is no module nowhere"),
+        ({"class": "tests.own_code"}, "class", "must be a class, as in 'my_policy:Reach'"),
+        ({"class": 3}, "class", "must be a class"),
+        ({"rate_hz": 333}, "rate_hz", "must divide the site's tick rate, 1000 Hz, is 333"),
+        ({"rate_hz": 5}, "rate_hz", "a whole number from 10 to 1000, Hz"),
+        ({"delay_ms": -1}, "delay_ms", "a time from 0 to 1000 ms"),
+        ({"turn_s": 2}, "turn_s", "unknown key"),
+        ({"settings": {"turn": 2}}, "hands", "cannot be made with turn = 2: TypeError"),
+        ({"mode": "force", "speed_limit_m_s": 1}, "speed_limit_m_s", "belongs to a live hand of mode 'tip'"),
+    ],
+)
+def test_a_hand_that_cannot_be_is_refused(keys: dict[str, Any], path: str, problem: str) -> None:
+    with pytest.raises(ScenarioError, match=problem) as refused:
+        tn.simulate("paper", at_m2(**keys))
+    assert refused.value.path.endswith(path)
+
+
+@pytest.mark.usefixtures("kept_consents")
+def test_a_plant_is_measured_and_its_control_repeated() -> None:
+    log = without_code(tn.simulate("paper", with_plant()))
+    assert log.scenario.external == ("s",)
+    assert log.scenario.outside == ()
+    assert tn.verify(log, virtual=True).passed
+    with pytest.raises(CodeWithheld, match="may not run"):
+        tn.simulate(log)
+
+
+def test_scenarios_arm_as_plant_differs_by_the_integrators_order() -> None:
+    """Euler's steps against Runge-Kutta's: the difference halves with the period."""
+
+    def apart(rate_hz: int) -> float:
+        overrides = {"rate_hz": rate_hz, "duration_s": 1.0, "link.delay_ms": 50}
+        built_in, plant = (tn.simulate("paper", {**more, **overrides}) for more in ({}, with_plant()))
+        return float(np.abs(built_in["s"].q[-1] - plant["s"].q[-1]).max())
+
+    coarse, fine = apart(500), apart(1000)
+    assert 0.0 < fine < 0.01
+    assert 1.5 < coarse / fine < 2.5
+
+
+@pytest.mark.parametrize(
+    ("how", "problem"),
+    [
+        ("raise", "RuntimeError: the belt is torn"),
+        ("nan", "qd is .*not finite"),
+        ("one", "q has 1 numbers, and the arm has 2 joints"),
+        ("alone", "ValueError: not enough values"),
+        ("nothing", "TypeError"),
+        ("touch", "tau_x has 1 numbers"),
+    ],
+)
+def test_a_plant_that_fails_ends_the_run_named(how: str, problem: str, tmp_path: Any) -> None:
+    scenario = load_scenario("paper", with_plant("Torn", how=how))
+    path = tmp_path / "torn.mcap"
+    with pytest.raises(
+        PlantFailed, match=rf"the plant tests\.own_code:Torn of s failed at tick 199: {problem}"
+    ):
+        record_virtual(scenario, path)
+    log = tn.open_log(path)
+    assert len(log["s"]) >= 199
+    assert [event.text for event in log.events if event.kind == "failed"]
+    assert tn.verify(log).passed
+
+
+def test_the_compiled_run_takes_no_plant_and_says_so() -> None:
+    with pytest.raises(ScenarioError, match="is a plant of one's own") as refused:
+        FusedRun(load_scenario("paper", with_plant()))
+    assert refused.value.path == "sites.s.plant"
+
+
+def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
+    scenario: Scenario = load_scenario("paper", {**at_m2(settings={"turn_s": 2.5}), **with_plant()})
+    again = load_scenario(scenario.text)
+    assert again.sha256 == scenario.sha256
+    assert again.sites["m2"].hands == scenario.sites["m2"].hands
+    assert again.sites["s"].plant == scenario.sites["s"].plant

@@ -1,0 +1,99 @@
+"""Hands and plants of users' own, as scenarios name them: `tests.own_code:Circle`."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from trilat_net.core.own_hand import HandContext, HandView
+from trilat_net.scenario.own_plant import PlantContext
+from trilat_net.scenario.simulated_arm import SimulatedArm
+
+
+class Circle:
+    """Moves the end effector along a circle, which it leaves its start on slowly."""
+
+    def __init__(self, facts: HandContext, radius_m: float = 0.1, turn_s: float = 1.5) -> None:
+        self.radius_m, self.turn_s, self.facts = radius_m, turn_s, facts
+        self.start: Any = None
+
+    def act(self, now: HandView) -> Sequence[float] | None:
+        if self.start is None:
+            self.start = now.pose
+        angle, size = 2.0 * math.pi * now.t_s / self.turn_s, self.radius_m * min(1.0, now.t_s / self.turn_s)
+        moved: Sequence[float] = self.start + size * np.array([math.cos(angle) - 1.0, math.sin(angle)])
+        return moved
+
+
+class Follower:
+    """Goes where its peers are, as far as their samples tell: what it does depends on all that it sees."""
+
+    def __init__(self, facts: HandContext) -> None:
+        self.seen: list[HandView] = []
+        self.facts = facts
+
+    def act(self, now: HandView) -> Sequence[float] | None:
+        self.seen.append(now)
+        way = sum((one.alpha * (one.q - now.q) * math.exp(-one.age_s) for one in now.peers), np.zeros(2))
+        goal: Sequence[float] = now.pose + 0.3 * way + 0.01 * now.grip * (now.target - now.pose)
+        return goal
+
+
+class Failing(Circle):
+    """Fails at a time, in a way."""
+
+    def __init__(self, facts: HandContext, how: str = "raise", at_s: float = 0.3) -> None:
+        super().__init__(facts)
+        self.how, self.at_s = how, at_s
+
+    def act(self, now: HandView) -> Any:
+        if now.t_s < self.at_s:
+            return super().act(now)
+        if self.how == "raise":
+            raise RuntimeError("no idea")
+        return {
+            "nan": [math.nan, 0.0],
+            "many": [0.0, 0.0, 0.0],
+            "far": [1e9, 0.0],
+            "text": ["here", "there"],
+            "let go": None,
+        }[self.how]
+
+
+class Arm:
+    """The scenario's own arm, written as a plant."""
+
+    def __init__(self, facts: PlantContext) -> None:
+        self.arm = SimulatedArm(facts.scenario, facts.site)
+
+    def step(self, tau: Any, h_s: float) -> Sequence[Any]:
+        self.arm.move(tau, h_s)
+        return self.arm.q, self.arm.qd
+
+
+class Torn(Arm):
+    """A plant that fails at its 200th step, in a way."""
+
+    def __init__(self, facts: PlantContext, how: str = "raise") -> None:
+        super().__init__(facts)
+        self.how, self.steps = how, 0
+
+    def step(self, tau: Any, h_s: float) -> Any:
+        self.steps += 1
+        q, qd = super().step(tau, h_s)
+        if self.steps < 200:
+            return q, qd
+        if self.how == "raise":
+            raise RuntimeError("the belt is torn")
+        return {
+            "nan": (q, [math.nan, 0.0]),
+            "one": (q[:1], qd),
+            "alone": (q,),
+            "nothing": None,
+            "touch": (q, qd, [0.0]),
+        }[self.how]
+
+
+class NoHand:
+    """Has no act."""

@@ -1,0 +1,189 @@
+"""Hands and plants of one's own in a live session: the same numbers as in virtual time, bit for bit."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sites.hand_process import HandProcess
+from tests.own_code import Circle, Failing, Follower
+from trilat_net.core.own_hand import HandProgram
+from trilat_net.errors import PlantFailed, RunFailed
+from trilat_net.execution.verify import verify
+from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.bus import Bus
+from trilat_net.net.requests import HandMessage
+from trilat_net.net.topics import HAND, key
+from trilat_net.net.wire import encode
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.operators.own_hand import place_own_hand
+
+from .relay import RelayClock
+from .sessions import SESSION, Session
+
+SIGNALS = ("q", "qd", "tau", "q_des", "hand")
+MS_NS = 1_000_000
+
+
+def at_m2(kind: str, **keys: Any) -> Scenario:
+    hand = {"kind": "own", "class": f"tests.own_code:{kind}", **keys}
+    return load_scenario("paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0})
+
+
+def add_program(
+    session: Session, program: HandProgram, thinks_ns: int = 0, dies_ns: int | None = None
+) -> None:
+    """A program at m2 in a process of its own, which thinks for a time about each view."""
+
+    def run(clock: RelayClock) -> None:
+        at = place_own_hand(session.scenario, "m2")
+        assert at is not None
+        with HandProcess(at, program, session.network.join(), clock, SESSION) as hand:
+            while not hand.over and (dies_ns is None or clock.monotonic_ns() < dies_ns):
+                asked = hand.asked
+                hand.serve()
+                clock.sleep_until(clock.monotonic_ns() + (thinks_ns if hand.asked > asked else 0) + MS_NS)
+
+    session.relay.add("hand", run)
+
+
+def assert_same(log: Log, other: Log) -> None:
+    for name in log.scenario.names:
+        for signal in SIGNALS:
+            assert np.array_equal(getattr(log[name], signal), getattr(other[name], signal)), (name, signal)
+
+
+def run(session: Session) -> Log:
+    session.relay.run()
+    return open_log(session.path)
+
+
+@pytest.mark.parametrize("kind", [Circle, Follower])
+def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path) -> None:
+    """In virtual time, live in the process of its site, and live in a process of its own."""
+    alone = at_m2(kind.__name__, process=True)
+    at = place_own_hand(alone, "m2")
+    assert at is not None
+    session = Session.whole(alone, tmp_path)
+    add_program(session, kind(at.describe()))
+    log = run(session)
+    assert_same(log, simulate_scenario(alone))
+    (tmp_path / "within").mkdir()
+    within = at_m2(kind.__name__)
+    found = run(Session.whole(within, tmp_path / "within"))
+    assert_same(found, simulate_scenario(within))
+    assert_same(log, found)
+    assert verify(log).passed
+
+
+def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path) -> None:
+    scenario = at_m2("Follower", process=True, delay_ms=20.0)
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    session = Session.whole(scenario, tmp_path)
+    add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
+    assert_same(run(session), simulate_scenario(scenario))
+
+
+def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
+    scenario = at_m2("Circle", process=True, delay_ms=20.0)
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    session = Session.whole(scenario, tmp_path)
+    add_program(session, Circle(at.describe()), thinks_ns=70 * MS_NS)
+    log = run(session)
+    assert any("hand: late" in text for text in session.said)
+    assert log["m2"].hand[-1, 2] == 1.0
+    assert verify(log).passed
+
+
+def test_a_killed_program_lets_go_and_the_session_goes_on(tmp_path: Path) -> None:
+    scenario = at_m2("Circle", process=True)
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    session = Session.whole(scenario, tmp_path)
+    add_program(session, Circle(at.describe()), dies_ns=2_100 * MS_NS)
+    log = run(session)
+    assert log.complete
+    held = log["m2"].hand[:, 2] > 0.0
+    assert held.any()
+    assert not held[-1]
+    assert {state.mode for name in log.sites for state in log[name].states} == {"run"}
+    assert verify(log).passed
+
+
+def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
+    scenario = at_m2("Failing", process=True)
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    session = Session.whole(scenario, tmp_path)
+    failing = Failing(at.describe(), at_s=0.4)
+    ended: list[str] = []
+
+    def serve(clock: RelayClock) -> None:
+        with HandProcess(at, failing, session.network.join(), clock, SESSION) as hand:
+            try:
+                while not hand.over:
+                    hand.serve()
+                    clock.sleep_until(clock.monotonic_ns() + MS_NS)
+            except RunFailed as failed:
+                ended.append(str(failed))
+
+    session.relay.add("hand", serve)
+    log = run(session)
+    assert ended == [
+        "the hand tests.own_code:Failing of m2 failed at tick 400: RuntimeError: no idea; it has let go"
+    ]
+    assert log["m2"].hand[430, 2] == 0.0
+    assert verify(log).passed
+
+
+def test_a_stranger_moves_no_arm_of_a_hand_of_ones_own(tmp_path: Path) -> None:
+    scenario = at_m2("Circle", process=True)
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    session = Session.whole(scenario, tmp_path)
+    add_program(session, Circle(at.describe()))
+
+    def meddle(clock: RelayClock) -> None:
+        bus: Bus = session.network.join()
+        publish = bus.publisher(key(SESSION, "m2", HAND))
+        for n in range(400):
+            moved = HandMessage(
+                site="m2", boot=7, source="page", n=n, target=[9.0, 9.0], sent_ns=clock.monotonic_ns()
+            )
+            publish(encode(moved))
+            publish(b"\x00 nothing")
+            clock.sleep_until(clock.monotonic_ns() + 5 * MS_NS)
+
+    session.relay.add("stranger", meddle)
+    assert_same(run(session), simulate_scenario(scenario))
+    assert any("hand: stranger" in text for text in session.said)
+
+
+@pytest.mark.parametrize("how", ["raise", "nan"])
+def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> None:
+    scenario = at_m2("Failing", settings={"how": how})
+    log = run(Session.whole(scenario, tmp_path))
+    assert_same(log, simulate_scenario(scenario))
+    assert [event.text for event in log.events if event.kind == "hand" and "failed at tick 300" in event.text]
+    assert log.complete
+
+
+def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
+    scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0})
+    log = run(Session.whole(scenario, tmp_path))
+    assert_same(log, simulate_scenario(scenario))
+    assert verify(log).passed
+
+
+def test_a_plant_that_fails_ends_the_run_named(tmp_path: Path) -> None:
+    scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Torn", "duration_s": 1.0})
+    ends: dict[str, object] = {}
+    log = run(Session.whole(scenario, tmp_path, ends=ends))
+    assert isinstance(ends["s"], PlantFailed)
+    assert "the belt is torn" in str(ends["s"])
+    assert [event.text for event in log.events if event.kind == "failed" and event.member == "s"]
+    assert verify(log).passed
