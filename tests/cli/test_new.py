@@ -64,7 +64,7 @@ def test_skeletons_of_hand_and_plant_run(kind: str, key: str, tmp_path: Path) ->
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["hand", "plant"])
 def test_tests_of_skeletons_pass(kind: str, tmp_path: Path) -> None:
-    _, test = (tn.new_hand if kind == "hand" else tn.new_plant)(tmp_path / f"my_{kind}.py")
+    _, test = (tn.new_hand if kind == "hand" else tn.new_plant)(tmp_path / f"own_{kind}.py")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", test.name]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout

@@ -1,4 +1,4 @@
-"""An experiment as a Gymnasium environment: checked by Gymnasium, a function of its seed, and saved as logs."""
+"""An experiment as a Gymnasium environment: checked by it, a function of its seed, and saved as logs."""
 
 from pathlib import Path
 from typing import Any

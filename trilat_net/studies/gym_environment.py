@@ -25,13 +25,15 @@ from ..core.ticks import tick_ns
 from ..core.vectors import Array
 from ..errors import UsageError
 from ..execution.fused import FusedRun
-from ..execution.virtual import simulate_scenario
+from ..execution.virtual import write_virtual_log
+from ..log.log_file import LogFile
+from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
 from ..scenario.operators.own_hand import HandSite
 
 ENV_ID = "trilat_net/Teleoperation-v0"
-FAR_RAD, FAST_RAD_S, FAR_S = 1e3, 1e3, 1e6
+FAR, FAR_S = 1e3, 1e6
 """Bounds of what is observed, where nothing tighter is known."""
 
 
@@ -153,9 +155,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise UsageError(f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}")
         self._every = self._base.sites[user].rate_hz // rate_hz
         far = self._place(self._base).describe()
-        self._most = (
-            far.limit if far.mode == "force" else FAR_RAD if far.mode == "joint" else self._find_reach()
-        )
+        self._most = far.limit if far.mode == "force" else self._find_reach()
         self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), np.float64)
         self._begin(self._base)
         self.task.begin(np.random.default_rng(0), self._look())
@@ -209,7 +209,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         observed = self._observe(self._look())
         return spaces.Dict(
             {
-                name: spaces.Box(-bounds.get(name, FAR_RAD), bounds.get(name, FAR_RAD), one.shape, np.float64)
+                name: spaces.Box(-bounds.get(name, FAR), bounds.get(name, FAR), one.shape, np.float64)
                 for name, one in observed.items()
             }
         )
@@ -218,7 +218,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         view = scene.view
         own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
         peers = {f"peer_{name}": np.array([getattr(one, name) for one in view.peers]) for name in _OF_PEERS}
-        flat = {name: np.clip(one, -FAR_RAD, FAR_RAD) for name, one in {**own, **peers}.items()}
+        flat = {name: np.clip(one, -FAR, FAR) for name, one in {**own, **peers}.items()}
         facts = {"alpha": [one.alpha for one in view.peers], "age_s": [one.age_s for one in view.peers]}
         more = {name: np.array(one) for name, one in {**facts, "grip": [view.grip]}.items()}
         return flat | more | {"goal": np.array(self.task.goal, dtype=np.float64)}
@@ -282,9 +282,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
                 hand.hand.decide(k, actions[k // self._every].tolist())
             return hand.take(k, site.arrays)
 
-        lasts_s = max(self._k, 1) / self._tick_rate_hz
-        log = simulate_scenario(replace(self.scenario, duration_s=lasts_s), hands={self._user: act})
-        return log.save(path, force=force)
+        lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
+        with LogFile(Path(path), force=force) as stream:
+            write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: act})
+        return Path(path)
 
 
 _OF_PEERS = ("q", "qd", "tau_x")
