@@ -27,7 +27,7 @@ from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.own_hand import place_own_hand
+from trilat_net.scenario.operators.program_hand import place_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 
 from .monitor import SessionDisplay, SessionMonitor

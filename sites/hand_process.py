@@ -24,7 +24,7 @@ from trilat_net.net.requests import HandMessage, HandViewMessage
 from trilat_net.net.wire import decode
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, find_site
-from trilat_net.scenario.operators.own_hand import HandSite, make_program, place_own_hand
+from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
 
 POLL_NS = 500_000
 HERE_NS = 100_000_000

@@ -23,7 +23,7 @@ from trilat_net.net.requests import HandMessage, HandViewMessage, PeerSeen
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators.kernel_operators import LiveHand
-from trilat_net.scenario.operators.own_hand import HandPlayer, HandSite
+from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""

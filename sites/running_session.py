@@ -219,7 +219,7 @@ def session(
 def start(*words: str | Path) -> "subprocess.Popen[bytes]":
     """Starts a process of a session, as in a terminal; it runs until its end, or until it is terminated.
 
-    The commands are `trilat site`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
+    The commands are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
 
     >>> recorder = tn.start("record", "--session", "paper", "-o", "run.mcap")  # doctest: +SKIP
     >>> player = tn.start("replay", "run.mcap", "--rate", "2")  # doctest: +SKIP

@@ -33,7 +33,7 @@ from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, to_core_change
 from trilat_net.scenario.imported_code import ImportedLaw
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
-from trilat_net.scenario.operators.own_hand import HandPlayer, make_program, place_own_hand
+from trilat_net.scenario.operators.program_hand import HandPlayer, make_program, place_own_hand
 from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder

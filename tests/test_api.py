@@ -30,7 +30,7 @@ def test_what_a_key_completes_is_what_there_is() -> None:
 COUNTERPARTS = {
     "import_trace": ["trace import"],
     "run": ["demo"],
-    "start": ["live", "site", "record", "watch", "router", "ros2", "replay"],
+    "start": ["live", "site", "hand", "record", "watch", "router", "ros2", "replay"],
     "session": ["ping", "stop", "enable", "reset", "set link", "set dominance"],
     "simulate": ["sim"],
     "compare": ["compare"],
@@ -46,7 +46,7 @@ COUNTERPARTS = {
     "load_scenario": ["scenario show"],
     "describe_scenario": ["scenario check"],
     "read_template": ["scenario new"],
-    "new_law": ["new law"],
+    **{f"new_{kind}": [f"new {kind}"] for kind in ("law", "hand", "plant")},
     "create_keys": ["keys new"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],

@@ -31,6 +31,7 @@ if _TYPE_CHECKING:
     from .api import export as export
     from .api import info as info
     from .api import linear as linear
+    from .api import make_env as make_env
     from .api import margin as margin
     from .api import metrics as metrics
     from .api import recover as recover
@@ -65,7 +66,6 @@ if _TYPE_CHECKING:
     from .scenario.skeletons import new_hand as new_hand
     from .scenario.skeletons import new_law as new_law
     from .scenario.skeletons import new_plant as new_plant
-    from .studies.gym_environment import make_env as make_env
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -77,7 +77,7 @@ _NAMES = {
     "sites.network_benchmark": "ping_benchmark",
     "sites.running_session": "hand session start",
     "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify check_file compare export info linear margin metrics recover report "
+    "trilat_net.api": "bench certify check_file compare export info linear make_env margin metrics recover report "
     "simulate sweep tune verify view",
     "trilat_net.core.compiled_law": "compiled",
     "trilat_net.core.own_hand": "HandContext HandView",
@@ -94,7 +94,6 @@ _NAMES = {
     "trilat_net.scenario.own_plant": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
-    "trilat_net.studies.gym_environment": "make_env",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

@@ -16,7 +16,7 @@ from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.imported_code import allowed_code
-from trilat_net.scenario.operators.own_hand import HandPlayer, place_own_hand
+from trilat_net.scenario.operators.program_hand import HandPlayer, place_own_hand
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
 

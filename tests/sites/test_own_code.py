@@ -18,7 +18,7 @@ from trilat_net.net.requests import HandMessage
 from trilat_net.net.topics import HAND, key
 from trilat_net.net.wire import encode
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.own_hand import place_own_hand
+from trilat_net.scenario.operators.program_hand import place_own_hand
 
 from .relay import RelayClock
 from .sessions import SESSION, Session

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import trilat_net as tn
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.studies.gym_environment import ENV_ID, Judgement, Reach, Scene, TeleoperationEnv
+from trilat_net.studies.gym_environment import ENV_ID, Judgement, ReachTask, Scene, TeleoperationEnv
 
 VARY = {"link.delay_ms": (0.0, 300.0)}
 
@@ -105,7 +105,7 @@ def test_episodes_end_at_their_duration() -> None:
     assert ends == [(False, False)] * 9 + [(False, True)]
 
 
-class Still(Reach):
+class Still(ReachTask):
     """Is done at once."""
 
     def judge(self, scene: Scene) -> Judgement:  # noqa: ARG002 - as all tasks
@@ -120,7 +120,7 @@ def test_a_task_of_ones_own_judges() -> None:
 
 
 def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
-    task, random = Reach(radius_m=0.3), np.random.default_rng(1)
+    task, random = ReachTask(radius_m=0.3), np.random.default_rng(1)
     start = np.array([1.0, 0.5])
     scene = Scene(0.0, {}, {"s": start}, None)  # type: ignore[arg-type]
     goals = []

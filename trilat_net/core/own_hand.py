@@ -58,6 +58,9 @@ class HandContext(NamedTuple):
 class HandView(NamedTuple):
     """What a hand of one's own sees at a tick, by what its site knows then.
 
+    >>> def act(self, now: tn.HandView) -> list[float]:
+    ...     return now.pose + 0.3 * (self.goal_m - now.pose)
+
     Attributes:
         k: the tick.
         t_s: its nominal time since the epoch, s.

@@ -46,7 +46,7 @@ from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
-from ..scenario.operators.own_hand import make_hand_players
+from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.validate import refuse_external_arms
 
 

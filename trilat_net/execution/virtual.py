@@ -45,7 +45,7 @@ from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
-from ..scenario.operators.own_hand import HandPlayer, make_hand_players
+from ..scenario.operators.program_hand import HandPlayer, make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms

@@ -17,7 +17,7 @@ import msgspec
 from ..errors import ScenarioError, UsageError
 from ..files import make_folder, write_whole
 from .imported_code import CodeConsent, ImportedLaw, allowed_code, check_class, read_code
-from .operators.own_hand import ProgramHand
+from .operators.program_hand import ProgramHand
 from .own_plant import OwnPlant
 
 if TYPE_CHECKING:

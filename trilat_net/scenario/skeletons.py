@@ -33,12 +33,20 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Does as `new_law` for a hand: a program that acts as a user; the command is `trilat new hand`."""
+    """Writes the skeleton of a hand, a program that acts as a user, as `new_law`: `trilat new hand`.
+
+    >>> [path.name for path in tn.new_hand("myhand.py")]
+    ['myhand.py', 'test_myhand.py']
+    """
     return _write_skeleton("hand", Path(path), force=force)
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Does as `new_law` for a plant: what moves an arm; the command is `trilat new plant`."""
+    """Writes the skeleton of a plant, which moves an arm, as `new_law`: `trilat new plant`.
+
+    >>> [path.name for path in tn.new_plant("myplant.py")]
+    ['myplant.py', 'test_myplant.py']
+    """
     return _write_skeleton("plant", Path(path), force=force)
 
 

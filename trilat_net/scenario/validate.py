@@ -27,7 +27,7 @@ from .distributions import dotted_key
 from .expect import find_expect_problem
 from .imported_code import ImportedLaw
 from .operators import kernel_operators
-from .operators.own_hand import ProgramHand
+from .operators.program_hand import ProgramHand
 from .scenario_types import Change, OnStale, Scenario, SiteSpec
 
 RANK_TOLERANCE = 1e-6

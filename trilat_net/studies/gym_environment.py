@@ -30,7 +30,7 @@ from ..log.log_file import LogFile
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
-from ..scenario.operators.own_hand import HandSite
+from ..scenario.operators.program_hand import HandSite
 
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR, FAR_S = 1e3, 1e6
@@ -61,7 +61,7 @@ class Judgement(NamedTuple):
     failed: bool = False
 
 
-class Task(Protocol):
+class EpisodeTask(Protocol):
     """What is to be done in an episode."""
 
     goal: Array
@@ -75,7 +75,7 @@ class Task(Protocol):
         """Returns the reward of a step, and whether the task is done or has failed."""
 
 
-class Reach:
+class ReachTask:
     """The slave's end effector is brought to a place that is drawn, and stays there.
 
     The reward of a step is minus the distance, m, times the step, s; and 1 once it was there for `stay_s`.
@@ -143,13 +143,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         rate_hz: int = 50,
         delay_ms: float = 20.0,
         duration_s: float | None = None,
-        task: Task | None = None,
+        task: EpisodeTask | None = None,
         vary: Mapping[str, Sequence[Any]] = {},
         leads: str = "s",
     ) -> None:
         self._user, self._mode, self._rate_hz, self._delay_s = user, mode, rate_hz, delay_ms * 1e-3
         self._vary, self._leads = vary, leads
-        self.task: Task = task or Reach(leads)
+        self.task: EpisodeTask = task or ReachTask(leads)
         self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
         if self._base.sites[user].rate_hz % rate_hz:
             raise UsageError(f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}")
@@ -229,9 +229,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         peers = self.scenario.peers(self._leads)
         shares = dict(zip(peers, row["alpha"].tolist(), strict=True))
         others = {name: share for name, share in shares.items() if name != self._user}
-        first = max(others, key=lambda name: others[name])
+        first = max(others, key=lambda name: others[name], default=self._user)
         return {
-            "is_intervention": others[first] > shares.get(self._user, 0.0),
+            "is_intervention": others.get(first, 0.0) > shares.get(self._user, 0.0),
             "teleop_action": scene.end_effector_m[first],
             "dominance": shares,
             "t_s": scene.t_s,
@@ -297,33 +297,6 @@ def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:
     if isinstance(of, tuple) and numbers:
         return float(random.uniform(*of))
     return of[int(random.integers(len(of)))]
-
-
-def make_env(
-    scenario: Any = "paper",
-    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - as in all of the interface
-    **more: Any,
-) -> TeleoperationEnv:
-    """Returns an experiment as a Gymnasium environment, in which one user is trained.
-
-    >>> env = tn.make_env("two_sites", user="m", duration_s=1)
-    >>> observation, info = env.reset(seed=1)
-    >>> observation["peer_q"].shape
-    (1, 2)
-
-    Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        set: overrides, as in `{"link.delay_ms": 100}`.
-        more: user: the site whose arm is acted on. mode: "tip", "joint" or "force", see a live hand. rate_hz:
-            steps a second. delay_ms: from what is seen to what is done. duration_s: of an episode. task: what
-            is to be done, by default `Reach`. leads: the site that works. vary: what each episode draws, by
-            key a list, or a pair of numbers.
-
-    Raises:
-        ScenarioError: the scenario or an override is not valid.
-        UsageError: the site or the rate is none.
-    """
-    return TeleoperationEnv(scenario, set, **more)
 
 
 if ENV_ID not in gymnasium.registry:
