@@ -77,8 +77,8 @@ _NAMES = {
     "sites.network_benchmark": "ping_benchmark",
     "sites.running_session": "hand session start",
     "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify check_file compare export info linear make_env margin metrics recover report "
-    "simulate sweep tune verify view",
+    "trilat_net.api": "bench certify check_file compare export info linear make_env margin metrics recover "
+    "report simulate sweep tune verify view",
     "trilat_net.core.compiled_law": "compiled",
     "trilat_net.core.own_hand": "HandContext HandView",
     "trilat_net.core.user_law": "LawContext LawInput",

@@ -504,7 +504,7 @@ def make_env(
         ScenarioError: the scenario or an override is not valid.
         UsageError: the site or the rate is none, or Gymnasium is not installed.
     """
-    import_extra("gymnasium", "gym", "an environment")
+    import_extra("gymnasium", "gym", "environments")
     from .studies.gym_environment import TeleoperationEnv
 
     how: dict[str, Any] = {"mode": mode, "rate_hz": rate_hz, "delay_ms": delay_ms, "duration_s": duration_s}

@@ -28,6 +28,8 @@ class SimulatedArm:
     Attributes:
         q: joint angles, rad, or m of a prismatic joint, shape (n,).
         qd: their velocities.
+        chain: its joints, gravity and end effector.
+        theta: the inertial parameters of its links, ten each, see `core.chain`.
 
     Raises:
         ScenarioError: there is no such site.
@@ -39,14 +41,15 @@ class SimulatedArm:
         arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True)
         assert arm.chain is not None
         self.q, self.qd = np.array(spec.q0_rad), np.array(spec.qd0_rad_s)
+        self.chain, self.theta = arm.chain, heavier * arm.theta
         self._joints = build_chain(arm.chain.joints, MAX_JOINTS)
-        self._theta, self._gravity = heavier * arm.theta, np.array(arm.chain.gravity_m_s2)
+        self._gravity = np.array(arm.chain.gravity_m_s2)
 
     def accelerate(self, torque: ArrayLike) -> Array:
         """Returns the accelerations under a torque ON the joints, N m, shape (n,), rad/s^2; nothing moves."""
         found = np.zeros_like(self.q)
         place_joints(self._joints, self.q)
-        told = (self._theta, self._gravity, self.q, self.qd, np.asarray(torque, dtype=np.float64))
+        told = (self.theta, self._gravity, self.q, self.qd, np.asarray(torque, dtype=np.float64))
         find_acceleration(self._joints, *told, found)
         return found
 
