@@ -18,7 +18,7 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
         ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_d"}, "sites.s.control.gravity", "p_d takes"),
         ("two_sites", {**OUTSIDE, "sites.s.control.law": "pd_d"}, "sites.s.control.gravity", "pd_d takes"),
         ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_f"}, "sites.s.control.gravity", "p_f takes"),
-        ("two_sites", {"sites.m.plant": "external"}, "sites.m.hands", "is pushed outside of it"),
+        ("two_sites", {"sites.m.plant": "external"}, "sites.m.hands", "is pushed there"),
     ],
 )
 def test_a_law_that_cannot_do_its_work_is_refused(

@@ -1,0 +1,68 @@
+"""A hand of one's own over a real network: in its site's process, in its own, and killed."""
+
+import signal
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from trilat_net.log.log_reader import Log, open_log
+
+from .processes import Process, Session, Stage
+
+SIGNALS = ("q", "qd", "tau", "hand")
+
+
+def overrides(*, process: bool) -> list[str]:
+    keys = f'kind="own", class="my_hand:MyHand", delay_ms=100, process={str(process).lower()}'
+    hand = f"sites.m2.hands=[{{{keys}}}]"
+    return ["--set", hand, "--set", "link.delay_ms=200", "--duration", "6"]
+
+
+def assert_bits_of_virtual_time(log: Log) -> None:
+    """Up to the first sample or decision that came late, if one did."""
+    virtual = tn.simulate(log)
+    for name in log.sites:
+        for signal_ in SIGNALS:
+            assert np.array_equal(getattr(log[name], signal_), getattr(virtual[name], signal_)), (
+                name,
+                signal_,
+            )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("process", [False, True])
+def test_records_are_those_of_virtual_time(
+    process: bool, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(stage.folder)
+    tn.new_hand("my_hand.py")
+    running = stage.start("demo", "demo", "paper", *overrides(process=process), "--out", "out")
+    assert running.code(120.0) == 0, running
+    log = open_log(stage.folder / "out" / "run.mcap", law=stage.folder / "my_hand.py")
+    assert log.complete
+    assert tn.verify(log).passed
+    assert log["m2"].hand[-1, 0] == 1.0
+    assert_bits_of_virtual_time(log)
+
+
+@pytest.mark.long
+def test_a_killed_program_lets_go_and_the_others_go_on(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SIGKILL in the middle: silence of 200 ms, a grip that fades within 100 ms, no site that holds."""
+    monkeypatch.chdir(stage.folder)
+    tn.new_hand("my_hand.py")
+    chosen = overrides(process=True)
+    session = Session(stage, "paper", ("m1", "m2", "s"), *chosen)
+    endpoint = session.endpoints[1]
+    words = ("hand", "m2", "--scenario", "paper", "--session", "t", "--connect", endpoint, *chosen)
+    program: Process = stage.start("hand", *words)
+    session.all()
+    session.processes["m2"].prints("takes hold")
+    program.signal(signal.SIGKILL)
+    session.ends_well()
+    log = open_log(session.log)
+    held = log["m2"].hand[:, 2] > 0.0
+    assert held.any()
+    assert not held[-1]
+    assert {state.mode for name in log.sites for state in log[name].states} == {"run"}
+    assert tn.verify(log).passed
