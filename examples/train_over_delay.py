@@ -106,11 +106,9 @@ def report(found: list[dict[str, Any]]) -> dict[str, tuple[float, float, float]]
     print(f"mean distance of the slave from its goal, mm, {len(found)} seeds, 95 % interval of the mean")
     spans = {name: interval(1e3 * values) for name, values in columns.items()}
     for name, (mean, low, high) in spans.items():
-        what = (
-            f"trained -> tested: {name}"
-            if "->" in name
-            else f"at {hard}: trained at {calm}, minus trained there"
-        )
+        what = f"trained -> tested: {name}"
+        if "->" not in name:
+            what = f"at {hard}: trained at {calm}, minus trained there"
         print(f"  {what:<62} {mean:7.1f}  [{low:.1f}, {high:.1f}]")
     return spans
 

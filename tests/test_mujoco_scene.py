@@ -40,9 +40,8 @@ def test_an_arm_of_a_urdf_is_the_same_arm() -> None:
 
 
 def test_the_box_is_pushed_and_the_users_feel_it() -> None:
-    free, box = (
-        tn.simulate("push.toml", {"sites.s.plant.thing": thing}, duration_s=6) for thing in ("nothing", "box")
-    )
+    things = ({"sites.s.plant.thing": thing} for thing in ("nothing", "box"))
+    free, box = (tn.simulate("push.toml", thing, duration_s=6) for thing in things)
     assert np.abs(free["s"].tau_x).max() == 0.0
     assert np.abs(box["s"].tau_x).max() > 5.0
     assert np.abs(box["m1"].q[-1] - free["m1"].q[-1]).max() > 0.01

@@ -10,7 +10,7 @@ from trilat_net.log.log_reader import Log, open_log
 
 from .processes import Process, Session, Stage
 
-SIGNALS = ("q", "qd", "tau", "hand")
+VECTORS = ("q", "qd", "tau", "hand")
 
 
 def overrides(*, process: bool) -> list[str]:
@@ -20,14 +20,11 @@ def overrides(*, process: bool) -> list[str]:
 
 
 def assert_bits_of_virtual_time(log: Log) -> None:
-    """Up to the first sample or decision that came late, if one did."""
     virtual = tn.simulate(log)
     for name in log.sites:
-        for signal_ in SIGNALS:
-            assert np.array_equal(getattr(log[name], signal_), getattr(virtual[name], signal_)), (
-                name,
-                signal_,
-            )
+        for vector in VECTORS:
+            live, ours = getattr(log[name], vector), getattr(virtual[name], vector)
+            assert np.array_equal(live, ours), (name, vector)
 
 
 @pytest.mark.long

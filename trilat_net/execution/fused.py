@@ -361,7 +361,17 @@ class FusedRun:
         self.approach(other, 0.0)
 
     def approach(self, other: "FusedRun", factor: float) -> None:
-        """Becomes another run plus so much of its difference to that, whose records it has made by now."""
+        """Becomes another run plus so much of its difference to that, whose records it has made by now.
+
+        Raises:
+            ScenarioError: a hand of one's own acts, of which nothing can be copied.
+        """
+        for i in self._hands:
+            raise ScenarioError(
+                "is a hand of one's own, which has no twin: judge runs by verdict, or a log by certify",
+                path=f"sites.{self._scenario.names[i]}.hands",
+                source=self._scenario.name,
+            )
         self._state.approach(other._state, factor)
         self._changes, self._taken_ticks = deque(other._changes), list(other._taken_ticks)
         for i, law in self._laws.items():
