@@ -356,6 +356,11 @@ class FusedRun:
         held += [] if arrays.channel is None else [*arrays.channel]
         return RunState([*held, *([] if laws is None else [laws.rows, laws.sent])])
 
+    @property
+    def has_programs(self) -> bool:
+        """True if hands of one's own act in it."""
+        return bool(self._hands)
+
     def copy_state(self, other: "FusedRun") -> None:
         """Becomes equal to another run of the same scenario, which is planned alike."""
         self.approach(other, 0.0)
@@ -363,15 +368,9 @@ class FusedRun:
     def approach(self, other: "FusedRun", factor: float) -> None:
         """Becomes another run plus so much of its difference to that, whose records it has made by now.
 
-        Raises:
-            ScenarioError: a hand of one's own acts, of which nothing can be copied.
+        A run that has programs cannot.
         """
-        for i in self._hands:
-            raise ScenarioError(
-                "is a hand of one's own, which has no twin: judge runs by verdict, or a log by certify",
-                path=f"sites.{self._scenario.names[i]}.hands",
-                source=self._scenario.name,
-            )
+        assert not self.has_programs
         self._state.approach(other._state, factor)
         self._changes, self._taken_ticks = deque(other._changes), list(other._taken_ticks)
         for i, law in self._laws.items():

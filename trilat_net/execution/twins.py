@@ -237,7 +237,8 @@ class _TwinRuns:
             if self._pushed[n] and self._died[n] is None:
                 twin.step_to(last_ns)
                 self._measure(n, kept, twin.take_records())
-                self._renew(n, end_s)
+                if not twin.has_programs:  # whose state no twin can take over
+                    self._renew(n, end_s)
             elif not self._pushed[n] and self._pushes[n].at_s <= end_s:
                 twin.copy_state(self._run)
                 self._push(n, end_s)
