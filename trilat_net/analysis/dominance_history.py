@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from ..core.dominance import find_reach, perron_vector
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
+from ..errors import UsageError
 from ..log.log_reader import Log
+from ..log.record_columns import Ints
 from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
@@ -50,11 +52,71 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     Raises:
         LogError: a record names a change that is none.
     """
-    start, scripted = list_scripted_ramps(log.scenario, site)
-    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
-    planned = evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    planned = evaluate_ramps(*list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz)
     lost = find_lost_peers(log, site, t_s)
     return _share_out(planned, ~lost) if lost.any() else planned
+
+
+def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
+    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and ordered.
+
+    Raises:
+        LogError: a record names a change that is none.
+    """
+    start, scripted = list_scripted_ramps(log.scenario, site)
+    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
+    return start, [*scripted, *ordered]
+
+
+class UserShares(NamedTuple):
+    """The shares of the users in a slave's reference, over K times: who leads it.
+
+    Attributes:
+        slave: the scenario's first slave.
+        users: the masters, in scenario order.
+        program: which of them a program holds, by its place among them.
+        shares: alpha of the slave for each of them, shape (K, U).
+    """
+
+    slave: str
+    users: tuple[str, ...]
+    program: int
+    shares: Array
+
+    @property
+    def lead(self) -> Ints:
+        """The user with the largest share, by its place, shape (K,); the program, if no share is larger."""
+        tied = self.shares[:, self.program] >= self.shares.max(axis=1)
+        return np.where(tied, self.program, self.shares.argmax(axis=1))
+
+    @property
+    def intervention(self) -> NDArray[np.bool_]:
+        """True where the share of another user is above that of the program, shape (K,)."""
+        found: NDArray[np.bool_] = self.lead != self.program
+        return found
+
+
+def find_slave(scenario: Scenario) -> str:
+    """Returns the first slave of a scenario; "" if there is none, or no master that it could follow."""
+    roles = {site: spec.role for site, spec in scenario.sites.items()}
+    slaves = [site for site, role in roles.items() if role == "slave"]
+    return slaves[0] if slaves and "master" in roles.values() else ""
+
+
+def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
+    """Returns the shares of the users in the reference of `find_slave`, whose alpha is given, shape (K, P).
+
+    The program is the user of that name, by default the last master.
+
+    Raises:
+        UsageError: there is no such user.
+    """
+    slave = find_slave(scenario)
+    users = tuple(site for site, spec in scenario.sites.items() if spec.role == "master")
+    if program and program not in users:
+        raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
+    columns = [scenario.peers(slave).index(user) for user in users]
+    return UserShares(slave, users, users.index(program or users[-1]), alpha[:, columns])
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
