@@ -131,8 +131,7 @@ class ShareHistory:
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario, self._site = scenario, site
-        planned = [change for change in scenario.timeline if change.dominance == site]
-        self._later = [scenario.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in planned]
+        self._later = scenario.scripted_ramps(site)
         self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
         self._before = self._ramp.alpha
 

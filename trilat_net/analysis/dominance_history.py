@@ -58,27 +58,21 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and ordered.
-
-    Raises:
-        LogError: a record names a change that is none.
-    """
+    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and ordered."""
     start, scripted = list_scripted_ramps(log.scenario, site)
     ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
     return start, [*scripted, *ordered]
 
 
 class UserShares(NamedTuple):
-    """The shares of the users in a slave's reference, over K times: who leads it.
+    """The shares of users in a slave's reference, over K times: who leads it.
 
     Attributes:
-        slave: the scenario's first slave.
         users: the masters, in scenario order.
         program: which of them a program holds, by its place among them.
         shares: alpha of the slave for each of them, shape (K, U).
     """
 
-    slave: str
     users: tuple[str, ...]
     program: int
     shares: Array
@@ -96,27 +90,27 @@ class UserShares(NamedTuple):
         return found
 
 
-def find_slave(scenario: Scenario) -> str:
-    """Returns the first slave of a scenario; "" if there is none, or no master that it could follow."""
-    roles = {site: spec.role for site, spec in scenario.sites.items()}
-    slaves = [site for site, role in roles.items() if role == "slave"]
-    return slaves[0] if slaves and "master" in roles.values() else ""
+def find_users(scenario: Scenario) -> tuple[str, tuple[str, ...]]:
+    """Returns the first slave, "" if there is none, and the users whom it follows, the masters."""
+    found: dict[str, list[str]] = {"slave": [], "master": []}
+    for site, spec in scenario.sites.items():
+        found[spec.role].append(site)
+    return found["slave"][0] if found["slave"] else "", tuple(found["master"])
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the shares of the users in the reference of `find_slave`, whose alpha is given, shape (K, P).
+    """Returns the shares of `find_users`, by alpha of the slave, shape (K, P).
 
-    The program is the user of that name, by default the last master.
+    The program is the user of that name, by default the last one.
 
     Raises:
         UsageError: there is no such user.
     """
-    slave = find_slave(scenario)
-    users = tuple(site for site, spec in scenario.sites.items() if spec.role == "master")
-    if program and program not in users:
+    slave, users = find_users(scenario)
+    if (program := program or users[-1]) not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
     columns = [scenario.peers(slave).index(user) for user in users]
-    return UserShares(slave, users, users.index(program or users[-1]), alpha[:, columns])
+    return UserShares(users, users.index(program), alpha[:, columns])
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
@@ -156,11 +150,7 @@ def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> Dominance
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's timeline."""
     start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
-    return start, [
-        scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
-        for change in scenario.timeline
-        if change.dominance == site
-    ]
+    return start, scenario.scripted_ramps(site)
 
 
 def forget_ramps(

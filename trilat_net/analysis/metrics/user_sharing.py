@@ -9,24 +9,24 @@ import numpy as np
 
 from ...core.task_space import PLACE
 from ...core.vectors import Array
-from ..aligned import AlignedRecords, find_latest_rows
-from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_slave, find_user_shares, list_ramps
+from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
+from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_shares, find_users, list_ramps
 from ..run_view import RunView
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
-_UNMOVED = Metric(None, "no user pushes", applies=False)
-_UNSHARED = Metric(None, "sites share no such coordinate", applies=False)
-_UNLED = Metric(None, "the lead never changes", applies=False)
-_UNCHANGED = Metric(None, "no share changes", applies=False)
+_NONE = "users share no such coordinate"
 _NO_INSTANT = "no instant of which every user has a record"
+
+
+def _unasked(why: str) -> Metric:
+    return Metric(None, why, applies=False)
 
 
 def read_user_shares(view: RunView) -> UserShares | Metric:
     """Returns the shares of the users at the slave's ticks, or why there are none."""
-    users = [site for site, spec in view.scenario.sites.items() if spec.role == "master"]
-    slave = find_slave(view.scenario)
+    slave, users = find_users(view.scenario)
     if not slave or len(users) < 2:
-        return Metric(None, "no two users share a slave", applies=False)
+        return _unasked("no two users share a slave")
     if absent := [site for site in (*users, slave) if site not in view.sites]:
         return Metric(None, f"no records of {', '.join(absent)}")
     return find_user_shares(view.scenario, view.sites[slave].dominance.alpha)
@@ -43,7 +43,7 @@ def measure_authority_effort(view: RunView, site: str) -> MetricValues:
     if site not in shared.users:
         return unavailable(USERS, "its hand is no user's", of="site", applies=False)
     records, torque, _ = view.sites[site]
-    row, recorded = find_latest_rows(view.sites[shared.slave].records, records.t_s)
+    row, recorded = find_latest_rows(view.sites[find_users(view.scenario)[0]].records, records.t_s)
     share = shared.shares[row, shared.users.index(site)]
     squares = np.einsum("kj,kj->k", torque.operator, torque.operator)
     effort = np.where(records.known & recorded, share * squares, 0.0)
@@ -72,7 +72,7 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
     shared = view.once(read_user_shares)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
-    known = view.sites[shared.slave].records.known
+    known = view.sites[find_users(view.scenario)[0]].records.known
     return {
         **_measure_disagreement(view, shared),
         "intervention_share": metric(float(shared.intervention[known].mean())),
@@ -82,30 +82,28 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
 
 def _measure_disagreement(view: RunView, shared: UserShares) -> MetricValues:
     runs = [view.shared[user] for user in shared.users]
-    t_s, pushes = runs[0].records.t_s, []
-    known = np.ones(len(t_s), dtype=np.bool_)
-    for run in runs:
-        row, recorded = find_latest_rows(run.records, t_s)
-        known &= recorded
-        pushes.append(run.torque.operator[row])
+    rows, known = find_common_rows([run.records for run in runs])
+    pushes = [run.torque.operator[row] for run, row in zip(runs, rows, strict=True)]
     torques = np.stack(pushes)[:, known]
     cancels, whole = cancelled_part(torques), np.abs(torques).sum()
-    places = 0 if view.scenario.sites[shared.slave].task.space == "joints" else PLACE
-    found = {"internal_share": metric(2.0 * cancels.sum() / whole) if whole else _UNMOVED}
+    places = 0 if view.scenario.sites[shared.users[0]].task.space == "joints" else PLACE
+    found = {"internal_share": metric(2.0 * cancels.sum() / whole) if whole else _unasked("no user pushes")}
     for unit, part in (("n", cancels[:, :places]), ("nm", cancels[:, places:])):
-        found[f"internal_rms_{unit}"] = metric(rms(part), _NO_INSTANT) if part.shape[1] else _UNSHARED
+        found[f"internal_rms_{unit}"] = (
+            metric(rms(part), _NO_INSTANT) if part.shape[1] else _unasked("sites share no such coordinate")
+        )
     return found
 
 
 def _measure_takeovers(view: RunView, shared: UserShares) -> MetricValues:
-    records = view.sites[shared.slave].records
-    ramps = sorted(list_ramps(view.log, shared.slave)[1], key=lambda ramp: ramp.start_ns)
+    records = view.sites[find_users(view.scenario)[0]].records
+    ramps = sorted(list_ramps(view.log, records.site)[1], key=lambda ramp: ramp.start_ns)
     spans = [(ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps]
     changed = np.flatnonzero(np.diff(shared.lead)) + 1
     taken = [_time_taken(float(records.t_s[row]), records.h_s, spans) for row in changed]
     return {
         "takeovers": metric(float(len(changed))),
-        "takeover_s": metric(max(taken)) if taken else _UNLED,
+        "takeover_s": metric(max(taken)) if taken else _unasked("the lead never changes"),
         "lead_jump": _compare_steps(records, spans),
     }
 
