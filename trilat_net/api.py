@@ -139,7 +139,7 @@ def export(
     """
     from .reporting.export import Exporter
 
-    exporter = Exporter(to, Path(out), settings, force=force)
+    exporter = Exporter(to, Path(out), force=force, settings=settings)
     given = [log] if isinstance(log, str | Path | Log) else log
     logs = [[one] if isinstance(one, Log) else open_logs(one) for one in given]
     exporter.export(*(one for found in logs for one in found))

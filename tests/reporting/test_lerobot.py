@@ -44,7 +44,7 @@ def without(*missing: tuple[float, float]) -> Log:
 
 
 def exported(folder: Path, *sources: Log, **settings: Any) -> Path:
-    Exporter("lerobot", folder / "set", settings).export(*sources)
+    Exporter("lerobot", folder / "set", settings=settings).export(*sources)
     return folder / "set"
 
 
@@ -120,7 +120,7 @@ def test_a_program_that_is_named_is_another_one(tmp_path: Path) -> None:
     assert not frames["intervention"].any()
     assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
     with pytest.raises(UsageError, match="the program holds one of a, b, not 'c'"):
-        Exporter("lerobot", tmp_path / "other", {"program": "c"}).export(log())
+        Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(log())
 
 
 def test_an_episode_ends_before_a_gap_and_nothing_bridges_it(tmp_path: Path) -> None:
@@ -190,11 +190,11 @@ def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("settings", "said"), [({"fps": "0"}, "not 0"), ({"fps": "x"}, "cannot be read")])
 def test_settings_that_are_none_are_refused(settings: dict[str, str], said: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=said):
-        Exporter("lerobot", tmp_path / "set", settings).export(log())
+        Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
 
 
 def test_a_form_without_settings_says_so(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="csv has no setting 'fps'; it has none"):
-        Exporter("csv", tmp_path / "set", {"fps": 30})
+        Exporter("csv", tmp_path / "set", settings={"fps": 30})
     with pytest.raises(UsageError, match="of one log"):
         Exporter("csv", tmp_path / "set").export(log(), log())

@@ -64,53 +64,40 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
     return start, [*scripted, *ordered]
 
 
+def find_users(scenario: Scenario) -> tuple[str, list[str]]:
+    """Returns the first slave, "" if there is none, and its users: the masters."""
+    slaves, users = (
+        [site for site, spec in scenario.sites.items() if spec.role == role] for role in ("slave", "master")
+    )
+    return next(iter(slaves), ""), users
+
+
 class UserShares(NamedTuple):
-    """The shares of users in a slave's reference, over K times: who leads it.
+    """Who of its users leads a slave, over K times. Where that is not the program, somebody intervenes.
 
     Attributes:
-        users: the masters, in scenario order.
-        program: which of them a program holds, by its place among them.
         shares: alpha of the slave for each of them, shape (K, U).
+        lead: the user with the largest share, by its place; the program, if no share is larger.
+        program: the user that a program holds, by its place.
     """
 
-    users: tuple[str, ...]
-    program: int
     shares: Array
-
-    @property
-    def lead(self) -> Ints:
-        """The user with the largest share, by its place, shape (K,); the program, if no share is larger."""
-        tied = self.shares[:, self.program] >= self.shares.max(axis=1)
-        return np.where(tied, self.program, self.shares.argmax(axis=1))
-
-    @property
-    def intervention(self) -> NDArray[np.bool_]:
-        """True where the share of another user is above that of the program, shape (K,)."""
-        found: NDArray[np.bool_] = self.lead != self.program
-        return found
-
-
-def find_users(scenario: Scenario) -> tuple[str, tuple[str, ...]]:
-    """Returns the first slave, "" if there is none, and the users whom it follows, the masters."""
-    found: dict[str, list[str]] = {"slave": [], "master": []}
-    for site, spec in scenario.sites.items():
-        found[spec.role].append(site)
-    return found["slave"][0] if found["slave"] else "", tuple(found["master"])
+    lead: Ints
+    program: int
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns the shares of `find_users`, by alpha of the slave, shape (K, P).
-
-    The program is the user of that name, by default the last one.
+    """Returns who leads the slave of `find_users`, by its alpha, shape (K, P).
 
     Raises:
-        UsageError: there is no such user.
+        UsageError: there is no such user; by default the program is the last one.
     """
     slave, users = find_users(scenario)
     if (program := program or users[-1]) not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
-    columns = [scenario.peers(slave).index(user) for user in users]
-    return UserShares(users, users.index(program), alpha[:, columns])
+    shares, place = alpha[:, [scenario.peers(slave).index(user) for user in users]], users.index(program)
+    tied = shares[:, place] >= shares.max(axis=1)
+    return UserShares(shares, np.where(tied, place, shares.argmax(axis=1)), place)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:

@@ -116,15 +116,14 @@ def log_export_command(
         form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
             site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
             episode for each log of the files and folders that are given.
-        settings: Setting of a form, repeatable: of lerobot fps=30 and program=m2, the site that a program
-            holds.
+        settings: Setting of a form, repeatable: of lerobot fps=30, and program=m2, who is none of the people.
         output: File or folder; default: next to FILE, named after it.
     """
     from ..log.log_reader import open_logs
     from ..reporting.export import Exporter
 
     given = {key: value for key, _, value in (one.partition("=") for one in settings or [])}
-    exporter = Exporter(form, output, given, force=force, log=files[0])
+    exporter = Exporter(form, output, force=force, log=files[0], settings=given)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         logs = open_logs(*files, progress=progress)
     for log in logs:

@@ -6,7 +6,7 @@ of every column, and its session. What can be refused is refused before anything
 
 import inspect
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,16 +26,14 @@ EXPORT_MANIFEST = "about.json"
 """File of an exported folder; it distinguishes such a folder from any other."""
 Written = Callable[[int], None]
 """Called with the number of records just written."""
-Settings = Mapping[str, Any] | tuple[()]
-"""Settings of a format by their names; texts are read as what they stand for."""
 
 
 class ExportFormat(NamedTuple):
     """A format of exports, `FORMAT` of a file in the folder `exports`.
 
     Attributes:
-        write: writes a log to a file, or into a folder, and tells how many records it has written since; it
-            returns what else is to be said of it, or None. Its keyword-only parameters are settings.
+        write: writes a log to a file, or into a folder, tells how many records it has written since, and
+            returns what else is to be said, or None; its keyword-only parameters are settings.
         ending: of the default path, after the name of the log.
         folder: whether it writes a folder.
         extra: the module that it imports, the optional dependency that has it, and what needs it; or ().
@@ -60,14 +58,14 @@ class Exporter:
     """
 
     def __init__(
-        self, form: str, path: Path | None, given: Settings = (), *, force: bool = False, log: Path = Path()
+        self, form: str, path: Path | None, *, force: bool = False, log: Path = Path(), settings: Any = ()
     ) -> None:
-        """Without a path it is next to the log, or its first part, and named after it."""
+        """Without a path it is next to the log, or its first part, and named after it; `settings` by name."""
         names = exports.list_export_formats()
         if form not in names:
             raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
         self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
-        self._settings = _read_settings(form, self._format.write, dict(given))
+        self._settings = _read_settings(form, self._format.write, dict(settings))
         name = log.name.removesuffix(".active").removesuffix(".mcap")
         self.path, self._force = path or log.parent / (name + self._format.ending), force
         self._manifest = EXPORT_MANIFEST if self._format.folder else None

@@ -10,7 +10,6 @@ import pytest
 import trilat_net
 from tests.analysis.logs import rewritten
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_whole
-from trilat_net.analysis.metrics.user_sharing import cancelled_part
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
@@ -41,23 +40,26 @@ to = { m1 = 0.25, m2 = 0.75 }
 ramp_s = RAMP
 """
 """400 ticks; m1 leads, and from tick 200 on m2 takes over."""
-PUSHES = {"m1": [3.0, 2.0], "m2": [-1.0, 1.0], "s": [0.0, 0.0]}
+PUSHES = {"m1": [3.0, 2.0], "m2": [-1.0, 1.0], "m3": [2.0, -3.0], "s": [0.0, 0.0]}
 """Of the hands ON the arms, N m."""
 
 
-def prescribed(ramp_s: float = 0.5, steps: Mapping[int, float] | None = None) -> Log:
-    """The slave's reference moves by 1 mrad a tick, by other steps where they are given."""
-    log = trilat_net.simulate(parse_scenario(TRIO.replace("RAMP", str(ramp_s))))
+def pushed(log: Log, steps: Mapping[int, float] | None = None) -> Log:
+    """The log with these pushes; references move by 1 mrad a tick, by other steps where they are given."""
     step = np.full(400, 1e-3)
     for tick, size in (steps or {}).items():
         step[tick] = size
-    way = np.cumsum(step)
+    way = np.cumsum(step).tolist()
 
     def change(state: Any) -> Any:
-        fields = {"tau_x": [-one for one in PUSHES[state.site]], "q_des": [float(way[state.tick]), 0.0]}
-        return msgspec.structs.replace(state, **fields)
+        tau_x = [-one for one in PUSHES[state.site]]
+        return msgspec.structs.replace(state, tau_x=tau_x, q_des=[way[state.tick], 0.0])
 
     return rewritten(log, change=change)
+
+
+def prescribed(ramp_s: float = 0.5, steps: Mapping[int, float] | None = None) -> Log:
+    return pushed(trilat_net.simulate(parse_scenario(TRIO.replace("RAMP", str(ramp_s)))), steps)
 
 
 def test_effort_of_a_hand_counts_by_its_share() -> None:
@@ -78,8 +80,12 @@ def test_what_cancels_is_the_smaller_of_opposed_torques() -> None:
 
 
 def test_three_users_cancel_up_to_the_torque_that_remains() -> None:
-    torques = np.array([[[2.0, 1.0]], [[-1.0, 1.0]], [[-3.0, 1.0]]])
-    assert cancelled_part(torques).tolist() == [[2.0, 0.0]]
+    """Of 3, -1 and 2 N m at joint 1 and 2, 1 and -3 at joint 2 the sums are 4 and 0: 1 and 3 N m cancel."""
+    text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace("RAMP", "0.5")
+    text = text.replace("[[timeline]]", "m3 = { s = 1.0 }\n[[timeline]]")
+    found = compute_log_metrics(pushed(trilat_net.simulate(parse_scenario(text)))).run
+    assert found["internal_rms_nm"].value == pytest.approx(3.0)
+    assert found["internal_share"].value == pytest.approx(8.0 / 12.0)
 
 
 def test_a_takeover_lasts_until_the_larger_share() -> None:

@@ -29,17 +29,16 @@ _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
     "observation.state": "angles, rad, and velocities, rad/s, of the slave's joints",
-    "action": "what the leading user commands, action.USER each of them: the angles of its arm, rad; in task "
-    "space the place, m, and turn, rad, of its end effector",
+    "action": "command of the leading user, action.USER of each: angles, rad; in task space a place, m, rad",
     "dominance": "share of each user in the slave's reference, Eq. (6); the largest one leads",
-    "tau_x": "external torque of Eq. (8) at the slave, N m, whose negative acts ON the arm; tau_x.USER what "
-    "the hand of each user feels",
+    "tau_x": "external torque of Eq. (8) at the slave, N m; tau_x.USER: what the hand of each user feels",
     "intervention": "true where another user than the program leads",
     "frame": "of each site the newest record at or before its time; nothing is interpolated",
 }
 _INDEX = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
 _PANDAS = {"pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})}
 """By this the reader of LeRobot, pandas, takes the texts of tasks for its index."""
+Names = dict[str, list[str]]
 Columns = dict[str, NDArray[Any]]
 """Columns of frames by the names of their features, shape (K, n) or (K,)."""
 
@@ -47,17 +46,16 @@ Columns = dict[str, NDArray[Any]]
 def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30, program: str = "") -> str:
     if fps < 1:
         raise UsageError(f"fps is a whole number of frames a second, not {fps}")
-    tasks = list(dict.fromkeys(log.scenario.title or log.scenario.name for log in logs))
-    names: dict[str, list[str]] = {}
-    parts: list[Columns] = []
-    sessions, lost = [], 0
+    tasks: dict[str, int] = {}
+    names: Names = {}
+    parts, sessions, lost = list[Columns](), [], 0
     for log in logs:
         rows, episode, left_out = _find_rows(log, fps)
         columns, found = _read_columns(log, rows, program)
         if (names := names or found) != found:
             raise LogError(f"{log.source}: its users and joints are not those of {logs[0].source}")
         columns["episode_index"] = episode + (parts[-1]["episode_index"][-1] + 1 if parts else 0)
-        task = tasks.index(log.scenario.title or log.scenario.name)
+        task = tasks.setdefault(log.scenario.title or log.scenario.name, len(tasks))
         parts.append({**columns, "task_index": np.full_like(episode, task)})
         sessions.append({**log.session, "scenario": log.scenario_text, "frames_left_out": left_out})
         lost += left_out
@@ -67,10 +65,12 @@ def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30
     starts = np.flatnonzero(np.diff(whole["episode_index"], prepend=-1))
     frame = index - starts[whole["episode_index"]]
     whole |= {"timestamp": (frame / fps).astype(np.float32), "frame_index": frame, "index": index}
-    _store(folder, fps, tasks, names, whole, [*starts.tolist(), len(index)])
-    version = collect_provenance()["version_trilat-net"]
-    about = {"exported_by": f"trilat-net {version}", "meanings": _MEANINGS, "sessions": sessions}
-    _store_json(folder / EXPORT_MANIFEST, {**about, "program": program or "the last user"})
+    texts = _store_tables(folder, whole, [*starts.tolist(), len(index)], list(tasks))
+    texts["meta/info.json"] = _describe_set(fps, names, whole, len(starts), len(tasks))
+    made_by = f"trilat-net {collect_provenance()['version_trilat-net']}, program {program or 'the last user'}"
+    texts[EXPORT_MANIFEST] = {"exported_by": made_by, "meanings": _MEANINGS, "sessions": sessions}
+    for place, content in texts.items():
+        (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
     return f"{len(index)} frames in {len(starts)} episodes; {lost} frames lie in gaps and are left out"
 
 
@@ -93,7 +93,7 @@ def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
     return {site: rows[frames] for site, rows in kept.items()}, episode, len(at_ns) - len(frames)
 
 
-def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Columns, dict[str, list[str]]]:
+def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Columns, Names]:
     """Returns the columns of all frames, and the names of their numbers."""
     slave, users = find_users(log.scenario)
     if not slave or not users:
@@ -103,8 +103,7 @@ def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Column
     joints = {site: list(log.scenario.arms[site].joint_names) for site in (slave, *users)}
 
     def read(site: str, field: str) -> Array:
-        found: Array = getattr(log[site], field)[rows[site]]
-        return found
+        return np.asarray(getattr(log[site], field)[rows[site]])
 
     task = log[slave].layout.task
     commands = [read(user, "x" if task else "q") for user in users]
@@ -115,17 +114,16 @@ def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Column
         ("observation.state", np.hstack([read(slave, "q"), read(slave, "qd")]), state),
         ("action", np.stack(commands)[shared.lead, np.arange(len(alpha))], commanded),
         *((f"action.{user}", one, commanded) for user, one in zip(users, commands, strict=True)),
-        ("dominance", shared.shares, list(users)),
+        ("dominance", shared.shares, users),
         ("tau_x", read(slave, "tau_x"), joints[slave]),
         *((f"tau_x.{user}", read(user, "tau_x"), joints[user]) for user in users),
     ]
     columns: Columns = {key: values.astype(np.float32) for key, values, _ in found}
-    return {**columns, "intervention": shared.intervention}, {key: names for key, _, names in found}
+    return {**columns, "intervention": shared.lead != shared.program}, {key: names for key, _, names in found}
 
 
-def _store(
-    folder: Path, fps: int, tasks: list[str], names: dict[str, list[str]], whole: Columns, edges: list[int]
-) -> None:
+def _store_tables(folder: Path, whole: Columns, edges: list[int], tasks: list[str]) -> dict[str, Any]:
+    """Stores the tables of a dataset, and returns its statistics by their place."""
     pa, parquet = import_extra("pyarrow", *_EXTRA[1:]), import_extra(*_EXTRA)
     vectors = {
         key: pa.FixedSizeListArray.from_arrays(one.ravel(), one[0].size) if one[0].size > 1 else one.ravel()
@@ -142,30 +140,28 @@ def _store(
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         with (folder / place).open("wb") as stream:  # a full disk is reported here, not by pyarrow
             parquet.write_table(table, stream)
-    _store_json(folder / "meta/stats.json", {key: _describe(one) for key, one in whole.items()})
-    info = {
+    return {"meta/stats.json": {key: _describe(one) for key, one in whole.items()}}
+
+
+def _describe_set(fps: int, names: Names, whole: Columns, episodes: int, tasks: int) -> dict[str, Any]:
+    return {
         "codebase_version": "v3.0",
         "robot_type": "trilat",
         "fps": fps,
-        "total_episodes": len(edges) - 1,
-        "total_frames": edges[-1],
-        "total_tasks": len(tasks),
+        "total_episodes": episodes,
+        "total_frames": len(whole["index"]),
+        "total_tasks": tasks,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": None,
-        "splits": {"train": f"0:{len(edges) - 1}"},
+        "splits": {"train": f"0:{episodes}"},
         "features": {
             key: {"dtype": str(one.dtype), "shape": [one[0].size], "names": names.get(key)}
             for key, one in whole.items()
         },
     }
-    _store_json(folder / "meta/info.json", info)
-
-
-def _store_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _describe_episode(whole: Columns, first: int, end: int, tasks: list[str]) -> dict[str, Any]:
