@@ -141,8 +141,8 @@ def export(
 
     exporter = Exporter(to, Path(out), force=force, settings=settings)
     given = [log] if isinstance(log, str | Path | Log) else log
-    logs = [[one] if isinstance(one, Log) else open_logs(one) for one in given]
-    exporter.export(*(one for found in logs for one in found))
+    paths = [one for one in given if not isinstance(one, Log)]
+    exporter.export(*(one for one in given if isinstance(one, Log)), *open_logs(*paths))
     return Path(out)
 
 

@@ -71,7 +71,7 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     assert "12 frames in 2" in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
     trilat(*command, "--set", "log=x", cwd=folder).refuses("no setting 'log'; it has fps, program")
     (folder / "none").mkdir()
-    trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses("there is no log in this folder")
+    trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses("no log is in this directory")
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:

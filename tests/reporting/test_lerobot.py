@@ -155,6 +155,17 @@ def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
     assert info(folder)["total_frames"] == 360
 
 
+def test_python_takes_paths_and_logs_together(tmp_path: Path) -> None:
+    """The path of a run of 0.2 s, and the log of it with another seed: six frames each, one task."""
+    first, second = (trilat_net.simulate("paper", duration_s=0.2, seed=seed) for seed in (1, 2))
+    path = first.save(tmp_path / "first.mcap")
+    folder = trilat_net.export([second, path], "lerobot", tmp_path / "set", fps=30, program="m1")
+    assert info(folder)["total_episodes"] == 2
+    assert info(folder)["total_tasks"] == 1
+    assert info(folder, "about")["program"] == "m1"
+    assert read(folder)["intervention"].to_list() == [False] * 12
+
+
 def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
     folder = exported(tmp_path, without((1.0, 1.5)))
     frames = read(folder)["action.a"].to_numpy().astype(np.float64)
@@ -187,8 +198,11 @@ def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
     assert np.array_equal(read(folder)["action"].to_numpy(), newest(source, "m", "x", 6, 30))
 
 
-@pytest.mark.parametrize(("settings", "said"), [({"fps": "0"}, "not 0"), ({"fps": "x"}, "cannot be read")])
-def test_settings_that_are_none_are_refused(settings: dict[str, str], said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [({"fps": "0"}, "not 0"), ({"fps": "x"}, "cannot be read"), ({"fps": 29.97}, "cannot be read")],
+)
+def test_settings_that_are_none_are_refused(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=said):
         Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
 

@@ -116,7 +116,7 @@ def log_export_command(
         form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
             site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
             episode for each log of the files and folders that are given.
-        settings: Setting of a form, repeatable: of lerobot fps=30, and program=m2, who is none of the people.
+        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program).
         output: File or folder; default: next to FILE, named after it.
     """
     from ..log.log_reader import open_logs

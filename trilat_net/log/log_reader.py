@@ -501,7 +501,7 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
     files: list[Path] = []
     for path in map(Path, sources):
         if not (found := sorted(path.glob("*.mcap")) if path.is_dir() else [path]):
-            raise LogError(f"{path}: there is no log in this folder")
+            raise LogError(f"{path}: no log is in this directory")
         files += found
     sessions: dict[str, list[LogContents]] = {}
     for part in _read_parts(files, progress):

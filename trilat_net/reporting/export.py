@@ -103,7 +103,7 @@ def _read_settings(form: str, write: Callable[..., Any], given: dict[str, Any]) 
     if strange := [name for name in given if name not in known]:
         raise UsageError(f"{form} has no setting {strange[0]!r}; it has {', '.join(known) or 'none'}")
     try:
-        return {name: known[name](value) for name, value in given.items()}
+        return {name: known[name](str(value)) for name, value in given.items()}
     except ValueError as error:
         raise UsageError(f"a setting of {form} cannot be read: {error}") from None
 

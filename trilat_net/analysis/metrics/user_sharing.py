@@ -13,8 +13,6 @@ from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_sha
 from ..run_view import RunView, SiteRun
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
-_NONE = "users share no such coordinate"
-
 
 def _unasked(why: str) -> Metric:
     return Metric(None, why, applies=False)

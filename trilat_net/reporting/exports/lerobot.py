@@ -67,8 +67,8 @@ def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30
     whole |= {"timestamp": (frame / fps).astype(np.float32), "frame_index": frame, "index": index}
     texts = _store_tables(folder, whole, [*starts.tolist(), len(index)], list(tasks))
     texts["meta/info.json"] = _describe_set(fps, names, whole, len(starts), len(tasks))
-    made_by = f"trilat-net {collect_provenance()['version_trilat-net']}, program {program or 'the last user'}"
-    texts[EXPORT_MANIFEST] = {"exported_by": made_by, "meanings": _MEANINGS, "sessions": sessions}
+    about = {"exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}", "meanings": _MEANINGS}
+    texts[EXPORT_MANIFEST] = {**about, "program": program or "the last user", "sessions": sessions}
     for place, content in texts.items():
         (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
     return f"{len(index)} frames in {len(starts)} episodes; {lost} frames lie in gaps and are left out"
