@@ -6,14 +6,13 @@ two topics have one name.
 
 import tomllib
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.errors import UsageError
 from trilat_net.fields import suggest_nearest
 from trilat_net.files import open_regular
 from trilat_net.log.ros2 import cdr
@@ -24,7 +23,8 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.messages import State
 from trilat_net.net.ros2_graph import QualityOfService, Ros2Graph, TopicPublisher, check_ros_name
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.run_changes import parse_core_change
+
+from .running_session import ShareHistory
 
 POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped"
 RELIABLE, LATCHED = QualityOfService(), QualityOfService(latched=True, depth=1)
@@ -124,38 +124,6 @@ class Ends(NamedTuple):
     def topic(self, site: str, name: str) -> str:
         """Returns the full name of a topic."""
         return self.table.find(self.session, site, name)
-
-
-class ShareHistory:
-    """The shares of a site in its peers, by the changes that are known."""
-
-    def __init__(self, scenario: Scenario, site: str) -> None:
-        self._scenario, self._site = scenario, site
-        planned = [change for change in scenario.timeline if change.dominance == site]
-        self._later = [scenario.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in planned]
-        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
-        self._before = self._ramp.alpha
-
-    def take(self, change: str) -> None:
-        """Takes a change of the site, as its events have it; one of anything else changes nothing."""
-        with suppress(ScenarioError):  # a stranger's
-            ramp = parse_core_change(self._scenario, self._site, change).ramp
-            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:  # else it was shown before
-                self._later.append(ramp)
-
-    def at(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the shares at a time since the epoch, ns, which never goes back."""
-        for ramp in sorted(one for one in self._later if one.start_ns <= t_ns):
-            self._before, self._ramp = self._find(ramp.start_ns), ramp
-        self._later = [one for one in self._later if one.start_ns > t_ns]
-        return self._find(t_ns)
-
-    def _find(self, t_ns: int) -> tuple[float, ...]:
-        _, end_ns, after = ramp = self._ramp
-        if t_ns >= end_ns:
-            return after
-        part = (t_ns - ramp.start_ns) / (end_ns - ramp.start_ns)
-        return tuple(a + part * (b - a) for a, b in zip(self._before, after, strict=True))
 
 
 class SiteTopics:

@@ -6,11 +6,11 @@ Invariant: each call connects, as its command does, and holds no connection afte
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.bus import Bus
@@ -21,14 +21,16 @@ from trilat_net.net.discovery import (
     connect_to_session,
     find_members,
     find_site_info,
+    list_past_events,
     send_change,
 )
-from trilat_net.net.membership import read_records
+from trilat_net.net.membership import read_events, read_records
 from trilat_net.net.messages import Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
+from trilat_net.scenario.run_changes import parse_core_change
 
 from .session_ping import PingReport, ping_session
 
@@ -36,6 +38,37 @@ GATHER_NS = 500_000_000
 """Time for further sites to answer, after the first one of a session that some may have left."""
 AHEAD_S = 0.5
 """From the newest tick that is known to the end: sites say ten times a second where they are."""
+
+
+class ShareHistory:
+    """The shares of a site in its peers, by the changes that are known."""
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._scenario, self._site = scenario, site
+        self._later = scenario.scripted_ramps(site)
+        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
+        self._before = self._ramp.alpha
+
+    def take(self, change: str) -> None:
+        """Takes a change of the site, as its events have it; one of anything else changes nothing."""
+        with suppress(ScenarioError):  # a stranger's
+            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:  # else it was shown before
+                self._later.append(ramp)
+
+    def at(self, t_ns: int) -> tuple[float, ...]:
+        """Returns the shares at a time since the epoch, ns, which never goes back."""
+        for ramp in sorted(one for one in self._later if one.start_ns <= t_ns):
+            self._before, self._ramp = self._find(ramp.start_ns), ramp
+        self._later = [one for one in self._later if one.start_ns > t_ns]
+        return self._find(t_ns)
+
+    def _find(self, t_ns: int) -> tuple[float, ...]:
+        _, end_ns, after = ramp = self._ramp
+        if t_ns >= end_ns:
+            return after
+        part = (t_ns - ramp.start_ns) / (end_ns - ramp.start_ns)
+        return tuple(a + part * (b - a) for a, b in zip(self._before, after, strict=True))
 
 
 class RunningSession:
@@ -175,6 +208,27 @@ class RunningSession:
                 return [record for ring in rings for record in read_records(ring)]
 
             yield take
+
+    @contextmanager
+    def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
+        """Listens to a site; yields a function that returns its present shares in its peers, by name."""
+        with self.reach("") as bus:
+            info = _find_running(bus, self._clock, self.name, site)
+            kinds = topics.STATE, topics.EVENT
+            records, events = (bus.inbox(topics.key(self.name, site, kind), 256) for kind in kinds)
+            scenario, now_ns = parse_embedded(info.scenario, self.name), 0
+            history = ShareHistory(scenario, site)
+            for event in list_past_events(bus, self._clock, self.name, site):
+                history.take(event.command)
+
+            def find() -> dict[str, float]:
+                nonlocal now_ns
+                for event in read_events(events):
+                    history.take(event.command)
+                now_ns = max([now_ns, *(record.t_ns for record in read_records(records))])
+                return dict(zip(scenario.peers(site), history.at(now_ns), strict=True))
+
+            yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
         """Measures round trips, clock offsets and links of the session; as `trilat ping`."""

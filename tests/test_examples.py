@@ -15,13 +15,12 @@ import numpy as np
 import pytest
 
 import trilat_net
-from sites.running_session import RunningSession, open_hand
+from sites.running_session import open_hand
 from tests.log_editing import recorded
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session
+from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
@@ -170,7 +169,7 @@ def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.long
 def test_a_program_hands_over_and_back_without_a_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The example in a session without a late tick: no reference steps further while the lead changes."""
     example = runpy.run_path(str(LOOK.with_name("policy_hand.py")))
@@ -181,9 +180,7 @@ def test_a_program_hands_over_and_back_without_a_step(
         def wait_s(time_s: float) -> None:
             clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
 
-        running = RunningSession(SESSION, Connection((), []))
-        monkeypatch.setattr(running, "_clock", clock)
-        monkeypatch.setattr(running, "_reach", lambda **_: nullcontext(bus))
+        running = reached(bus, clock)
         wait_s(1.0)
         with (
             open_hand(bus, clock, SESSION, "m2", scenario) as program,

@@ -17,7 +17,7 @@ from .execution.log_checks import LogCheckReport, run_log_checks
 from .execution.virtual import SimulatedLog, simulate_scenario
 from .files import import_extra, make_results_folder
 from .log.accounting import MIN_COVERAGE
-from .log.log_reader import Log, open_log
+from .log.log_reader import Log, open_log, open_logs
 from .log.recover import Recovery, recover_log
 from .log.session_check import LogCheckResult, check_log
 from .scenario import Scenario, load_scenario
@@ -120,24 +120,30 @@ def recover(file: str | Path, out: str | Path | None = None, *, force: bool = Fa
     return recover_log(Path(file), None if out is None else Path(out), force=force)
 
 
-def export(log: AnyLog, to: str, out: str | Path, *, force: bool = False) -> Path:
+def export(
+    log: AnyLog | Sequence[AnyLog], to: str, out: str | Path, *, force: bool = False, **settings: Any
+) -> Path:
     """Exports a log to files for other tools and returns the path; the command is `trilat log export`.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
 
     Args:
-        log: the log, or its path.
-        to: ros2, parquet, csv, npz or mat.
-        out: a file, or of parquet and csv a folder.
+        log: the log, or its path; of lerobot also several, or a folder of them.
+        to: ros2, parquet, csv, npz, mat or lerobot.
+        out: a file, or of parquet, csv and lerobot a folder.
         force: whether it may replace one.
+        settings: what the format lets one choose, as `fps=30` and `program="m2"` of lerobot.
 
     Raises:
-        UsageError: there is no such format, a package is missing, or the place is taken.
+        UsageError: there is no such format or setting, a package is missing, or the place is taken.
     """
     from .reporting.export import Exporter
 
-    Exporter(to, Path(out), force=force).export(_open(log))
+    exporter = Exporter(to, Path(out), force=force, settings=settings)
+    given = [log] if isinstance(log, str | Path | Log) else log
+    paths = [one for one in given if not isinstance(one, Log)]
+    exporter.export(*(one for one in given if isinstance(one, Log)), *open_logs(*paths))
     return Path(out)
 
 

@@ -57,14 +57,32 @@ def test_the_parts_of_a_log_are_exported_as_one(folder: Path) -> None:
     assert np.load(folder / "out.npz")["m1/tick"].tolist() == list(range(120))
 
 
+def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
+    """The parts of one of them are one episode: 0.12 s at 1 kHz are four frames of 30 Hz, or six of 50 Hz."""
+    count = len(messages(recorded("paper")))
+    (folder / "logs").mkdir()
+    for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
+        (folder / "logs" / f"run-00{n + 1}.mcap").write_bytes(data)
+    (folder / "logs" / "other.mcap").write_bytes(recorded("paper", {"seed": 9, "duration_s": 0.12}))
+    command = ("log", "export", "logs", "--to", "lerobot")
+    text = trilat(*command, cwd=folder).succeeds()
+    assert text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out\n"
+    trilat(*command, cwd=folder).refuses("logs-lerobot: exists", "--force")
+    assert "12 frames in 2" in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
+    trilat(*command, "--set", "log=x", cwd=folder).refuses("no setting 'log'; it has fps, program")
+    (folder / "none").mkdir()
+    trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses("no log is in this directory")
+
+
 def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
     done = trilat("log", "export", "run.mcap", "--to", "xlsx", cwd=folder)
-    done.refuses("--to", "xlsx", "csv, mat, npz, parquet, ros2")
+    done.refuses("--to", "xlsx", "csv, lerobot, mat, npz, parquet, ros2")
     assert [path.name for path in folder.iterdir()] == ["run.mcap"]
 
 
 @pytest.mark.parametrize(
-    ("form", "module", "name"), [("parquet", "polars", "frames"), ("mat", "scipy.io", "mat")]
+    ("form", "module", "name"),
+    [("parquet", "polars", "frames"), ("mat", "scipy.io", "mat"), ("lerobot", "pyarrow.parquet", "lerobot")],
 )
 def test_package_that_is_missing_is_named_with_what_installs_it(
     form: str, module: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch

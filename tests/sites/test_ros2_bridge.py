@@ -30,7 +30,8 @@ from sites.ros2_bridge import (
     refuse_other_robots,
     show_session,
 )
-from sites.ros2_topics import Ends, RobotTable, ShareHistory, SiteTopics, read_topic_table
+from sites.ros2_topics import Ends, RobotTable, SiteTopics, read_topic_table
+from sites.running_session import ShareHistory
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until

@@ -9,6 +9,7 @@ constant delay of the theorem; the difference from the sample in use at the next
 link.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -307,3 +308,9 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
     row = np.clip(row, 0, len(records.known) - 1)
     recorded: Bools = inside & records.known[row]
     return row, recorded
+
+
+def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
+    """Returns per site the rows of its latest ticks at those of the first one, and where all are recorded."""
+    found = [find_latest_rows(records, sites[0].t_s) for records in sites]
+    return [row for row, _ in found], np.logical_and.reduce([recorded for _, recorded in found])

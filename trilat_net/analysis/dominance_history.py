@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from ..core.dominance import find_reach, perron_vector
 from ..core.ticks import DominanceRamp
 from ..core.vectors import Array
+from ..errors import UsageError
 from ..log.log_reader import Log
+from ..log.record_columns import Ints
 from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
@@ -50,11 +52,52 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     Raises:
         LogError: a record names a change that is none.
     """
-    start, scripted = list_scripted_ramps(log.scenario, site)
-    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
-    planned = evaluate_ramps(start, [*scripted, *ordered], t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    planned = evaluate_ramps(*list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz)
     lost = find_lost_peers(log, site, t_s)
     return _share_out(planned, ~lost) if lost.any() else planned
+
+
+def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
+    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and ordered."""
+    start, scripted = list_scripted_ramps(log.scenario, site)
+    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
+    return start, [*scripted, *ordered]
+
+
+def find_users(scenario: Scenario) -> tuple[str, list[str]]:
+    """Returns the first slave, "" if there is none, and its users: the masters."""
+    slaves, users = (
+        [site for site, spec in scenario.sites.items() if spec.role == role] for role in ("slave", "master")
+    )
+    return next(iter(slaves), ""), users
+
+
+class UserShares(NamedTuple):
+    """Who of its users leads a slave, over K times. Where that is not the program, somebody intervenes.
+
+    Attributes:
+        shares: alpha of the slave for each of them, shape (K, U).
+        lead: the user with the largest share, by its place; the program, if no share is larger.
+        program: the user that a program holds, by its place.
+    """
+
+    shares: Array
+    lead: Ints
+    program: int
+
+
+def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
+    """Returns who leads the slave of `find_users`, by its alpha, shape (K, P).
+
+    Raises:
+        UsageError: there is no such user; by default the program is the last one.
+    """
+    slave, users = find_users(scenario)
+    if (program := program or users[-1]) not in users:
+        raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
+    shares, place = alpha[:, [scenario.peers(slave).index(user) for user in users]], users.index(program)
+    tied = shares[:, place] >= shares.max(axis=1)
+    return UserShares(shares, np.where(tied, place, shares.argmax(axis=1)), place)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
@@ -94,11 +137,7 @@ def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> Dominance
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
     """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's timeline."""
     start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
-    return start, [
-        scenario.ramp(site, change.shares, change.start_ns, change.ramp_s)
-        for change in scenario.timeline
-        if change.dominance == site
-    ]
+    return start, scenario.scripted_ramps(site)
 
 
 def forget_ramps(

@@ -105,6 +105,7 @@ def log_recover_command(
 def log_export_command(
     files: options.LogsArgument,
     form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
+    settings: Annotated[list[str] | None, options.value("--set", "KEY=VALUE")] = None,
     output: Annotated[Path | None, options.value("-o --out", "OUT")] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -113,20 +114,28 @@ def log_export_command(
 
     Options:
         form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
-            site and kind; npz, mat: one file with an array per column.
+            site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
+            episode for each log of the files and folders that are given.
+        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program).
         output: File or folder; default: next to FILE, named after it.
     """
+    from ..log.log_reader import open_logs
     from ..reporting.export import Exporter
 
-    exporter = Exporter(form, output, force=force, log=files[0])
-    log = terminal.open_with_progress(*files)
+    given = {key: value for key, _, value in (one.partition("=") for one in settings or [])}
+    exporter = Exporter(form, output, force=force, log=files[0], settings=given)
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
+        logs = open_logs(*files, progress=progress)
+    for log in logs:
+        terminal.warn_of_damage(log)
     with terminal.progress_bar(f"writing {exporter.path}") as progress:
-        exporter.export(log, progress)
-    records = {site: len(log[site]) for site in log.sites}
+        told = exporter.export(*logs, progress=progress)
+    records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
+    told = told or f"{sum(records.values())} records of {', '.join(records)}"
     if as_json:
         terminal.print_json({"file": exporter.path.as_posix(), "format": form, "records": records})
     else:
-        terminal.print_text(f"{exporter.path}: {sum(records.values())} records of {', '.join(records)}")
+        terminal.print_text(f"{exporter.path}: {told}")
 
 
 @options.command("run.mcap")

@@ -52,7 +52,7 @@ from .data_tables import (
 )
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
-from .merge import merge_parts
+from .merge import identify_session, merge_parts
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
@@ -491,10 +491,29 @@ def open_log(
         LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of different
             sessions, or disagree on a message.
     """
+    log = Log(merge_parts(_read_parts((source, *more), progress)))
+    allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
+    return log
+
+
+def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
+    """Returns the logs in files and folders, see `open_log`; files of one session are its parts."""
+    files: list[Path] = []
+    for path in map(Path, sources):
+        if not (found := sorted(path.glob("*.mcap")) if path.is_dir() else [path]):
+            raise LogError(f"{path}: no log is in this directory")
+        files += found
+    sessions: dict[str, list[LogContents]] = {}
+    for part in _read_parts(files, progress):
+        sessions.setdefault(str(identify_session(part)), []).append(part)
+    return [Log(merge_parts(parts)) for parts in sessions.values()]
+
+
+def _read_parts(sources: Sequence[str | Path | BinaryIO], progress: Progress | None) -> list[LogContents]:
     files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
-        for one in (source, *more):
+        for one in sources:
             if isinstance(one, str | Path):
                 with _reading(str(one)):
                     files.append((stack.enter_context(open_regular(Path(one))), str(one)))
@@ -507,9 +526,7 @@ def open_log(
             with _reading(name):
                 shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
-    log = Log(merge_parts(parts))
-    allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
-    return log
+    return parts
 
 
 @contextmanager

@@ -32,9 +32,9 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
     """
     if len(parts) == 1:
         return parts[0]
-    ours = _common_facts(parts[0])
+    ours = identify_session(parts[0])
     for other in parts[1:]:
-        theirs = _common_facts(other)
+        theirs = identify_session(other)
         differ = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if ours[name] != theirs[name]]
         if differ:
             session = f"the session in {parts[0].source}: {'; '.join(differ)}"
@@ -105,7 +105,8 @@ def _recorder_boot(part: LogContents) -> int:
     return 0
 
 
-def _common_facts(part: LogContents) -> dict[str, str]:
+def identify_session(part: LogContents) -> dict[str, str]:
+    """Returns what all parts of a session have in common, and no other session has."""
     facts = {name: part.session.get(name, "unknown") for name in ("session", "driver", "epoch_unix_ns")}
     return {**facts, "scenario": hashlib.sha256(part.scenario).hexdigest()[:16]}
 

@@ -4,6 +4,7 @@ Invariant: a number read back is the same, bit for bit. An export describes itse
 of every column, and its session. What can be refused is refused before anything is read or written.
 """
 
+import inspect
 import json
 from collections.abc import Callable
 from importlib import import_module
@@ -31,16 +32,19 @@ class ExportFormat(NamedTuple):
     """A format of exports, `FORMAT` of a file in the folder `exports`.
 
     Attributes:
-        write: writes a log to a file, or into a folder, and tells how many records it has written since.
+        write: writes a log to a file, or into a folder, tells how many records it has written since, and
+            returns what else is to be said, or None; its keyword-only parameters are settings.
         ending: of the default path, after the name of the log.
         folder: whether it writes a folder.
         extra: the module that it imports, the optional dependency that has it, and what needs it; or ().
+        many: whether it takes any number of logs, which `write` then gets as a list.
     """
 
-    write: Callable[[Log, Path, Written], None]
+    write: Callable[..., str | None]
     ending: str
     folder: bool = False
     extra: tuple[str, str, str] | tuple[()] = ()
+    many: bool = False
 
 
 class Exporter:
@@ -50,15 +54,18 @@ class Exporter:
         path: the file or folder.
 
     Raises:
-        UsageError: there is no such format, the place is taken and `force` is false, or a package is missing.
+        UsageError: no such format or setting, the place is taken and `force` is false, a package is missing.
     """
 
-    def __init__(self, form: str, path: Path | None, *, force: bool = False, log: Path = Path()) -> None:
-        """Without a path it is next to the log, or its first part, and named after it."""
+    def __init__(
+        self, form: str, path: Path | None, *, force: bool = False, log: Path = Path(), settings: Any = ()
+    ) -> None:
+        """Without a path it is next to the log, or its first part, and named after it; `settings` by name."""
         names = exports.list_export_formats()
         if form not in names:
             raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
         self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
+        self._settings = _read_settings(form, self._format.write, dict(settings))
         name = log.name.removesuffix(".active").removesuffix(".mcap")
         self.path, self._force = path or log.parent / (name + self._format.ending), force
         self._manifest = EXPORT_MANIFEST if self._format.folder else None
@@ -66,15 +73,17 @@ class Exporter:
         if self._format.extra:
             import_extra(*self._format.extra)
 
-    def export(self, log: Log, progress: Progress = lambda _done, _total: None) -> None:
-        """Exports a log; `progress` is called with the number of records that are written, and of all.
+    def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
+        """Exports a log, or several, and returns what the format says of it; `progress` is of records.
 
         Raises:
             LogError: a record cannot be read.
             LogRefused: the disk is full.
-            UsageError: the place cannot be written to.
+            UsageError: the place cannot be written to, or the format takes one log alone.
         """
-        total = sum(len(log[site]) for site in log.sites)
+        if len(logs) > 1 and not self._format.many:
+            raise UsageError(f"an export of this form is of one log; here are {len(logs)}, of other sessions")
+        total = sum(len(log[site]) for log in logs for site in log.sites)
         done = 0
 
         def written(records: int) -> None:
@@ -83,7 +92,20 @@ class Exporter:
             progress(done, total)
 
         with stage_output(self.path, force=self._force, manifest=self._manifest) as path:
-            self._format.write(log, path, written)
+            what = list(logs) if self._format.many else logs[0]
+            return self._format.write(what, path, written, **self._settings) or ""
+
+
+def _read_settings(form: str, write: Callable[..., Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Returns settings as the keyword-only parameters of `write` take them."""
+    parameters = inspect.signature(write).parameters.values()
+    known = {one.name: type(one.default) for one in parameters if one.kind is one.KEYWORD_ONLY}
+    if strange := [name for name in given if name not in known]:
+        raise UsageError(f"{form} has no setting {strange[0]!r}; it has {', '.join(known) or 'none'}")
+    try:
+        return {name: known[name](str(value)) for name, value in given.items()}
+    except ValueError as error:
+        raise UsageError(f"a setting of {form} cannot be read: {error}") from None
 
 
 def store_tables(

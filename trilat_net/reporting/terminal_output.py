@@ -201,15 +201,20 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
     with progress_bar(f"reading {first}") as progress:
         log = open_log(first, *more, progress=progress, **allowed)
-    for path in (first, *more):
-        warn_if_unfinished(path)
+    warn_of_damage(log)
+    return log
+
+
+def warn_of_damage(log: "Log") -> None:
+    """Warns of what a log lacks, and says what to do."""
+    for path in log.sources:
+        warn_if_unfinished(Path(path))
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
         print_note(problem)
     if log.damaged:
         rest = len(log.damaged) - _MAX_DAMAGED
         unlisted = f"and {rest} more damaged parts; " if rest > 0 else ""
         print_note(f"{unlisted}make a whole file of everything that can be read: trilat log recover FILE")
-    return log
 
 
 def warn_user_laws(log: "Log") -> None:

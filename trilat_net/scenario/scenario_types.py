@@ -411,11 +411,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             qd0=spec.qd0_rad_s,
             actors=tuple(one.actor for one in (*spec.hands, *spec.environment)),
             links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
-            ramps=tuple(
-                self.ramp(site, change.shares, change.start_ns, change.ramp_s)
-                for change in self.timeline
-                if change.dominance == site
-            ),
+            ramps=tuple(self.scripted_ramps(site)),
             on_stale=spec.on_stale.rule,
             external=spec.plant != "simulated",
             own=control.maker(len(self.sites), self.scheme),
@@ -475,6 +471,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns a change of a site's dominance factors, as the core has it."""
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
+
+    def scripted_ramps(self, site: str) -> list[DominanceRamp]:
+        """Returns the changes of a site's dominance factors on the timeline, as the core has them."""
+        changes = [change for change in self.timeline if change.dominance == site]
+        return [self.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in changes]
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without operators."""

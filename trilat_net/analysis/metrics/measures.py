@@ -108,8 +108,8 @@ class Measure(NamedTuple):
 _MEASURES: list[Measure] = []
 TRACKING, SPREAD, FOLLOWING = "tracking", "apart", "slave and master"
 EFFORT, ENERGY, CONTACT, LEARNING = "effort", "energy", "walls", "learning"
-SHARING, NETWORK, LOOP = "force sharing", "network", "loop"
-_SHOWN = (TRACKING, SPREAD, FOLLOWING, EFFORT, ENERGY, CONTACT, SHARING, LEARNING, NETWORK, LOOP)
+SHARING, USERS, NETWORK, LOOP = "force sharing", "users", "network", "loop"
+_SHOWN = (TRACKING, SPREAD, FOLLOWING, EFFORT, ENERGY, CONTACT, SHARING, USERS, LEARNING, NETWORK, LOOP)
 """Headings in the order in which they are shown; others follow."""
 
 

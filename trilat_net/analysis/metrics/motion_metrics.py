@@ -20,7 +20,7 @@ from ...results import JsonObject
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
-from ..aligned import AlignedRecords, Bools, find_latest_rows
+from ..aligned import AlignedRecords, Bools, find_common_rows
 from ..arm_rows import (
     ArmRows,
     PlanarArmRows,
@@ -109,20 +109,17 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     log, runs = view.log, view.sites
     if view.absent:
         return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
-    first = runs[log.sites[0]].records
-    known, poses = first.known.copy(), []
-    for records in (run.records for run in runs.values()):
-        row, recorded = find_latest_rows(records, first.t_s)
-        known &= recorded
-        poses.append(records.shared[row])
+    sites = [run.records for run in runs.values()]
+    rows, known = find_common_rows(sites)
+    poses = [records.shared[row] for records, row in zip(sites, rows, strict=True)]
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
     apart = np.ptp(np.stack(poses)[:, known], axis=0)
-    axes = [run.records.axes for run in runs.values()]
+    axes = [records.axes for records in sites]
     if all(axes):
         apart = apart * np.prod(axes, axis=0)
-    end_s = min(float(run.records.t_s[-1]) for run in runs.values())
-    last = first.t_s[known] > end_s - END_WINDOW_S
+    end_s = min(float(records.t_s[-1]) for records in sites)
+    last = sites[0].t_s[known] > end_s - END_WINDOW_S
     none = "no instant of the last second of which every site has a record"
 
     def measure(columns: slice) -> MetricValues:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
-from ...analysis.dominance_history import evaluate_ramps
+from ...analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from ...analysis.run_end import THROWN_RAD, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.torque_sources import list_walls, wall_force
@@ -187,11 +187,8 @@ def _find_push(judged: _JudgedRun) -> tuple[float, float]:
 
 def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
     peers, own = scenario.peers(SLAVE), records[SLAVE]
-    start = np.array([scenario.dominance[SLAVE].get(peer, 0.0) for peer in peers])
-    changes = [change for change in scenario.timeline if change.dominance == SLAVE]
-    ramps = [scenario.ramp(SLAVE, change.shares, change.start_ns, change.ramp_s) for change in changes]
-    t_s = own.t_ns / NS_PER_S
-    alpha = evaluate_ramps(start, ramps, t_s, 1.0 / scenario.sites[SLAVE].rate_hz).alpha
+    t_s, period_s = own.t_ns / NS_PER_S, 1.0 / scenario.sites[SLAVE].rate_hz
+    alpha = evaluate_ramps(*list_scripted_ramps(scenario, SLAVE), t_s, period_s).alpha
     led: Array = sum(
         (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)), np.zeros_like(own.q)
     )

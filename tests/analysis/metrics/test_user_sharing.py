@@ -1,0 +1,114 @@
+"""Metrics of users who share a slave, on records that are prescribed, against numbers worked out by hand."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.analysis.logs import rewritten
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_whole
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import parse_scenario
+
+TRIO = """
+name = "trio"
+rate_hz = 200
+duration_s = 2.0
+[control]
+law = "p_d"
+K = 10.0
+d = 2.0
+[link]
+delay_ms = 50.0
+[sites.m1]
+role = "master"
+[sites.m2]
+role = "master"
+[sites.s]
+role = "slave"
+[dominance]
+m1 = { m2 = 0.5, s = 0.5 }
+m2 = { m1 = 0.5, s = 0.5 }
+s = { m1 = 0.75, m2 = 0.25 }
+[[timeline]]
+at_s = 1.0
+dominance = "s"
+to = { m1 = 0.25, m2 = 0.75 }
+ramp_s = RAMP
+"""
+"""400 ticks; m1 leads, and from tick 200 on m2 takes over."""
+PUSHES = {"m1": [3.0, 2.0], "m2": [-1.0, 1.0], "m3": [2.0, -3.0], "s": [0.0, 0.0]}
+"""Of the hands ON the arms, N m."""
+
+
+def pushed(log: Log, steps: Mapping[int, float] | None = None) -> Log:
+    """The log with these pushes; references move by 1 mrad a tick, by other steps where they are given."""
+    step = np.full(400, 1e-3)
+    for tick, size in (steps or {}).items():
+        step[tick] = size
+    way = np.cumsum(step).tolist()
+
+    def change(state: Any) -> Any:
+        tau_x = [-one for one in PUSHES[state.site]]
+        return msgspec.structs.replace(state, tau_x=tau_x, q_des=[way[state.tick], 0.0])
+
+    return rewritten(log, change=change)
+
+
+def prescribed(ramp_s: float = 0.5, steps: Mapping[int, float] | None = None) -> Log:
+    return pushed(trilat_net.simulate(parse_scenario(TRIO.replace("RAMP", str(ramp_s)))), steps)
+
+
+def test_effort_of_a_hand_counts_by_its_share() -> None:
+    """|tau|^2 is 13 and 2; the shares of m1 add up to 200 x 0.75 + (75 - 0.5 x 49.5) + 100 x 0.25."""
+    found = compute_log_metrics(prescribed())
+    shares = 150.0 + 50.25 + 25.0
+    assert found.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(13.0 * shares / 200.0)
+    assert found.sites["m2"]["authority_effort_nm2_s"].value == pytest.approx(2.0 * (400.0 - shares) / 200.0)
+    assert not found.sites["s"]["authority_effort_nm2_s"].applies
+
+
+def test_what_cancels_is_the_smaller_of_opposed_torques() -> None:
+    """Joint 1 has 3 against -1, joint 2 has 2 and 1: 1 N m of joint 1 cancels on both sides, of 7 in all."""
+    found = compute_log_metrics(prescribed()).run
+    assert found["internal_rms_nm"].value == pytest.approx(1.0)
+    assert found["internal_share"].value == pytest.approx(2.0 / 7.0)
+    assert not found["internal_rms_n"].applies
+
+
+def test_three_users_cancel_up_to_the_torque_that_remains() -> None:
+    """Of 3, -1 and 2 N m at joint 1 and 2, 1 and -3 at joint 2 the sums are 4 and 0: 1 and 3 N m cancel."""
+    text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace("RAMP", "0.5")
+    text = text.replace("[[timeline]]", "m3 = { s = 1.0 }\n[[timeline]]")
+    found = compute_log_metrics(pushed(trilat_net.simulate(parse_scenario(text)))).run
+    assert found["internal_rms_nm"].value == pytest.approx(3.0)
+    assert found["internal_share"].value == pytest.approx(8.0 / 12.0)
+
+
+def test_a_takeover_lasts_until_the_larger_share() -> None:
+    """The ramp of 0.5 s passes 1/2 at 1.25 s: ticks 0 to 249 of 400 are m1's; at equal shares m2 leads."""
+    found = measure_whole(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
+    assert {key: one.value for key, one in found.items()} == {
+        "intervention_share": pytest.approx(250.0 / 400.0),
+        "takeovers": 1.0,
+        "takeover_s": pytest.approx(0.25, abs=1e-9),
+    }
+
+
+def test_a_step_of_shares_takes_over_at_once() -> None:
+    assert compute_log_metrics(prescribed(ramp_s=0.0)).run["takeover_s"].value == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("tick", "jump"), [(200, 4.0), (250, 4.0), (300, 4.0), (199, 0.25), (302, 0.25)])
+def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
+    """A step of 4 mrad among those of 1 mrad: of the ramp from tick 200 to 300, or of the rest."""
+    found = compute_log_metrics(prescribed(steps={tick: 4e-3})).run["lead_jump"]
+    assert found.value == pytest.approx(jump, rel=1e-6)
+
+
+def test_two_sites_have_no_users_who_share() -> None:
+    found = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
+    assert {found[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {False}

@@ -1,0 +1,28 @@
+"""A policy and a person in real processes of a session, through the interfaces of LeRobot."""
+
+import threading
+
+import pytest
+
+import trilat_net
+from tests.plugins.driving import assert_taken_over, drive
+from tests.plugins.lerobot_stub import plugins
+
+from .processes import PAPER, Session, Stage
+
+
+@pytest.mark.long
+def test_a_person_takes_over_from_a_policy_in_a_live_session(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log of both is verified, and is repeated in virtual time."""
+    monkeypatch.setenv("HF_HOME", str(stage.folder))
+    session = Session(stage, "play", PAPER, "--duration", "8")
+    session.all()
+    session.begun()
+    session.recording()
+    running = trilat_net.session("t", connect=session.endpoints)
+    reach = {"session": "t", "scenario": "play", "connect": session.endpoints, "timeout_s": 60.0}
+    with plugins() as found:
+        seen = drive(found, running, threading.Event().wait, **reach)
+    assert_taken_over(seen, session.is_reproduced())

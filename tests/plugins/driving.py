@@ -1,0 +1,63 @@
+"""A policy at m2 and a person at m1 of one session, moved through the plugins, and what is to come of it."""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.log.log_reader import Log
+
+from .lerobot_stub import make_device
+
+ROBOT, TELEOPERATOR = "lerobot_robot_trilat", "lerobot_teleoperator_trilat"
+
+
+def drive(
+    found: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
+) -> dict[str, Any]:
+    """Moves both arms through the plugins for two seconds; returns what they said."""
+    robot = make_device(found[ROBOT].TrilatRobotConfig(**reach))
+    teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
+    robot.connect()
+    teleoperator.connect()
+    first, before = robot.get_observation(), teleoperator.get_teleop_events()
+    goal = {"x.pos": first["x.pos"] + 0.1, "y.pos": first["y.pos"]}
+    for n in range(60):
+        assert robot.send_action(goal) == goal
+        if n == 30:
+            felt = robot.get_observation()["x.felt"]
+            running.set_dominance("s", {"m1": 0.9, "m2": 0.1}, 0.5)
+            teleoperator.enable_torque()
+        teleoperator.send_feedback(goal)
+        wait_s(1.0 / 30.0)
+    told = {
+        "before": before,
+        "after": teleoperator.get_teleop_events(),
+        "observed": robot.get_observation(),
+        "features": robot.observation_features,
+        "goal": goal,
+        "first": first,
+        "felt": felt,
+        "led": teleoperator.get_action(),
+    }
+    teleoperator.disable_torque()
+    teleoperator.disconnect()
+    robot.disconnect()
+    assert not robot.is_connected
+    return told
+
+
+def assert_taken_over(seen: dict[str, Any], log: Log) -> None:
+    intervenes = {key.value: (seen["before"][key], seen["after"][key]) for key in seen["after"]}
+    assert intervenes["is_intervention"] == (False, True)
+    assert intervenes["terminate_episode"] == (False, False)
+    assert list(seen["observed"]) == list(seen["features"])
+    assert seen["felt"] < -0.1  # the arm hangs back from where the policy pulls it
+    assert seen["observed"]["x.pos"] > seen["first"]["x.pos"] + 0.02
+    assert seen["observed"]["s.q1.pos"] != seen["first"]["s.q1.pos"]
+    assert seen["led"]["x.pos"] > seen["first"]["x.pos"] + 0.02
+    held = log["m2"].hand[np.flatnonzero(log["m2"].hand[:, 2])]
+    assert held[-1, 3:5] == pytest.approx(list(seen["goal"].values()))
+    assert log["m1"].hand[:, 0].max() == 1.0

@@ -1,0 +1,94 @@
+"""LeRobot's interfaces of robots and teleoperators as far as a plugin sees them, if it is not installed.
+
+By facts of its source, version 0.6: names of modules, of abstract methods, of events, and how a configuration
+is registered and its device found. Where LeRobot can be imported, the tests run against LeRobot.
+"""
+
+import abc
+import importlib
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+PLUGINS = Path(__file__).parents[2] / "plugins"
+_BOTH = ["is_connected", "connect", "is_calibrated", "calibrate", "configure", "disconnect"]
+ABSTRACT = {
+    "Robot": [*_BOTH, "action_features", "observation_features", "get_observation", "send_action"],
+    "Teleoperator": [*_BOTH, "action_features", "feedback_features", "get_action", "send_feedback"],
+}
+
+
+class TeleopEvents(Enum):
+    SUCCESS = "success"
+    FAILURE = "failure"
+    RERECORD_EPISODE = "rerecord_episode"
+    IS_INTERVENTION = "is_intervention"
+    TERMINATE_EPISODE = "terminate_episode"
+
+
+def _config() -> type:
+    @dataclass(kw_only=True)
+    class Config:
+        id: str | None = None
+        calibration_dir: Path | None = None
+
+        known = {}  # noqa: RUF012
+
+        @classmethod
+        def register_subclass(cls, name: str) -> Any:
+            return lambda kind: cls.known.setdefault(name, kind)
+
+        @property
+        def type(self) -> str:
+            return next(name for name, kind in self.known.items() if kind is self.__class__)
+
+    return Config
+
+
+def _device(name: str) -> type:
+    def begin(self: Any, config: Any) -> None:
+        self.id = config.id
+
+    methods = {method: abc.abstractmethod(lambda *_: None) for method in ABSTRACT[name]}
+    return abc.ABCMeta(name, (), {"__init__": begin, **methods})
+
+
+def _modules() -> dict[str, ModuleType]:
+    made = {name: ModuleType(name) for name in ("lerobot", "lerobot.utils", "lerobot.utils.errors")}
+    for room, name in (("robots", "Robot"), ("teleoperators", "Teleoperator")):
+        made[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
+        made[f"lerobot.{room}"].__dict__.update({name: _device(name), f"{name}Config": _config()})
+    made["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
+    made["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
+    for error in ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"):
+        made["lerobot.utils.errors"].__dict__[error] = type(error, (ConnectionError,), {})
+    return made
+
+
+@contextmanager
+def plugins() -> Iterator[dict[str, ModuleType]]:
+    """Imports all plugins by the names of their folders, under LeRobot or in its place."""
+    before = dict(sys.modules)
+    try:
+        importlib.import_module("lerobot")
+    except ImportError:
+        sys.modules.update(_modules())
+    names = sorted(path.name for path in PLUGINS.iterdir() if path.is_dir())
+    sys.path[:0] = [str(PLUGINS / name) for name in names]
+    try:
+        yield {name: importlib.import_module(name) for name in names}
+    finally:
+        del sys.path[: len(names)]
+        for name in [one for one in sys.modules if one not in before and one.startswith("lerobot")]:
+            del sys.modules[name]
+
+
+def make_device(config: Any) -> Any:
+    """Makes a device as LeRobot does: of its configuration's module, by its name without `Config`."""
+    kind = type(config)
+    return getattr(importlib.import_module(kind.__module__), kind.__name__.removesuffix("Config"))(config)

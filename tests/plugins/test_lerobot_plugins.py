@@ -1,0 +1,94 @@
+"""A policy and a person in one session, through the interfaces of LeRobot."""
+
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+import trilat_net
+from sites.running_session import open_hand
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import SESSION, Session, reached
+from trilat_net.net.bus import Bus
+from trilat_net.scenario import load_scenario
+
+from .driving import ROBOT, TELEOPERATOR, assert_taken_over, drive
+from .lerobot_stub import PLUGINS, make_device, plugins
+
+
+@pytest.fixture
+def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, ModuleType]]:
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    with plugins() as modules:
+        yield modules
+
+
+def test_a_plugin_is_found_by_the_name_of_its_distribution(found: dict[str, ModuleType]) -> None:
+    """LeRobot imports the module of that name, which registers its configuration."""
+    assert sorted(found) == [ROBOT, TELEOPERATOR]
+    for name, module in found.items():
+        project = tomllib.loads((PLUGINS / name / "pyproject.toml").read_text(encoding="utf-8"))
+        assert project["project"]["name"] == module.__name__ == name
+        assert project["tool"]["setuptools"]["py-modules"] == [name]
+    assert found[ROBOT].TrilatRobotConfig().type == "trilat"
+    assert found[TELEOPERATOR].TrilatTeleoperatorConfig().type == "trilat"
+
+
+def test_plugins_import_the_interface_alone() -> None:
+    for path in PLUGINS.rglob("*.py"):
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if "trilat_net" in line]
+        assert [line for line in lines if line.startswith(("import", "from"))] == ["import trilat_net as tn"]
+
+
+def test_features_follow_from_the_scenario_before_any_connection(found: dict[str, ModuleType]) -> None:
+    robot = make_device(found[ROBOT].TrilatRobotConfig())
+    joints = [
+        f"{site}.{q}.{what}" for site in ("s", "m2") for what in ("pos", "vel", "tau_x") for q in ("q1", "q2")
+    ]
+    assert list(robot.observation_features) == [*joints, "x.pos", "y.pos", "x.felt", "y.felt"]
+    assert robot.action_features == {"x.pos": float, "y.pos": float}
+    teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig())
+    assert teleoperator.action_features == teleoperator.feedback_features == robot.action_features
+    assert not robot.is_connected
+    with pytest.raises(ConnectionError, match="not connected"):
+        robot.get_observation()
+
+
+@pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
+def test_an_arm_that_nobody_can_hold_is_refused(config: str, found: dict[str, ModuleType]) -> None:
+    module = found[ROBOT if "Robot" in config else TELEOPERATOR]
+    with pytest.raises(ValueError, match="no operator of kind 'live' at m1"):
+        make_device(getattr(module, config)(session="paper", site="m1"))
+
+
+def test_policy_and_person_share_a_slave_and_one_takes_over(
+    found: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The policy moves m2 by 10 cm, the person takes over half-way, and feedback pulls the person's arm."""
+    scenario = load_scenario("play", {"duration_s": 4.0, "rate_hz": 200})
+    session, seen = Session.whole(scenario, tmp_path), dict[str, Any]()
+
+    def act(bus: Bus, clock: RelayClock) -> None:
+        def wait_s(time_s: float) -> None:
+            clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+
+        @contextmanager
+        def hold(_name: str, site: str, source: str, **_: Any) -> Iterator[Any]:
+            with open_hand(bus, clock, SESSION, site, scenario, source) as hand:
+                yield hand
+
+        monkeypatch.setattr(trilat_net, "hand", hold, raising=False)
+        monkeypatch.setattr(trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False)
+        relayed = SimpleNamespace(sleep=wait_s, monotonic=lambda: 1e-9 * clock.monotonic_ns())
+        monkeypatch.setattr(found[ROBOT], "time", relayed)
+        wait_s(1.0)
+        seen.update(drive(found, reached(bus, clock), wait_s))
+
+    session.stranger(act)
+    log = session.run()
+    assert trilat_net.verify(log).passed
+    assert_taken_over(seen, log)

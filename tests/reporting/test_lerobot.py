@@ -1,0 +1,214 @@
+"""What other programs read of a dataset of LeRobot is the log at the times of its frames."""
+
+import json
+from fractions import Fraction
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import trilat_net
+from tests.analysis import logs
+from tests.task_arms import planar_task
+from trilat_net.errors import LogError, UsageError
+from trilat_net.log.log_reader import Log
+from trilat_net.net.messages import State
+from trilat_net.reporting.export import Exporter
+from trilat_net.scenario import parse_scenario
+
+FILE = "chunk-000/file-000.parquet"
+USERS = {"action": 2, "action.a": 2, "action.b": 2, "tau_x": 2, "tau_x.a": 2, "tau_x.b": 2, "dominance": 2}
+PLACES = {"frame_index", "episode_index", "index", "task_index"}
+
+
+def log() -> Log:
+    """Users a and b, of which b has 150 Hz, and a slave c: from 4 to 5 s its shares change to 0.9 and 0.1."""
+    return logs.busy().log
+
+
+@cache
+def without(*missing: tuple[float, float]) -> Log:
+    """The log without the slave's records of some times, s."""
+
+    def keep(state: State) -> bool:
+        return state.site != "c" or not any(a <= state.t_ns * 1e-9 < b for a, b in missing)
+
+    return logs.rewritten(log(), keep)
+
+
+def exported(folder: Path, *sources: Log, **settings: Any) -> Path:
+    Exporter("lerobot", folder / "set", settings=settings).export(*sources)
+    return folder / "set"
+
+
+def read(folder: Path, place: str = "data") -> pl.DataFrame:
+    return pl.read_parquet(folder / place / FILE)
+
+
+def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    return found
+
+
+def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarray:
+    """A vector of the newest records at or before the times of frames, by exact fractions."""
+    part = source[site]
+    ticks = [int(Fraction(n, fps) * part.rate_hz) for n in range(count)]
+    return np.array([getattr(part.by_tick[tick], field) for tick in ticks], dtype=np.float32)
+
+
+def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
+    folder = exported(tmp_path, log())
+    found = info(folder)
+    assert {key: found[key] for key in ("codebase_version", "fps", "video_path", "splits")} == {
+        "codebase_version": "v3.0",
+        "fps": 30,
+        "video_path": None,
+        "splits": {"train": "0:1"},
+    }
+    assert found["data_path"].format(chunk_index=0, file_index=0) == f"data/{FILE}"
+    schema = pq.read_schema(folder / "data" / FILE)
+    wanted = {name: pa.list_(pa.float32(), size) for name, size in USERS.items()}
+    wanted |= {"observation.state": pa.list_(pa.float32(), 4), "timestamp": pa.float32()}
+    wanted |= {"intervention": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
+    assert {field.name: field.type for field in schema} == wanted
+    assert set(found["features"]) == set(wanted)
+    assert found["features"]["observation.state"] == {
+        "dtype": "float32",
+        "shape": [4],
+        "names": ["c.q1.pos", "c.q2.pos", "c.q1.vel", "c.q2.vel"],
+    }
+    assert found["features"]["dominance"]["names"] == ["a", "b"]
+    assert found["features"]["intervention"] == {"dtype": "bool", "shape": [1], "names": None}
+
+
+@pytest.mark.parametrize("fps", [30, 7])
+def test_a_frame_has_the_newest_records_before_it(fps: int, tmp_path: Path) -> None:
+    """Of a run of 6 s, whose last ticks are at 5.995 s and, of b, at 5.9933 s."""
+    frames = read(exported(tmp_path, log(), fps=fps))
+    assert len(frames) == 6 * fps
+    for column, site, field in (("action.b", "b", "q"), ("action.a", "a", "q"), ("tau_x", "c", "tau_x")):
+        assert np.array_equal(frames[column].to_numpy(), newest(log(), site, field, 6 * fps, fps))
+    state = np.hstack([newest(log(), "c", field, 6 * fps, fps) for field in ("q", "qd")])
+    assert np.array_equal(frames["observation.state"].to_numpy(), state)
+    assert state.sum() == frames["observation.state"].to_numpy().sum() != 0.0
+    assert frames["timestamp"].to_list() == pytest.approx([n / fps for n in range(6 * fps)])
+    assert frames["index"].to_list() == frames["frame_index"].to_list() == list(range(6 * fps))
+
+
+def test_whose_share_is_above_the_program_s_intervenes(tmp_path: Path) -> None:
+    """The program is b, the last user: a leads from 4 s on, and is at 0.7 half-way through the ramp."""
+    frames = read(exported(tmp_path, log()))
+    shares = frames["dominance"].to_numpy()
+    assert shares[120].tolist() == [0.5, 0.5]
+    assert shares[135] == pytest.approx([0.7, 0.3])
+    assert shares[-1] == pytest.approx([0.9, 0.1])
+    assert frames["intervention"].to_list() == [n > 120 for n in range(180)]
+    led = np.where(frames["intervention"].to_numpy()[:, None], frames["action.a"], frames["action.b"])
+    assert np.array_equal(frames["action"].to_numpy(), led)
+
+
+def test_a_program_that_is_named_is_another_one(tmp_path: Path) -> None:
+    frames = read(exported(tmp_path, log(), program="a"))
+    assert not frames["intervention"].any()
+    assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
+    with pytest.raises(UsageError, match="the program holds one of a, b, not 'c'"):
+        Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(log())
+
+
+def test_an_episode_ends_before_a_gap_and_nothing_bridges_it(tmp_path: Path) -> None:
+    """Without 1.0 to 1.5 s: 1.0 s still has a record of 5 ms before it; so has 3.0 s in the short gap."""
+    folder = exported(tmp_path, without((1.0, 1.5), (3.0, 3.02)))
+    lengths = read(folder, "meta/episodes")["length"].to_list()
+    assert lengths == [31, 135]
+    assert info(folder, "about")["sessions"][0]["frames_left_out"] == 180 - 31 - 135
+    frames, own = read(folder), newest(log(), "c", "q", 180, 30)
+    assert frames["timestamp"][31] == frames["frame_index"][31] == 0
+    q = frames["observation.state"].to_numpy()[:, :2]
+    assert np.array_equal(q[:30], own[:30])
+    assert q[30].tolist() == np.float32(log()["c"].by_tick[199].q).tolist()
+    assert (np.flatnonzero((q[31:] != own[45:]).any(axis=1)) + 45).tolist() == [90]
+    assert q[31 + 45].tolist() == np.float32(log()["c"].by_tick[599].q).tolist()
+
+
+def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
+    again = trilat_net.simulate(log().scenario.text.replace("seed = 5", "seed = 6").replace("busy", "other"))
+    folder = exported(tmp_path, log(), again)
+    episodes = read(folder, "meta/episodes")
+    assert episodes["dataset_from_index"].to_list() == [0, 180]
+    assert episodes["dataset_to_index"].to_list() == [180, 360] == np.cumsum(episodes["length"]).tolist()
+    assert episodes["tasks"].to_list() == [["busy"], ["other"]]
+    frames = read(folder)
+    assert frames["index"].to_list() == list(range(360))
+    assert frames["frame_index"].to_list() == 2 * list(range(180))
+    assert frames["task_index"].to_list() == frames["episode_index"].to_list() == [0] * 180 + [1] * 180
+    tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
+    assert tasks.index.tolist() == ["busy", "other"]
+    assert tasks["task_index"].tolist() == [0, 1]
+    assert info(folder)["total_frames"] == 360
+
+
+def test_python_takes_paths_and_logs_together(tmp_path: Path) -> None:
+    """The path of a run of 0.2 s, and the log of it with another seed: six frames each, one task."""
+    first, second = (trilat_net.simulate("paper", duration_s=0.2, seed=seed) for seed in (1, 2))
+    path = first.save(tmp_path / "first.mcap")
+    folder = trilat_net.export([second, path], "lerobot", tmp_path / "set", fps=30, program="m1")
+    assert info(folder)["total_episodes"] == 2
+    assert info(folder)["total_tasks"] == 1
+    assert info(folder, "about")["program"] == "m1"
+    assert read(folder)["intervention"].to_list() == [False] * 12
+
+
+def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
+    folder = exported(tmp_path, without((1.0, 1.5)))
+    frames = read(folder)["action.a"].to_numpy().astype(np.float64)
+    stats = info(folder, "meta/stats")["action.a"]
+    assert stats["count"] == [len(frames)]
+    assert stats["std"] == pytest.approx(frames.std(axis=0))
+    assert stats["q90"] == pytest.approx(np.quantile(frames, 0.9, axis=0))
+    episodes = read(folder, "meta/episodes")
+    for n, (first, end) in enumerate(pairwise([0, *episodes["dataset_to_index"]])):
+        assert episodes["stats/action.a/max"][n].to_list() == pytest.approx(frames[first:end].max(axis=0))
+
+
+def test_logs_of_other_arms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
+    other = trilat_net.simulate("two_sites", duration_s=0.2)
+    with pytest.raises(LogError, match="its users and joints are not those of"):
+        exported(tmp_path, log(), other)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_user_leads_alone_and_is_a_scalar(tmp_path: Path) -> None:
+    folder = exported(tmp_path, trilat_net.simulate("two_sites", duration_s=0.2))
+    assert read(folder)["dominance"].to_list() == [1.0] * 6
+    assert info(folder)["features"]["dominance"]["shape"] == [1]
+
+
+def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
+    source = trilat_net.simulate(parse_scenario(planar_task(0.2)))
+    folder = exported(tmp_path, source)
+    assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]
+    assert np.array_equal(read(folder)["action"].to_numpy(), newest(source, "m", "x", 6, 30))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [({"fps": "0"}, "not 0"), ({"fps": "x"}, "cannot be read"), ({"fps": 29.97}, "cannot be read")],
+)
+def test_settings_that_are_none_are_refused(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=said):
+        Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
+
+
+def test_a_form_without_settings_says_so(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="csv has no setting 'fps'; it has none"):
+        Exporter("csv", tmp_path / "set", settings={"fps": 30})
+    with pytest.raises(UsageError, match="of one log"):
+        Exporter("csv", tmp_path / "set").export(log(), log())
