@@ -60,6 +60,7 @@ if _TYPE_CHECKING:
     from .scenario.describe import describe_scenario as describe_scenario
     from .scenario.imported_law import new_law as new_law
     from .scenario.simulated_arm import SimulatedArm as SimulatedArm
+    from .studies.arm_gains import tune_arm as tune_arm
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -86,6 +87,7 @@ _NAMES = {
     "trilat_net.scenario.imported_law": "new_law",
     "trilat_net.scenario.delay_traces": "import_trace",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
+    "trilat_net.studies.arm_gains": "tune_arm",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""
