@@ -32,10 +32,13 @@ ARMS = ("arm6.urdf", "arm7.urdf", *MAKERS, *ODD_ARMS)
 DELAYS = ("0", "20ms", "100ms", "jitter")
 
 
-def write_jitter(path: Path, every_s: float = 0.01) -> Path:
-    """A trace of 2 s whose delay, 20 to 60 ms, is drawn anew in such intervals."""
+def write_jitter(path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01) -> Path:
+    """A trace of 2 s about 40 ms: a queue that fills and empties, and what is drawn anew in intervals."""
     chance = random.Random(3)
-    rows = (f"{every_s * n:.2f},{chance.uniform(20.0, 60.0):.3f}" for n in range(round(2.0 / every_s)))
+    rows = []
+    for n in range(round(2.0 / every_s)):
+        delay_ms = 40.0 + swing_ms * math.sin(math.pi * n * every_s) + chance.uniform(-jitter_ms, jitter_ms)
+        rows.append(f"{every_s * n:.2f},{delay_ms:.3f}")
     path.write_text("\n".join(["t_s,delay_ms", *rows]), encoding="utf-8")
     return path
 
@@ -163,7 +166,7 @@ def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> 
 @pytest.mark.long
 def test_over_slow_jitter_what_grows_may_decay_again(one_joint: Path, tmp_path: Path) -> None:
     """Delays that change every 50 ms swing the loop as a child does; the runs do as the roots say."""
-    found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.05), poses=1)
+    found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1)
     assert found.agree
     assert [run["stable"] for run in found.runs] == [True, True, True]
 
