@@ -22,8 +22,6 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from sites.demo_session import SessionResult
 
     from ..scenario import Scenario
@@ -310,12 +308,8 @@ def tune_command(
     wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
     found = tune_arm(arm, _measure_delay(delay, reach), law, **loop, **wanted, curve=picture is not None)
 
-    def draw() -> "Figure":
-        from ..reporting.figures.linear_figures import draw_arm_gains
-
-        return draw_arm_gains(found.to_dict())
-
-    options.print_drawn(found, picture, draw, as_json=as_json)
+    shown = found.to_dict()
+    options.print_drawn(found, picture, "linear_figures:draw_arm_gains", shown, as_json=as_json)
     if not found.agree:
         raise typer.Exit(1)
 
@@ -330,8 +324,8 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
     there = reach.resolve(operates=False), SystemClock(), options.check_session_name(name)
     found = ping_session(*there, 50, 3.0, lambda: False)
     assert found is not None  # nothing stops it
-    trips = [0.5 * one["rtt_us"]["p99"] for one in found.members if one["answers"]]
-    return f"{max([link['delay_max_us'] for link in found.links] or trips):.0f}us"
+    trips_us = [0.5 * one["rtt_us"]["p99"] for one in found.members if one["answers"]]
+    return f"{max([link['delay_max_us'] for link in found.links] or trips_us or [0.0]):.0f}us"
 
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:

@@ -5,14 +5,13 @@
 Alike arms follow one another over links of that delay. The edge is the least k, over the poses, at which
 small motions of the sampled loop grow. The gains have its damping, and its stiffness over the margin. They
 keep the same margin to the sampled-data limit, where a damping that is held for a tick makes the lightest
-motion swing from tick to tick: m is less of joints that share one too light, as the first and third of an arm
-that is stretched out. For one joint at a wall such edges are known: Gil, Avello, Rubio and Florez, "Stability
-analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans. Control Systems
-Technology 12 (2004); over delays Hulin, Preusche and Hirzinger, "Stability boundary for haptic rendering:
-influence of physical damping", IROS 2006.
+motion swing from tick to tick; m is less of joints that share one too light. For one joint at a wall such
+edges are known: Gil, Avello, Rubio and Florez, "Stability analysis of a 1 DOF haptic interface using the
+Routh-Hurwitz criterion", IEEE Trans. Control Systems Technology 12 (2004); over delays Hulin, Preusche and
+Hirzinger, "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
 
-Invariant: a result is a function of its arguments. Friction, stops and torque limits of the file are left
-out: friction only helps, and limits are no matter of small motions.
+Invariant: a result is a function of its arguments. Friction, stops and torque limits are left out: friction
+only helps, and limits are no matter of small motions.
 """
 
 import math
@@ -32,7 +31,7 @@ from ..core.vectors import Array
 from ..errors import UsageError
 from ..execution.fused import FusedRun
 from ..log.log_reader import open_log, read_link_delays
-from ..reporting.result_text import Block, MarkedText, TextTable
+from ..reporting.result_text import MARKS, Block, MarkedText, TextTable
 from ..results import Result, finite_or_none
 from ..scenario import Scenario, load_scenario
 from ..scenario.arms import read_arm
@@ -48,16 +47,18 @@ TUNED_LAWS = tuple(
 """Those with a stiffness and a damping that send nothing but their motion."""
 SHARES = (0.95, 1.1)
 """Of the edge, at which runs show that it is one."""
-_PUSH, _SMALL = 1e-6, 0.1
-"""By how much the first arm starts aside, rad or m, and from which speed on motions are not small, rad/s."""
+_PUSH, _SMALL, _STILL = 1e-6, 1.0, 1e-7
+"""By how much the first arm starts aside, rad or m; from which speed on motions are not small, rad/s; and
+what share of the largest speed is rounding."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
 _SLACK, _HALF_TURN, _HALF_SLIDE_M = 0.05, math.pi, 0.5
 """Share of a joint's range that poses leave at its ends, and half of the range of one without limits."""
 _SETTLES, _SHORTEST_S, _LONGEST_S, _EXTENSIONS = 4.0, 2.0, 400.0, 3
 """By how many time constants of its slowest motion a run lasts at first, within which bounds, s; and how
 often it may go on for as long again."""
+_TELLS = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
 _NO_GAIN, _CURVE_POINTS = 1e-6, 9
-_EDGE_TOLERANCE, _FITTING_STEP = 1e-4, 0.9
+_EDGE_TOLERANCE, _FITTING_STEP, _GONE_PER_S = 1e-4, 0.9, -1e3
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 
@@ -67,14 +68,12 @@ class ArmGains(Result):
     """The largest gains that an arm bears, with a margin; as the keys of `trilat tune --json`.
 
     Attributes:
-        arm: this and the others down to `damping` are what was asked for; `age_ms` is the constant age of
-            samples that stands for the delay.
-        joints: of each m and the gains with their unit, and the error at which the effort limit is reached.
+        age_ms: the constant age of samples that stands for the delay.
+        joints: of each m, the gains with their unit, and the error at which the effort limit is reached.
         edge: k, 1/s^2, of the sampled loop over the delays in use, over a constant one, in continuous time
             (None: never), and where damping swings from tick to tick; frequency, motion, pose, what bounds K.
         runs: at the gains (share None) and at shares of the edge's k: how fast the largest speed grows (None:
-            until motions were not small), and the roots.
-        agree: whether all runs do as the roots predict.
+            until motions were not small), and the roots; they `agree` if all do as the roots predict.
         line: the gains, to paste above the tables of a scenario.
         curve: delays, s, and k of the edge in the same pose, if asked for.
     """
@@ -115,10 +114,10 @@ class ArmGains(Result):
         for run in self.runs:
             where = "these gains" if run["share"] is None else f"{run['share']:g} of the edge"
             found = {None: "does not tell", True: "decays", False: "grows"}[run["stable"]]
-            rate = "" if run["rate_per_s"] is None else f" {run['rate_per_s']:+.3g} /s"
-            mark = "[green]ok[/green]  " if run["agrees"] else "[red]fail[/red]"
-            roots = f"by its roots {run['predicted_per_s']:+.3g} /s"
-            yield MarkedText(mark, f"run of {run['ran_s']:.4g} s at {where}: {found}{rate}; {roots}")
+            found += f" {run['rate_per_s']:+.3g} /s" if run["rate_per_s"] else ""
+            found += f"; by its roots {run['predicted_per_s']:+.3g} /s"
+            mark = MARKS["ok" if run["agrees"] else "fail"]
+            yield MarkedText(mark, f"run of {run['ran_s']:.4g} s at {where}: {found}")
         yield "to paste above the first table of a scenario:"
         yield self.line
 
@@ -180,8 +179,7 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
         ranges.append((max(joint.lower, middle - half), min(joint.upper, middle + half)))
     low, high = np.transpose(ranges)
     shares = np.random.Generator(np.random.Philox(seed)).uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
-    poses: Array = low + (high - low) * shares
-    return poses
+    return np.asarray(low + (high - low) * shares)
 
 
 class _GainSearch:
@@ -198,12 +196,12 @@ class _GainSearch:
         self._scenario, self._poses, self._margin = scenario, poses, margin
         self._damping = damping = damping / math.sqrt(margin)  # at the edge, where K is larger by the margin
         self.conditions = self.held = derive_operating_conditions(scenario)
-        self.rate_hz, self.age_s = self.held.sites[0].rate_hz, float(self.held.age_s.max())
+        self.rate_hz = self.held.sites[0].rate_hz
         if self.conditions.varying:
             used = find_samples_in_use(self.conditions).used.values()
             ages = np.concatenate([np.arange(len(one)) - one for one in used])
             self.held = self.delay_by(float(np.quantile(ages, quantile, method="higher")) / self.rate_hz)
-            self.age_s = float(self.held.age_s.max())
+        self.age_s = float(self.held.age_s.max())
         # the heaviest mass is stable up to k = (2 zeta / T)^2, where the damping shall have its margin
         self._least = (2.0 * damping / self.age_s) ** 2
         model, most = scenario.arms[scenario.names[0]], 1.0 if scenario.scheme == "second_order" else 2.0
@@ -224,7 +222,7 @@ class _GainSearch:
 
     def delay_by(self, age_s: float) -> OperatingConditions:
         """Returns the conditions with one constant age of samples."""
-        same = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
+        same: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
         return self.conditions._replace(age_s=same, varying=False)
 
     def at(self, k: float, softer: float = 1.0) -> Any:
@@ -247,8 +245,7 @@ class _GainSearch:
         sites = tuple(site._replace(gains=law.linear_gains(theta)) for site in loop.sites)
         rest = Equilibrium(np.tile(pose, (count, 1)), np.tile(theta, (count, 1)), "a pose", 0.0)
         found = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
-        assert found is not None  # there is motion
-        return found
+        return found or CharacteristicRoot(complex(_GONE_PER_S), 1, ())
 
     def find_least(
         self, loop: OperatingConditions, poses: Iterable[Array], start: float, *, sampled: bool = True
@@ -317,12 +314,12 @@ class _GainSearch:
             run.advance(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
-            fit = fit_envelopes(t_s, speed[:, np.newaxis], falls_first=True)[0]
-            stable = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}.get(fit.trend)
+            still = _STILL * float(speed.max())
+            fit = fit_envelopes(t_s, speed[:, np.newaxis], still, falls_first=True)[0]
             left = run.diverged_s is not None
-            if left or stable is not None:
+            if left or fit.trend in _TELLS:
                 break
-        stable = False if left else stable
+        stable = False if left else _TELLS.get(fit.trend)
         return {
             "share": share,
             "predicted_per_s": predicted_per_s,
@@ -377,7 +374,7 @@ def tune_arm(
     ranges = {"margin": (margin, 1.0, 100.0), "damping": (damping, 0.01, 10.0), "poses": (poses, 1, 1000)}
     for name, (value, low, high) in {**ranges, "quantile": (quantile, 0.0, 1.0)}.items():
         if not low <= value <= high:
-            raise UsageError(f"--{name} is from {low:g} to {high:g}, not {value:g}")
+            raise UsageError(f"{name} is from {low:g} to {high:g}, not {value:g}")
     link, words = _read_delay(delay)
     scenario = _set_up_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
     search = _GainSearch(scenario, _draw_poses(scenario, poses, seed), margin, damping, quantile)
