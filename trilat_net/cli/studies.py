@@ -325,7 +325,8 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
     found = ping_session(*there, 50, 3.0, lambda: False)
     assert found is not None  # nothing stops it
     trips_us = [0.5 * one["rtt_us"]["p99"] for one in found.members if one["answers"]]
-    return f"{max([link['delay_max_us'] for link in found.links] or trips_us or [0.0]):.0f}us"
+    delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in found.links]
+    return f"{max(delays_us or trips_us or [0.0]):.0f}us"
 
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:

@@ -57,8 +57,7 @@ _SETTLES, _SHORTEST_S, _LONGEST_S, _EXTENSIONS = 4.0, 2.0, 400.0, 3
 """By how many time constants of its slowest motion a run lasts at first, within which bounds, s; and how
 often it may go on for as long again."""
 _TELLS = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
-_NO_GAIN, _CURVE_POINTS = 1e-6, 9
-_EDGE_TOLERANCE, _FITTING_STEP, _GONE_PER_S = 1e-4, 0.9, -1e3
+_NO_GAIN, _CURVE_POINTS, _EDGE_TOLERANCE, _FITTING_STEP, _GONE_PER_S = 1e-6, 9, 1e-4, 0.9, -1e3
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 
@@ -73,7 +72,8 @@ class ArmGains(Result):
         edge: k, 1/s^2, of the sampled loop over the delays in use, over a constant one, in continuous time
             (None: never), and where damping swings from tick to tick; frequency, motion, pose, what bounds K.
         runs: at the gains (share None) and at shares of the edge's k: how fast the largest speed grows (None:
-            until motions were not small), and the roots; they `agree` if all do as the roots predict.
+            until motions were not small), and the roots.
+        agree: whether all runs do as the roots predict, and the one at the gains decays.
         line: the gains, to paste above the tables of a scenario.
         curve: delays, s, and k of the edge in the same pose, if asked for.
     """
@@ -210,8 +210,8 @@ class _GainSearch:
         self.inertia: Array = np.max([np.diag(M) for M in self._M], axis=0)
         wanted = self._swings_per_s / (2.0 * damping * math.sqrt(self._least) * margin)
         while (found := self._find_lightest())[0] > wanted * (1.0 + _EDGE_TOLERANCE):
-            step, shares = max(wanted / found[0], _FITTING_STEP), found[1]
-            self.inertia = self.inertia * step ** (shares / shares.max())
+            shares = found[1] / found[1].max()
+            self.inertia = self.inertia * max(wanted / found[0], _FITTING_STEP) ** shares
 
     def _find_lightest(self) -> tuple[float, Array]:
         """Returns the largest eigenvalue of m M^-1 in a pose, and the joints' shares in that motion."""
@@ -255,7 +255,7 @@ class _GainSearch:
         Under delays that vary they may grow, and not, and grow again: then steps are small.
         """
         edge, worst = math.inf, self._poses[0]
-        steps = np.arange(100) * math.log(1.05) if loop.varying else np.arange(24) * math.log(2.0)
+        steps = np.arange(100) * math.log(1.1) if loop.varying else np.arange(24) * math.log(2.0)
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
@@ -273,11 +273,11 @@ class _GainSearch:
     def find_edge(self) -> dict[str, Any]:
         constant, pose = self.find_least(self.held, self._poses, self._least)
         k, continuous = constant, math.inf
-        link = next(iter(self._scenario.links.values()))
-        delay_s = self.age_s if self.conditions.varying else 1e-3 * link.moments().mean_ms
+        link, varies = next(iter(self._scenario.links.values())), self.conditions.varying
+        delay_s = self.age_s if varies else 1e-3 * link.moments().mean_ms
         if delay_s > 0.0:  # without a delay such a loop is passive
             continuous, _ = self.find_least(self.delay_by(delay_s), [pose], self._least, sampled=False)
-        if self.conditions.varying:
+        if varies:
             k, _ = self.find_least(self.conditions, [pose], 0.5 * constant)
         limit = (self._swings_per_s / (2.0 * self._damping * self._find_lightest()[0])) ** 2
         root, damped = self.find_root(self.at(k), pose, self.conditions), limit / self._margin**2
@@ -314,8 +314,7 @@ class _GainSearch:
             run.advance(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
-            still = _STILL * float(speed.max())
-            fit = fit_envelopes(t_s, speed[:, np.newaxis], still, falls_first=True)[0]
+            fit = fit_envelopes(t_s, speed[:, np.newaxis], _STILL * speed.max(), falls_first=True)[0]
             left = run.diverged_s is not None
             if left or fit.trend in _TELLS:
                 break
@@ -392,5 +391,6 @@ def tune_arm(
     columns = (model.joint_names, search.inertia.tolist(), *gains.values(), units, errors)
     joints = [dict(zip(heads, row, strict=True)) for row in zip(*columns, strict=True)]
     asked = Path(arm).name, law, sites, search.rate_hz, words, 1e3 * search.age_s, margin, damping
-    agree, over = all(run["agrees"] for run in runs), search.trace_edge(pose) if curve else []
-    return ArmGains(*asked, joints, edge, runs, agree, f'control = {{ law = "{law}", {cells} }}', over)
+    agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
+    line, over = f'control = {{ law = "{law}", {cells} }}', search.trace_edge(pose) if curve else []
+    return ArmGains(*asked, joints, edge, runs, agree, line, over)

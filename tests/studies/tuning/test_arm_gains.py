@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import trilat_net as tn
 from tests.chains import robot_files
 from tests.cli.running import trilat
+from tests.sites.visits import ping_sites
 from tests.studies.tuning.mode_count import count_growing
 from tests.studies.tuning.odd_arms import ELBOW, ODD_ARMS, SHOULDER, write_arm
 from trilat_net.errors import TrilatError
@@ -175,6 +176,16 @@ def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
     found = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
     assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", found.delay)
     assert found.runs[0]["stable"]
+
+
+def test_the_delay_of_a_session_is_that_of_its_slowest_link(
+    one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = ping_sites()  # of a party on the party's clock
+    monkeypatch.setattr("sites.session_ping.ping_session", lambda *_: report)
+    words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
+    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    assert told["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
 
 
 @pytest.mark.long
