@@ -4,6 +4,7 @@ import json
 import math
 import random
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -65,17 +66,26 @@ def assert_confirmed(found: ArmGains) -> None:
     assert found.agree
 
 
+def assert_proven(found: ArmGains) -> None:
+    """At a margin of 2 P+d meets d > K T, which suffices whatever the masses."""
+    assert (gains(found, "d") > gains(found, "K") * 1e-3 * found.age_ms).all()
+
+
 @pytest.mark.parametrize("delay", ["0", "20ms"])
 @pytest.mark.parametrize("name", ["one joint", "slide"])
 def test_runs_confirm_the_edge(name: str, delay: str, tmp_path: Path) -> None:
-    assert_confirmed(tune(name, delay, tmp_path, poses=2))
+    found = tune(name, delay, tmp_path, poses=2)
+    assert_confirmed(found)
+    assert_proven(found)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("name", ARMS)
 def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Path) -> None:
-    assert_confirmed(tune(name, delay, tmp_path))
+    found = tune(name, delay, tmp_path)
+    assert_confirmed(found)
+    assert_proven(found)
 
 
 def gains(found: ArmGains, name: str) -> np.ndarray:
@@ -125,11 +135,17 @@ def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> Non
         assert (count_growing(M, k * m, 2.0 * zeta * math.sqrt(k) * m, 20, 1e-3) > 0) is grows
 
 
+@cache
+def tune_shoulder(share: float) -> ArmGains:
+    """The gains of an arm of one joint with so much of its mass."""
+    text = write_arm([SHOULDER._replace(mass=share * SHOULDER.mass)])
+    return tune_arm("arm", "30ms", poses=1, set={"urdf": {"arm": text}})
+
+
 @settings(max_examples=3)
 @given(st.floats(0.05, 20.0))
 def test_gains_scale_with_all_masses(c: float) -> None:
-    texts = [write_arm([SHOULDER._replace(mass=mass * SHOULDER.mass)]) for mass in (1.0, c)]
-    found = [tune_arm("arm", "30ms", poses=2, set={"urdf": {"arm": text}}) for text in texts]
+    found = [tune_shoulder(1.0), tune_shoulder(c)]
     for name in ("K", "d"):
         assert gains(found[1], name) == pytest.approx(c * gains(found[0], name), rel=5e-3)
 
@@ -140,10 +156,20 @@ def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
 
 
 def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
-    slow, fast, faster = (tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 1000, 4000))
+    slow, fast, faster = (tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000))
     assert fast.edge["bound"] == faster.edge["bound"] == "delay"
     assert gains(faster, "K") == pytest.approx(gains(fast, "K"), rel=1e-2)
     assert slow.edge["bound"] == "tick rate"
+
+
+@pytest.mark.long
+def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> None:
+    """No root of one joint crosses at any delay where d^2 >= 2 K M."""
+    bounded, free = (tune_arm(one_joint, "50ms", poses=1, damping=ratio) for ratio in (0.95, 1.05))
+    assert bounded.edge["bound"] == "delay"
+    assert free.edge["continuous_per_s2"] is None
+    assert free.edge["bound"] == "tick rate"
+    assert_confirmed(free)
 
 
 @pytest.mark.parametrize("margin", [1.5, pytest.param(4.0, marks=pytest.mark.long)])
@@ -156,6 +182,7 @@ def test_damping_keeps_the_margin_to_its_limit(margin: float, tmp_path: Path) ->
     assert found.runs[0]["stable"]
 
 
+@pytest.mark.long
 def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> None:
     jitter = write_jitter(tmp_path / "jitter.csv")
     largest, median = (tune_arm(one_joint, jitter, poses=1, quantile=q) for q in (1.0, 0.5))
