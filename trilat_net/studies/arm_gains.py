@@ -241,9 +241,9 @@ class _GainSearch:
         self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
     ) -> CharacteristicRoot:
         """Returns the rightmost root of a loop with a law at rest in a pose."""
-        theta, count = loop.sites[0].theta, len(loop.sites)
-        sites = tuple(site._replace(gains=law.linear_gains(theta)) for site in loop.sites)
-        rest = Equilibrium(np.tile(pose, (count, 1)), np.tile(theta, (count, 1)), "a pose", 0.0)
+        sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
+        theta = np.array([site.theta for site in sites])
+        rest = Equilibrium(np.tile(pose, (len(sites), 1)), theta, "a pose", 0.0)
         found = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
         return found or CharacteristicRoot(complex(_GONE_PER_S), 1, ())
 
