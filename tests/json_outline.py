@@ -33,6 +33,9 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
         tn.linear("p_d_margin", over=["control.d=0.3:1"]),
         tn.linear("jitter", {"rate_hz": 200}, pose=(0.1, 0.2), over=["control.d=0.1:0.4"]),
     ],
+    "tune": lambda _: [
+        tn.tune_arm("arm6.urdf", delay, law, poses=1, curve=True) for delay, law in ((20, "pd_d"), (0, "p_d"))
+    ],
     "twin": lambda _: [tn.twin(LOGS[1]), tn.twin(LOGS[1], delta="1e-9:1e-3")],
     "test": lambda _: [tn.check("free", jobs=1)],
     "sweep": lambda folder: [

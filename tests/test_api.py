@@ -33,6 +33,7 @@ COUNTERPARTS = {
     "start": ["live", "site", "hand", "record", "watch", "router", "ros2", "replay"],
     "session": ["ping", "stop", "enable", "reset", "set link", "set dominance"],
     "simulate": ["sim"],
+    "tune_arm": ["tune"],
     "compare": ["compare"],
     "info": ["log info"],
     "check_file": ["log check"],
@@ -73,7 +74,7 @@ def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
 
 
 SLOW = {"bench", "check", "certify", "hand", "linear", "margin", "ping_benchmark", "report", "run"}
-SLOW |= {"sweep", "tune"}
+SLOW |= {"sweep", "tune", "tune_arm"}
 
 
 @pytest.mark.parametrize(

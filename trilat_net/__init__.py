@@ -66,6 +66,7 @@ if _TYPE_CHECKING:
     from .scenario.skeletons import new_hand as new_hand
     from .scenario.skeletons import new_law as new_law
     from .scenario.skeletons import new_plant as new_plant
+    from .studies.arm_gains import tune_arm as tune_arm
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -94,6 +95,7 @@ _NAMES = {
     "trilat_net.scenario.own_plant": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
+    "trilat_net.studies.arm_gains": "tune_arm",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

@@ -3,9 +3,6 @@
 The packages come with `make test-long` (`requirements/robots.lock`, 0.9 GB); no mesh is opened.
 """
 
-import functools
-from importlib import metadata
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.chains import robot_files
 from tests.core.chain_references import (
     Arm,
     Array,
@@ -154,17 +152,6 @@ def parse_chains() -> list[tuple[str, str, str, int]]:
             base, _, tip = ends.rpartition(">")
             found.append((file, base, tip, int(n)))
     return found
-
-
-@functools.cache
-def robot_files() -> dict[str, Path]:
-    """The files of the package by their path in its folder of robots."""
-    files = [str(file) for file in metadata.files("example-robot-data") or () if file.suffix == ".urdf"]
-    places = {
-        name.partition("/robots/")[2]: metadata.distribution("example-robot-data").locate_file(name)
-        for name in files
-    }
-    return {name: Path(str(place)) for name, place in places.items()}
 
 
 def read_robot(file: str) -> str:

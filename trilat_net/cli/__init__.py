@@ -76,7 +76,7 @@ def _main(
 _FIRST = (
     "demo", "live", "site", "hand", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router",
     "ros2", "sim", "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay",
-    "rerun", "log", "test", "sweep", "bench", "linear",
+    "rerun", "log", "test", "sweep", "bench", "linear", "tune",
 )  # fmt: skip
 """The order of the help; others follow."""
 _GROUPS: dict[str, dict[str, Any]] = {

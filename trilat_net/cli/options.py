@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import wraps
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
@@ -15,8 +15,6 @@ from ..errors import UsageError
 from ..reporting import terminal_output as terminal
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..log.log_reader import Log
     from ..net.connection import Connection
     from ..results import Result
@@ -267,14 +265,14 @@ def check_picture(path: Path | None, *, force: bool) -> None:
         raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
-def print_drawn(
-    found: "Result", picture: Path | None, draw: "Callable[[], Figure]", *, as_json: bool
-) -> None:
-    """Prints a result, and writes its figure if a path for it was given."""
+def print_drawn(found: "Result", picture: Path | None, figure: str, shown: Any, *, as_json: bool) -> None:
+    """Prints a result; if asked for, writes the figure of what is shown, as "twin_differences:draw_twins"."""
     if picture is not None:
         from ..reporting.style import REPORT_DPI, write_figure
 
-        write_figure(draw(), picture, REPORT_DPI)
+        module, _, name = figure.partition(":")
+        draw = getattr(import_module(f"trilat_net.reporting.figures.{module}"), name)
+        write_figure(draw(shown), picture, REPORT_DPI)
     terminal.print_result(found, as_json=as_json)
     if picture is not None and not as_json:
         terminal.print_paths([picture])

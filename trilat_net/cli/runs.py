@@ -16,10 +16,7 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ..log.log_reader import Log
-    from ..theory import LinearAnalysis
 
 
 @options.command("free -o free.mcap --set link.delay_ms=400")
@@ -156,12 +153,7 @@ def twin_command(
     log = laws.open(*files)
     found = twin(log, at_s, push or (), delta)
 
-    def draw() -> "Figure":
-        from ..reporting.figures.twin_differences import draw_twins
-
-        return draw_twins(found)
-
-    options.print_drawn(found, picture, draw, as_json=as_json)
+    options.print_drawn(found, picture, "twin_differences:draw_twins", found, as_json=as_json)
 
 
 @options.command("run.mcap")
@@ -351,7 +343,8 @@ def linear_command(
         scenario, overrides or [], pose=_pose(pose), roots=roots, over=over or [], ports=wanted
     )
     shown = found if ports or as_json else replace(found, ports=None)
-    options.print_drawn(shown, picture, lambda: _draw(found, what), as_json=as_json)
+    name, of = ("root_map", found) if what is LinearFigure.ROOTS else (f"port_{what}", found.ports)
+    options.print_drawn(shown, picture, f"linear_figures:draw_{name}", of, as_json=as_json)
 
 
 def _pose(text: str | None) -> tuple[float, ...] | None:
@@ -361,11 +354,3 @@ def _pose(text: str | None) -> tuple[float, ...] | None:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
-
-
-def _draw(found: "LinearAnalysis", what: LinearFigure) -> "Figure":
-    from ..reporting.figures.linear_figures import draw_port_impedance, draw_port_passivity, draw_root_map
-
-    if found.ports is None or what is LinearFigure.ROOTS:
-        return draw_root_map(found)
-    return (draw_port_impedance if what is LinearFigure.IMPEDANCE else draw_port_passivity)(found.ports)

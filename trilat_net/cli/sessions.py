@@ -16,8 +16,6 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from sites.demo_session import SessionAttendant
     from sites.running_session import RunningSession
 
@@ -214,12 +212,8 @@ def _benchmark(
         scenario, overrides or [], duration_s=seconds or DEFAULT_S, connect=reach.connect, keys=reach.keys
     )
 
-    def draw() -> "Figure":
-        from ..reporting.figures.linear_figures import draw_network_delays
-
-        return draw_network_delays(found.to_dict())
-
-    options.print_drawn(found, picture, draw, as_json=as_json)
+    shown = found.to_dict()
+    options.print_drawn(found, picture, "linear_figures:draw_network_delays", shown, as_json=as_json)
     if not found.good:
         raise typer.Exit(1)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -272,6 +272,61 @@ def compare_command(
         seeds=seeds,
     )
     _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
+
+
+@options.command("--arm arm6.urdf --delay 40ms --figure gains.png", "--arm my.urdf --delay measured:run.mcap")
+def tune_command(
+    arm: Annotated[Path, value("--arm", "URDF", "The arm: a file, or a shipped one.")],
+    delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
+    law: Annotated[str, value("--law", "LAW", "p_d, pd_d or saturated_pd.")] = "p_d",
+    tip: Annotated[str, value("--tip", "LINK", "End link; default: the only one without a child.")] = "",
+    sites: Annotated[int, value("--sites", "2|3", "How many such arms follow one another.")] = 2,
+    rate: Annotated[int, value("--rate", "HZ", "Tick rate.")] = 1000,
+    margin: Annotated[float, value("--margin", "FACTOR", "By how much K is below the edge.")] = 2.0,
+    damping: Annotated[float, value("--damping", "RATIO", "Damping ratio of an arm.")] = 0.7,
+    quantile: Annotated[float, value("--quantile", "SHARE")] = 1.0,
+    overrides: options.SetOption = None,
+    *,
+    reach: options.Reach,
+    picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Finds the largest gains that an arm bears over a delay, with a margin, and confirms them by runs.
+
+    Such arms follow one another over links of that delay both ways (docs/arms.md). The last line is one to
+    paste into a scenario. Exit code 0: all runs do as the linear loop predicts. 1: one does not.
+
+    Options:
+        delay: One way; the delays of a log, of a running session, or of a table t_s,delay_ms.
+        quantile: Of delays that vary, the one that a constant delay stands for; 1: the largest.
+    """
+    options.check_picture(picture, force=force)
+    from ..studies.arm_gains import tune_arm
+
+    loop: dict[str, Any] = {"set": overrides or (), "tip": tip, "sites": sites, "rate_hz": rate}
+    wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
+    found = tune_arm(arm, _measure_delay(delay, reach), law, **loop, **wanted, curve=picture is not None)
+
+    shown = found.to_dict()
+    options.print_drawn(found, picture, "linear_figures:draw_arm_gains", shown, as_json=as_json)
+    if not found.agree:
+        raise typer.Exit(1)
+
+
+def _measure_delay(text: str, reach: options.Reach) -> str:
+    """Returns a delay; of a running session that of its slowest link, or half of its longest round trip."""
+    name = text.removeprefix("measured:")
+    if name == text or name.endswith(".mcap"):
+        return text
+    from sites.session_ping import ping_session
+
+    there = reach.resolve(operates=False), SystemClock(), options.check_session_name(name)
+    found = ping_session(*there, 50, 3.0, lambda: False)
+    assert found is not None  # nothing stops it
+    trips_us = [0.5 * one["rtt_us"]["p99"] for one in found.members if one["answers"]]
+    delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in found.links]
+    return f"{max(delays_us or trips_us or [0.0]):.0f}us"
 
 
 def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:

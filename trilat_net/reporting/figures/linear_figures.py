@@ -250,3 +250,23 @@ def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
             axes.annotate(
                 label, (1.01, at), xycoords=("axes fraction", "data"), va=where, fontsize=REPORT_SIZE.tick_pt
             )
+
+
+def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
+    """Returns k at the edge over the delay, with the gains and the runs, see `ArmGains.to_dict`."""
+    edge, margin = facts["edge"], facts["margin"]
+    delay_ms, k = np.array(facts["curve"]).T * [[1e3], [1.0]]
+    runs = [run for run in facts["runs"] if run["share"]]
+    marks = {True: ("o", "run decays"), False: ("x", "run grows"), None: ("s", "run tells nothing")}
+    with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
+        axes = figure.add_subplot()
+        axes.loglog(delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay")
+        axes.fill_between(delay_ms, k, 10.0 * k.max(), **_UNSTABLE)
+        used = (edge["used_per_s2"] / margin, "D", f"the gains, margin {margin:g}")
+        shown = [(run["share"] * edge["k_per_s2"], *marks[run["stable"]]) for run in runs]
+        for at, mark, label in (used, *shown):
+            axes.plot(facts["age_ms"], at, mark, color=SITE_COLOURS[1], markersize=4.5, label=label)
+        axes.set(xlim=(delay_ms[0], delay_ms[-1]), ylim=(0.3 * k.min(), 3.0 * k.max()))
+        axes.set(xlabel="delay of each link (ms)", ylabel=r"K / inertia (1/s$^2$)")
+        figure.legend(loc="outside upper center", ncols=2, handlelength=1.2, columnspacing=1.0)
+    return figure

@@ -1,0 +1,47 @@
+"""How many modes of alike arms grow, counted by the argument principle from M(q), K and d alone.
+
+Two alike arms that follow one another split into a sum and a difference: each is one arm that its own
+position reaches n ticks later, with a = 1 or -1,
+
+    x[k + 1] = P x[k] + a Q S x[k - n],    det(1 - a z^-n S (z - P)^-1 Q)
+
+whose turns about zero along a circle just outside of abs(z) = 1 count what grows. Desoer and Wang, "On the
+generalized Nyquist stability criterion", IEEE Trans. Automatic Control 25 (1980). Nothing of `trilat_net`.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+Array = NDArray[np.float64]
+_GROWTH = 1e-7
+"""By how much of itself a motion that counts grows in a tick."""
+
+
+def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) -> int:
+    """The modes that grow under P+d without gravity, whose torque is 1.5 tau_k - 0.5 tau_{k-1}."""
+    n = len(M)
+    zero, one = np.zeros((n, n)), np.eye(n)
+    held = np.block([[zero, one, zero], [zero, zero, np.linalg.inv(M)], [np.zeros((n, 3 * n))]])
+    whole = expm(held * h_s)
+    Phi, Gamma, F = whole[: 2 * n, : 2 * n], whole[: 2 * n, 2 * n :], np.hstack([-np.diag(K), -np.diag(d)])
+    P = np.block([[Phi + 1.5 * Gamma @ F, -0.5 * Gamma], [F, zero]])
+    Q, S = np.vstack([1.5 * Gamma @ np.diag(K), np.diag(K)]), np.eye(n, 3 * n)
+
+    def values(angle: Array) -> NDArray[np.complex128]:
+        z = (1.0 + _GROWTH) * np.exp(1j * angle)[:, np.newaxis, np.newaxis]
+        G = z**-delay_ticks * (S @ np.linalg.solve(z * np.eye(3 * n) - P, Q + 0.0 * z))
+        return np.linalg.det(one - np.array([1.0, -1.0]).reshape(2, 1, 1) * G[:, np.newaxis])
+
+    angle = np.geomspace(1e-3 * _GROWTH, np.pi, 500)
+    found = values(angle)
+    while True:
+        turns = np.angle(found[1:] / found[:-1])
+        wide = np.flatnonzero(np.abs(turns).max(axis=1) > 0.8)
+        if not len(wide):
+            break
+        between = np.sqrt(angle[wide] * angle[wide + 1])
+        found = np.insert(found, wide + 1, values(between), axis=0)
+        angle = np.insert(angle, wide + 1, between)
+    alone = int((np.abs(np.linalg.eigvals(P)) > 1.0 + _GROWTH).sum())
+    return 2 * alone - round(float(turns.sum()) / np.pi)
