@@ -5,7 +5,8 @@ Invariant: each call connects, as its command does, and holds no connection afte
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,8 @@ from .session_ping import PingReport, ping_session
 
 GATHER_NS = 500_000_000
 """Time for further sites to answer, after the first one of a session that some may have left."""
+STATES_KEPT = 4096
+"""Records of each site that are looked at for the sample which another one has in use."""
 AHEAD_S = 0.5
 """From the newest tick that is known to the end: sites say ten times a second where they are."""
 
@@ -210,6 +213,55 @@ class RunningSession:
             yield take
 
     @contextmanager
+    def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
+        """Listens to all sites; yields a function that returns a record of each, by name.
+
+        That is the newest one; with `as_site` what that site knows: its own newest record, and of each peer
+        the one whose sample it has in use, delayed as its links are. There is none of a peer whose sample was
+        made before this listened, or more than `STATES_KEPT` ticks ago.
+
+        >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
+        ...     find()["s"].q
+        """
+        with self.reach("") as bus:
+            ring = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
+            kept: dict[str, deque[State]] = {}
+
+            def find() -> dict[str, State]:
+                for record in read_records(ring):
+                    kept.setdefault(record.site, deque(maxlen=STATES_KEPT)).append(record)
+                newest = {site: records[-1] for site, records in kept.items()}
+                if not as_site or as_site not in newest:
+                    return {} if as_site else newest
+                own = newest[as_site]
+                seen = {peer: _find_record(kept.get(peer, ()), tick) for peer, tick in own.used.items()}
+                return {as_site: own, **{peer: one for peer, one in seen.items() if one is not None}}
+
+            yield find
+
+    def mark(self, text: str) -> str:
+        """Marks this moment in the log by a text: an event of a site."""
+        with self.reach() as bus:
+            scenario, found = self._meet_sites(bus)
+            first = next(name for name in scenario.names if name in found)
+            return send_change(bus, self._clock, self.name, first, ChangeRequest(mark=text)).text
+
+    @contextmanager
+    def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
+        """Marks the begin and the end of an episode; yields a function that says whether it succeeded.
+
+        >>> with tn.session("paper").episode("reach 3") as judge:  # doctest: +SKIP
+        ...     judge(True)
+        """
+        judged: list[bool] = []
+        self.mark(f"episode {name} begins")
+        try:
+            yield judged.append
+        finally:
+            how = {True: "succeeded", False: "failed", None: "ended"}[judged[-1] if judged else None]
+            self.mark(f"episode {name} {how}")
+
+    @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
         """Listens to a site; yields a function that returns its present shares in its peers, by name."""
         with self.reach("") as bus:
@@ -235,6 +287,10 @@ class RunningSession:
         found = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
         assert found is not None  # nothing stops it
         return found
+
+
+def _find_record(records: Iterable[State], tick: int) -> State | None:
+    return next((one for one in reversed([*records]) if one.tick == tick), None)
 
 
 def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
