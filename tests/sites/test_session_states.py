@@ -55,7 +55,7 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
         for peer in ("m2", "s"):
             assert one[peer].tick == own.used[peer] == log["m1"].states[own.tick].used[peer]
             assert np.array_equal(one[peer].q, log[peer].q[own.used[peer]])
-            assert true[peer].tick - one[peer].tick >= 119
+            assert true[peer].tick - one[peer].tick >= 120 - 11  # records come ten at a time
     assert seen
 
 
