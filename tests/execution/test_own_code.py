@@ -194,3 +194,23 @@ def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
     assert again.sha256 == scenario.sha256
     assert again.sites["m2"].hands == scenario.sites["m2"].hands
     assert again.sites["s"].plant == scenario.sites["s"].plant
+
+
+def test_a_person_takes_over_from_a_program_without_a_jump() -> None:
+    """Both lead a moving slave in turn; the ramps step q_id by no more than 1.2 times the motion's own steps."""
+    person = {"kind": "tip_spring", "to_m": [1.6, 0.5], "stiffness_n_m": 300.0, "damping_n_s_m": 30.0}
+    ramps = [
+        {"at_s": at_s, "dominance": "s", "to": {"m1": m1, "m2": 1.0 - m1}, "ramp_s": 1.0}
+        for at_s, m1 in ((3.0, 0.9), (6.0, 0.1))
+    ]
+    overrides = {
+        **at_m2(settings={"turn_s": 3.0}),
+        "sites.m1.hands": [{**person, "move_start_s": 0.0, "move_end_s": 8.0}],
+        "dominance.s": {"m1": 0.1, "m2": 0.9},
+        "timeline": ramps,
+        "duration_s": 9.0,
+    }
+    found = tn.metrics(tn.simulate("paper", overrides))
+    assert found.run["takeovers"].value == 2
+    assert 0.0 < found.run["takeover_s"].value <= 1.0
+    assert 0.0 < found.run["lead_jump"].value <= 1.2
