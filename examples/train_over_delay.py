@@ -140,7 +140,7 @@ def main() -> None:
     with ProcessPoolExecutor(options.jobs) as pool:
         found = list(pool.map(run_seed, range(options.seeds)))
     report(found)
-    options.out.with_suffix(".json").write_text(json.dumps(found, indent=1))
+    options.out.with_suffix(".json").write_text(json.dumps(found, indent=1), newline="\n")
     draw(found, options.out)
 
 

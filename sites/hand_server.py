@@ -55,7 +55,7 @@ class HandServer:
         self._names: dict[int, str] = {}
         self.news: list[tuple[int, str]] = []
 
-    def take(self, k: int, _arrays: SiteArrays) -> list[float]:
+    def take(self, k: int, _arrays: SiteArrays | None = None) -> list[float]:
         """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
         commands = []
         for _ in range(MESSAGES_KEPT):

@@ -87,6 +87,7 @@ ELSEWHERE = {
     "docs/network.md: trilat ping --session": "tests/live/test_clocks.py",
     "docs/network.md: trilat site m2 --scenario glide.toml": "tests/live/test_returning.py",
     "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
+    "docs/policies.md: trilat hand": "tests/live/test_own_hands.py",
     "docs/ros2.md: trilat": "tests/live/test_ros2.py",
     "docs/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
     "docs/sweep.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",

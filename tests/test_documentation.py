@@ -78,6 +78,7 @@ SCENARIO_OF = {
     "docs/live-hands.md": "play",
     "docs/metrics.md": "free",
     "docs/own-controller.md": "paper",
+    "docs/policies.md": "paper",
     "docs/sweep.md": "free",
 }
 """By page the scenario into which its settings are put."""
@@ -106,6 +107,9 @@ def test_settings_make_a_scenario(block: Block, tmp_path: Path, monkeypatch: pyt
         return
     if block.page == "docs/own-controller.md":
         (tmp_path / "mylaws.py").write_text(find_blocks(block.page)[0].text)
+    for code in find_blocks("docs/policies.md"):
+        if named := re.match(r"# (my_\w+\.py)\n", code.text):
+            (tmp_path / named[1]).write_text(code.text)
     base = tomllib.loads((SCENARIOS / f"{SCENARIO_OF[block.page]}.toml").read_text(encoding="utf-8"))
     stated = tomllib.loads(text)
     (tmp_path / "arm6.urdf").write_text((SCENARIOS / "arm6.urdf").read_text(encoding="utf-8"))
@@ -188,6 +192,7 @@ PYTHON_PAGES = {
     "docs/linear.md",
     "docs/live-hands.md",
     "docs/own-controller.md",
+    "docs/policies.md",
     "docs/ports.md",
     "docs/python.md",
     "docs/rerun.md",

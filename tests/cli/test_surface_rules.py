@@ -19,11 +19,20 @@ COMMANDS = [name for name in OPTIONS if not any(other.startswith(f"{name} ") for
 GOLDEN_LOG = Path(__file__).parents[1] / "golden" / "live-paper.mcap"
 NO_RESULT = {
     *(
-        f"trilat {name}" for name in ("site", "record", "watch", "router", "ros2", "log view")
+        f"trilat {name}" for name in ("site", "hand", "record", "watch", "router", "ros2", "log view")
     ),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
     *(
-        f"trilat {name}" for name in ("scenario show", "scenario new", "new law", "keys new", "keys pair")
+        f"trilat {name}"
+        for name in (
+            "scenario show",
+            "scenario new",
+            "new law",
+            "new hand",
+            "new plant",
+            "keys new",
+            "keys pair",
+        )
     ),  # files
 }
 """Commands that print what they do, and find nothing."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -98,3 +99,29 @@ def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -
     with pytest.raises(ValueError, match=problem):
         hand.decide(0, goal)
     assert acted(hand, 0).source == 0
+
+
+@given(
+    st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)) | st.none(), min_size=1, max_size=14),
+    st.integers(0, 45),
+    st.floats(0.05, 2.0),
+)
+def test_compiled_spans_are_the_ticks_bit_for_bit(
+    goals: list[tuple[float, float] | None], delay: int, speed_limit: float
+) -> None:
+    """Goals come at every 20th tick, and then none for longer than a silence that lets go."""
+    rules = HandRules(2, 1000, speed_limit, from_arm=True, farthest=100.0)
+    by_tick, by_span = (OwnHand(rules, EVERY, delay, lambda _: PLACE) for _ in range(2))
+    singles = []
+    for k in range(EVERY * len(goals) + 500):
+        if k % EVERY == 0 and k // EVERY < len(goals):
+            by_tick.decide(k, goals[k // EVERY])
+        singles.append(by_tick.advance(k, lambda: PLACE).vector)
+    k, spans = 0, []
+    while k < len(singles):
+        if k % EVERY == 0 and k // EVERY < len(goals):
+            by_span.decide(k, goals[k // EVERY])
+        rows = by_span.advance_until(k, len(singles), lambda: PLACE)
+        spans += rows.tolist()
+        k += len(rows)
+    assert np.array(spans).tobytes() == np.array(singles).tobytes()

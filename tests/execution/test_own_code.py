@@ -197,7 +197,7 @@ def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
 
 
 def test_a_person_takes_over_from_a_program_without_a_jump() -> None:
-    """Both lead a moving slave in turn; the ramps step q_id by no more than 1.2 times the motion's own steps."""
+    """Both lead a moving slave in turn; ramps step q_id by no more than 1.2 times the motion itself."""
     person = {"kind": "tip_spring", "to_m": [1.6, 0.5], "stiffness_n_m": 300.0, "damping_n_s_m": 30.0}
     ramps = [
         {"at_s": at_s, "dominance": "s", "to": {"m1": m1, "m2": 1.0 - m1}, "ramp_s": 1.0}

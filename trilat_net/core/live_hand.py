@@ -15,6 +15,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from .jit import leaf
+from .vectors import Array
+
 SILENCE_NS = 200_000_000
 """A longer silence of who holds an arm lets it go."""
 GRIP_NS = 100_000_000
@@ -182,6 +185,41 @@ def advance_hand(
         now = now._replace(rate=_find_rate(rules, now, t_ns))
     vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
     return HandStep(now, vector, tuple(refused), tuple(changes))
+
+
+@leaf
+def glide(
+    first: int,
+    rate_hz: int,
+    grip: float,
+    arrives_ns: int,
+    speed_limit: float,
+    goal: Array,
+    target: Array,
+    rate: Array,
+    rows: Array,
+) -> float:
+    """Does as `advance_hand` of a held arm in ticks without a message, compiled: a row of `rows` each.
+
+    A row is as `HandInForce`, but for number and source. Target and rate are changed; returns the grip.
+    """
+    h_s, firmer, size = 1.0 / rate_hz, 1e9 / (GRIP_NS * rate_hz), target.shape[0]
+    for n in range(rows.shape[0]):
+        t_ns = (first + n) * 1_000_000_000 // rate_hz
+        grip = min(grip + firmer, 1.0)
+        left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
+        square = 0.0
+        for i in range(size):
+            target[i] += rate[i] * h_s
+            rate[i] = (goal[i] - target[i]) / left_s
+            square += rate[i] * rate[i]
+        speed = math.sqrt(square)
+        share = speed_limit / speed if speed > speed_limit else 1.0
+        rows[n, 0] = grip
+        for i in range(size):
+            rate[i] *= share
+            rows[n, 3 + i], rows[n, 3 + size + i] = target[i], rate[i]
+    return grip
 
 
 def _take_command(

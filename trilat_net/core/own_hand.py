@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from .live_hand import HandCommand, HandMemory, HandRules, HandStep, advance_hand
+from .live_hand import SILENCE_NS, HandCommand, HandMemory, HandRules, HandStep, advance_hand, glide
 from .site_arrays import SiteArrays
 from .site_setup import Layout
 from .ticks import tick_ns
@@ -198,3 +198,25 @@ class OwnHand:
         step = advance_hand(self._rules, self._memory, t_ns, commands, lambda: self._place(angles()))
         self._memory = step.memory
         return step
+
+    def advance_until(self, k: int, end: int, angles: Callable[[], Sequence[float]]) -> Array:
+        """Returns what it does from tick k until it needs the arm again, before tick `end`.
+
+        Of each tick there is a row, as `HandInForce`. The same as `advance` tick by tick, bit for bit.
+        """
+        size, rate_hz = self._rules.size, self._rules.rate_hz
+        first = self.advance(k, angles).vector
+        rows = np.zeros((max(min(self.find_next(k), end), k + 1) - k, 3 + 2 * size))
+        rows[0] = first
+        held = self._memory
+        if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.heard_ns <= SILENCE_NS:
+            goal, target, rate = (np.array(one) for one in (held.goal, held.target, held.rate))
+            limit = self._rules.speed_limit
+            grip = glide(k + 1, rate_hz, held.grip, held.arrives_ns, limit, goal, target, rate, rows[1:])
+            rows[1:, 1], rows[1:, 2] = held.number, held.source
+            ends = tuple(target.tolist()), tuple(rate.tolist())
+            self._memory = held._replace(grip=grip, target=ends[0], rate=ends[1])
+        else:
+            for n in range(1, len(rows)):
+                rows[n] = self.advance(k + n, angles).vector
+        return rows

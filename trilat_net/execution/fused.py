@@ -36,7 +36,6 @@ from ..core.fused_run import (
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
-from ..core.own_hand import OwnHand
 from ..core.site_arrays import SiteArrays, select_site, stack_site_arrays, take_change
 from ..core.site_setup import SiteSetup
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
@@ -109,12 +108,13 @@ def _largest_ratio(scenario: Scenario) -> int:
 
 
 class HandActor(Protocol):
-    """A live hand in a compiled run: `hand` says at which ticks `take` needs the arm as it then is."""
+    """A live hand in a compiled run."""
 
-    hand: OwnHand
+    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
+        """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick.
 
-    def take(self, k: int, arrays: SiteArrays) -> list[float]:
-        """Returns what it does in tick k, see `HandInForce`."""
+        A row is as `HandInForce`.
+        """
 
 
 class RunTotals(NamedTuple):
@@ -277,10 +277,8 @@ class FusedRun:
         if k < self._acted.get(i, 0):
             return tick_ns(self._acted[i], rate_hz)
         arrays, size = self.arrays(i), (acts.shape[2] - 1) // 2
-        acted = [hand.take(k, arrays)]
-        until = min(hand.hand.find_next(k), int(progress["ticks"]))
-        acted += [hand.take(later, arrays) for later in range(k + 1, until)]
-        block = np.array(acted)
+        block = hand.take_until(k, int(progress["ticks"]), arrays)
+        until = k + len(block)
         own = (block.shape[1] - 3) // 2
         target, rate = block[:, 3 : 3 + own], block[:, 3 + own :]
         acts[i, k:until, 0], acts[i, k:until, 1 : 1 + own] = block[:, 0], target

@@ -127,6 +127,11 @@ class ActedHand:
         """Returns what it does in tick k, see `HandInForce`."""
         return self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist()).vector
 
+    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
+        """Returns what it does until it needs the arm again, as `HandActor` says."""
+        angles = arrays.site[0]["q"][: self._layout.joints]
+        return self.hand.advance_until(k, end, angles.tolist)
+
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     """One user of an experiment, in steps; `make_env` says what its arguments mean."""

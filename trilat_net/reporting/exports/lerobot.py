@@ -70,7 +70,7 @@ def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30
     about = {"exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}", "meanings": _MEANINGS}
     texts[EXPORT_MANIFEST] = {**about, "program": program or "the last user", "sessions": sessions}
     for place, content in texts.items():
-        (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+        (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n")
     return f"{len(index)} frames in {len(starts)} episodes; {lost} frames lie in gaps and are left out"
 
 

@@ -15,6 +15,7 @@ from ... import fields
 from ...core.own_hand import HandContext, HandProgram, HandView, OwnHand
 from ...core.site_arrays import SiteArrays
 from ...core.ticks import NS_PER_S, tick_ns
+from ...core.vectors import Array
 from ...laws.interface import make_instance
 from ..imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
 from ..operators import Holding
@@ -142,6 +143,12 @@ class HandPlayer:
         step = self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist())
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
+
+    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
+        """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
+        if self.hand.is_asked(k) and not self.failure:
+            self.ask(k, self.hand.view(k, arrays, self._layout))
+        return self.hand.advance_until(k, end, arrays.site[0]["q"][: self._layout.joints].tolist)
 
     def ask(self, k: int, view: HandView) -> None:
         """Asks its class at tick k."""
