@@ -22,18 +22,8 @@ NO_RESULT = {
         f"trilat {name}" for name in ("site", "hand", "record", "watch", "router", "ros2", "log view")
     ),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
-    *(
-        f"trilat {name}"
-        for name in (
-            "scenario show",
-            "scenario new",
-            "new law",
-            "new hand",
-            "new plant",
-            "keys new",
-            "keys pair",
-        )
-    ),  # files
+    *(f"trilat new {kind}" for kind in ("law", "hand", "plant")),
+    *(f"trilat {name}" for name in ("scenario show", "scenario new", "keys new", "keys pair")),  # files
 }
 """Commands that print what they do, and find nothing."""
 

@@ -209,6 +209,7 @@ class FusedRun:
         ]
         self._taken_ticks = [0] * count
         self._acted: dict[int, int] = {}
+        self._selected: dict[int, SiteArrays] = {}
         self.ran_s = 0.0
 
     def _meet_hands(self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]) -> None:
@@ -378,7 +379,9 @@ class FusedRun:
 
     def arrays(self, i: int) -> SiteArrays:
         """Returns what a site is made of, as its next tick will find it; to be read, not written."""
-        return select_site(self._tables, i, self._layouts[i])
+        if i not in self._selected:
+            self._selected[i] = select_site(self._tables, i, self._layouts[i])
+        return self._selected[i]
 
     def push(self, field: str, by: Array) -> None:
         """Adds to a field of every site's state, shape (N, n)."""

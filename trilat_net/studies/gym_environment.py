@@ -33,8 +33,8 @@ from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
 from ..scenario.operators.program_hand import HandSite
 
 ENV_ID = "trilat_net/Teleoperation-v0"
-FAR, FAR_S = 1e3, 1e6
-"""Bounds of what is observed, where nothing tighter is known."""
+FAR = 1e6
+"""Bound of what is observed where nothing tighter is known: rad, rad/s, m, N m, s."""
 
 
 class Scene(NamedTuple):
@@ -210,12 +210,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return Scene(self._k / self._tick_rate_hz, q, places, view)
 
     def _describe_observation(self) -> spaces.Dict:
-        bounds = {"alpha": 1.0, "grip": 1.0, "age_s": FAR_S, "goal": self.task.bound}
-        observed = self._observe(self._look())
+        bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
         return spaces.Dict(
             {
                 name: spaces.Box(-bounds.get(name, FAR), bounds.get(name, FAR), one.shape, np.float64)
-                for name, one in observed.items()
+                for name, one in self._observe(self._look()).items()
             }
         )
 
@@ -223,10 +222,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         view = scene.view
         own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
         peers = {f"peer_{name}": np.array([getattr(one, name) for one in view.peers]) for name in _OF_PEERS}
-        flat = {name: np.clip(one, -FAR, FAR) for name, one in {**own, **peers}.items()}
-        facts = {"alpha": [one.alpha for one in view.peers], "age_s": [one.age_s for one in view.peers]}
-        more = {name: np.array(one) for name, one in {**facts, "grip": [view.grip]}.items()}
-        return flat | more | {"goal": np.array(self.task.goal, dtype=np.float64)}
+        alpha, age_s = zip(*((one.alpha, one.age_s) for one in view.peers), strict=True)
+        more = {"alpha": np.array(alpha), "age_s": np.array(age_s), "grip": np.array([view.grip])}
+        return {**own, **peers, **more, "goal": np.array(self.task.goal, dtype=np.float64)}
 
     def _inform(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
         """Returns facts of a step; the first two by the names of gym-hil."""
