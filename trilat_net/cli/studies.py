@@ -308,8 +308,7 @@ def tune_command(
     wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
     found = tune_arm(arm, _measure_delay(delay, reach), law, **loop, **wanted, curve=picture is not None)
 
-    shown = found.to_dict()
-    options.print_drawn(found, picture, "linear_figures:draw_arm_gains", shown, as_json=as_json)
+    options.print_drawn(found, picture, "linear_figures:draw_arm_gains", found.to_dict(), as_json=as_json)
     if not found.agree:
         raise typer.Exit(1)
 

@@ -252,10 +252,11 @@ class _GainSearch:
     ) -> tuple[float, Array]:
         """Returns the least k at which small motions grow in a pose, and that pose; inf if in none.
 
-        Under delays that vary they may grow, and not, and grow again: then steps are small.
+        Under delays that vary they may grow, and not, and grow again: then the first steps are small.
         """
         edge, worst = math.inf, self._poses[0]
-        steps = np.arange(100) * math.log(1.1) if loop.varying else np.arange(24) * math.log(2.0)
+        small, steps = np.arange(15) * math.log(1.1), np.arange(24) * math.log(2.0)
+        steps = np.append(small, math.log(4.0) + steps) if loop.varying else steps
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:

@@ -205,7 +205,7 @@ def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
     assert found.runs[0]["stable"]
 
 
-def test_the_delay_of_a_session_is_that_of_its_slowest_link(
+def test_a_session_has_the_delay_of_its_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
