@@ -140,7 +140,9 @@ def test_a_plant_is_measured_and_its_control_repeated() -> None:
     log = without_code(tn.simulate("paper", with_plant()))
     assert log.scenario.external == ("s",)
     assert log.scenario.outside == ()
-    assert tn.verify(log, virtual=True).passed
+    checked = tn.verify(log, virtual=True)
+    assert checked.passed
+    assert "the motion of s was measured and is not judged" in checked.summary()
     with pytest.raises(CodeWithheld, match="may not run"):
         tn.simulate(log)
 

@@ -111,6 +111,9 @@ def _checks(
     for law in find_user_laws(log.scenario):
         yield Finding("user law", str(law), law.allowed, law.allowed)
     yield _verify_line(result, recorded)
+    if log.scenario.external:
+        arms = " and ".join(log.scenario.external)
+        yield Finding("plant", f"the motion of {arms} was measured and is not judged, its control is", True)
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield Finding("scenario", "is not the one whose hash the log names: it was changed", False)
     if virtual and result.withheld:
