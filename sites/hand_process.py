@@ -81,9 +81,8 @@ class HandProcess(SiteClient):
         self._send(message.k, numbers)
 
     def _send(self, k: int, goal: list[float] | None) -> None:
-        does = {"force" if self._pushes else "target": goal or []}
-        about = {"source": self._code, "n": k // self._every, "grip": goal is not None}
-        self._sender.send(HandMessage, **about, **does)
+        does = {"force" if self._pushes else "target": goal or [], "grip": goal is not None}
+        self._sender.send(HandMessage, source=self._code, n=k // self._every, **does)
 
 
 def read_view(message: HandViewMessage) -> HandView:

@@ -112,13 +112,10 @@ class RemoteHand(HandPlayer):
         publish: Callable[[bytes], None],
         dropped: Counter[str],
     ) -> None:
-        super().__init__(at, self)
+        super().__init__(at, None)
         self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
         self._every = at.scenario.sites[at.name].rate_hz // at.rate_hz
         self._asked, self._source = -1, at.source
-
-    def act(self, now: HandView) -> None:
-        """Decides nothing itself."""
 
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
         """Returns what it does in tick k, by the decisions that have come."""

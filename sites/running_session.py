@@ -6,7 +6,7 @@ Invariant: each call connects, as its command does, and holds no connection afte
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -234,7 +234,8 @@ class RunningSession:
                 if not as_site or as_site not in newest:
                     return {} if as_site else newest
                 own = newest[as_site]
-                seen = {peer: _find_record(kept.get(peer, ()), tick) for peer, tick in own.used.items()}
+                by_tick = {peer: {one.tick: one for one in kept.get(peer, ())} for peer in own.used}
+                seen = {peer: by_tick[peer].get(tick) for peer, tick in own.used.items()}
                 return {as_site: own, **{peer: one for peer, one in seen.items() if one is not None}}
 
             yield find
@@ -287,10 +288,6 @@ class RunningSession:
         found = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
         assert found is not None  # nothing stops it
         return found
-
-
-def _find_record(records: Iterable[State], tick: int) -> State | None:
-    return next((one for one in reversed([*records]) if one.tick == tick), None)
 
 
 def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:

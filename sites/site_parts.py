@@ -92,7 +92,10 @@ class SiteParts:
         self.stats = LoopStats(self.site, self.boot, self.rates)
         self.watchdog = CodeWatchdog()
         law = scenario.sites[name].control
-        self.step = self.site.step if not isinstance(law, ImportedLaw) else self._watch_law(law)
+        self.step: Callable[[TickInput], TickRecord] = self.site.step
+        if isinstance(law, ImportedLaw):
+            code, self.step = watch_law(self.site, law.code, clock)
+            self.watchdog.codes.append(code)
         self.rings = [
             bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
             for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
@@ -127,11 +130,6 @@ class SiteParts:
         code = WatchedCode(name, rate_hz, lambda _, problem: TimeoutError(problem), self.clock)
         self.watchdog.codes.append(code)
         return code.run
-
-    def _watch_law(self, law: ImportedLaw) -> Callable[[TickInput], TickRecord]:
-        code = watch_law(self.site, law.code, self.clock)
-        self.watchdog.codes.append(code)
-        return lambda tick: code.run(tick.k, lambda: self.site.step(tick))
 
     def _meet_hand(self) -> None:
         name, bus, session = self.name, self.bus, self.options.session
@@ -209,23 +207,24 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     site = Site(setup)
     try:
         if isinstance(law, ImportedLaw):
-            code = watch_law(site, law.code, clock or SystemClock())
+            code, step = watch_law(site, law.code, clock or SystemClock())
             with CodeWatchdog(code):
-                _warm(setup, site, lambda tick: code.run(tick.k, lambda: site.step(tick)))
+                _warm(setup, site, step)
         else:
             _warm(setup, site, site.step)
     except LawFailed as failed:
         problem = f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
-        raise LawFailed(problem, site=name, law=failed.law, tick=failed.tick) from None
+        raise LawFailed(problem, site=name, code=failed.code, tick=failed.tick) from None
 
 
-def watch_law(site: Site, law: str, clock: Clock) -> WatchedCode:
-    """Returns the step of a site under a user's law, as a watchdog knows it."""
+def watch_law(site: Site, law: str, clock: Clock) -> tuple[WatchedCode, Callable[[TickInput], TickRecord]]:
+    """Returns a user's law as a watchdog knows it, and the step of its site."""
 
     def fail(k: int, problem: str) -> LawFailed:
-        return LawFailed(problem, site=site.name, law=law, tick=k)
+        return LawFailed(problem, site=site.name, code=law, tick=k)
 
-    return WatchedCode(f"the law {law}", site.rate_hz, fail, clock)
+    code = WatchedCode(f"the law {law}", site.rate_hz, fail, clock)
+    return code, lambda tick: code.run(tick.k, lambda: site.step(tick))
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:

@@ -25,7 +25,7 @@ from trilat_net.core.ticks import (
     find_life_reason,
     tick_ns,
 )
-from trilat_net.errors import LawFailed, PeerLeft, PlantFailed, RunFailed, SessionError
+from trilat_net.errors import CodeFailed, PeerLeft, RunFailed, SessionError
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -263,7 +263,7 @@ class RunningSite:
             self._output = self._step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
             if parts.plant is not None:
                 parts.plant.move(self._output)
-        except (LawFailed, PlantFailed) as failed:
+        except CodeFailed as failed:
             self._failure = failed
             return None
         return self._output

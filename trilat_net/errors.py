@@ -123,36 +123,38 @@ class PeerLeft(RunFailed):
     exit_code = 3
 
 
-class LawFailed(RunFailed):
-    """A user's control law that raised, was too slow, or returned no torque.
+class CodeFailed(RunFailed):
+    """Code of a user's own that raised, was too slow, or gave nothing that can be used.
 
     Args:
         problem: its failure.
         site: its site.
-        law: the law, as in "package.module:Law".
+        code: the class, as in "package.module:Law".
         tick: the tick of the failure; None if it was being resumed.
     """
 
-    def __init__(self, problem: str, *, site: str, law: str, tick: int | None) -> None:
+    kind: ClassVar[str] = "code"
+
+    def __init__(self, problem: str, *, site: str, code: str, tick: int | None) -> None:
         when = "as it was resumed" if tick is None else f"at tick {tick}"
-        super().__init__(f"the law {law} of {site} failed {when}: {problem}")
-        self.problem, self.site, self.law, self.tick = problem, site, law, tick
+        super().__init__(f"the {self.kind} {code} of {site} failed {when}: {problem}")
+        self.problem, self.site, self.code, self.tick = problem, site, code, tick
 
     def __reduce__(self) -> tuple[object, ...]:
         """Restores the error of another process."""
-        return partial(LawFailed, site=self.site, law=self.law, tick=self.tick), (self.problem,)
+        return partial(type(self), site=self.site, code=self.code, tick=self.tick), (self.problem,)
 
 
-class PlantFailed(RunFailed):
-    """A plant of one's own that raised, or whose motion is none of its arm."""
+class LawFailed(CodeFailed):
+    """A user's control law failed."""
 
-    def __init__(self, problem: str, site: str) -> None:
-        super().__init__(problem)
-        self.problem, self.site = problem, site
+    kind = "law"
 
-    def __reduce__(self) -> tuple[object, ...]:
-        """Restores the error of another process."""
-        return PlantFailed, (self.problem, self.site)
+
+class PlantFailed(CodeFailed):
+    """A plant of one's own failed."""
+
+    kind = "plant"
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md

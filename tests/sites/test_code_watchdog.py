@@ -40,7 +40,7 @@ class Steps:
 
 
 def fail_of(site: str, law: str) -> Callable[[int, str], Exception]:
-    return lambda k, problem: LawFailed(problem, site=site, law=law, tick=k)
+    return lambda k, problem: LawFailed(problem, site=site, code=law, tick=k)
 
 
 def ended(steps: Steps, overtime: WatchedCode | None = None) -> int | None:

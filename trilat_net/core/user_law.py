@@ -291,7 +291,7 @@ def law_name(law: UserLaw) -> str:
 
 
 def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
-    return LawFailed(problem, site=site, law=law_name(law), tick=tick)
+    return LawFailed(problem, site=site, code=law_name(law), tick=tick)
 
 
 def _one_line(error: BaseException) -> str:

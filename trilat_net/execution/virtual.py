@@ -29,7 +29,7 @@ from ..core.ticks import (
     describe_divergence,
     describe_mode,
 )
-from ..errors import LawFailed, PlantFailed
+from ..errors import CodeFailed
 from ..log.accounting import Account
 from ..log.log_file import LogFile
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
@@ -45,7 +45,7 @@ from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
-from ..scenario.operators.program_hand import HandPlayer, make_hand_players
+from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
@@ -174,23 +174,6 @@ HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
 """Per site with a live hand what that does at a tick of the site, which is about to make it."""
 
 
-class OwnCode(NamedTuple):
-    """What a scenario has of one's own besides laws, by site: hands, and plants that move arms."""
-
-    hands: Mapping[str, HandPlayer] = {}
-    plants: Mapping[str, PlantPlayer] = {}
-
-    @classmethod
-    def of_scenario(cls, scenario: Scenario) -> "OwnCode":
-        """Makes it anew.
-
-        Raises:
-            CodeWithheld: a class may not run.
-            ScenarioError: one cannot be made.
-        """
-        return cls(make_hand_players(scenario), make_plant_players(scenario))
-
-
 def check_virtual(scenario: Scenario) -> None:
     """Refuses a scenario that virtual time cannot run, before anything is written.
 
@@ -221,21 +204,20 @@ def execute_virtual(
     measured: PlantSchedule = {},  # noqa: B006
     ends: Mapping[str, int] = {},
     hands: HandTracks = {},  # noqa: B006
-    own: OwnCode = OwnCode(),  # noqa: B008
+    plants: Mapping[str, PlantPlayer] = {},
 ) -> Iterator[SiteTick]:
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
     A site whose network is not ready lets the others go first; by default every sample arrives at the next
     tick. A run that diverges ends with the ticks of that instant. `ends` holds the last tick of sites that
-    make fewer than the scenario has. Live hands do what `hands` says, or those of one's own; else nobody
-    holds an arm.
+    make fewer than the scenario has. Live hands do what `hands` says; else nobody holds an arm.
 
     Raises:
-        ScenarioError: an arm is external and `measured` and `own` lack it.
+        ScenarioError: an arm is external and `measured` and `plants` lack it.
         LawFailed: a user law failed.
         PlantFailed: a plant of one's own did.
     """
-    refuse_external_arms(scenario, {**measured, **own.plants})
+    refuse_external_arms(scenario, {**measured, **plants})
     joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
     setups = [scenario.setup(name) for name in scenario.names]
     sites = [Site(setup) for setup in setups]
@@ -252,12 +234,7 @@ def execute_virtual(
         site = sites[index]
         arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
         ordered, arm = commands.get(site.name, {}), measured.get(site.name, {})
-        hand: Sequence[float] = ()
-        if site.name in hands:
-            hand = hands[site.name](site, k)
-        elif site.name in own.hands:
-            hand = own.hands[site.name].take(k, site.arrays)
-        plant = own.plants.get(site.name)
+        hand, plant = hands[site.name](site, k) if site.name in hands else (), plants.get(site.name)
         at = arm.get(k) if plant is None else plant.state
         output = site.step(TickInput(k, arrivals, ordered.get(k, ()), at, hand))
         if plant is not None:
@@ -326,30 +303,26 @@ def write_virtual_log(
         LawFailed: a user law failed; the log holds an event with the reason.
     """
     check_virtual(scenario)
-    own = OwnCode.of_scenario(scenario)
+    own, plants = make_hand_players(scenario), make_plant_players(scenario)
+    acts = {**{name: player.track for name, player in own.items()}, **hands}
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
     members: dict[str, _VirtualChannels] = {}
     within = True
     t_ns = 0
     try:
         with process.pause_gc():
-            told: dict[str, Any] = {"commands": commands, "hands": hands, "own": own}
+            told: dict[str, Any] = {"commands": commands, "hands": acts, "plants": plants}
             for site, arrivals, output in execute_virtual(scenario, network, **told):
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
                 members[site.name].tick(arrivals, output)
-                if site.name in own.hands:
-                    members[site.name].tell(own.hands[site.name].news)
+                if site.name in own:
+                    members[site.name].tell(own[site.name].news)
                 within &= output.mode is not Mode.DIVERGED
                 t_ns = output.t_ns
                 if stopped():
                     break
-    except PlantFailed as failed:
-        if failed.site in members:
-            member = members[failed.site]
-            member.write(member.new_event("failed", str(failed), t_ns), writer)
-        raise
-    except LawFailed as failed:
+    except CodeFailed as failed:
         if failed.site not in members:
             without_law = Site(scenario.setup(failed.site)._replace(own=None))
             members[failed.site] = _VirtualChannels(scenario, without_law, writer)

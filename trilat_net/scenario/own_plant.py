@@ -134,8 +134,7 @@ class PlantPlayer:
         self.state = PlantState(*found)
 
     def _failed(self, tick: int, problem: str) -> PlantFailed:
-        text = f"the plant {self._code} of {self._site} failed at tick {tick}: {problem}"
-        return PlantFailed(text, self._site)
+        return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 
 def make_plant_players(scenario: "Scenario") -> dict[str, PlantPlayer]:

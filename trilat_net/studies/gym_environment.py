@@ -19,8 +19,7 @@ import numpy as np
 from gymnasium import spaces
 from msgspec.structs import replace
 
-from ..core.own_hand import HandView, OwnHand
-from ..core.site_arrays import SiteArrays
+from ..core.own_hand import HandView
 from ..core.ticks import tick_ns
 from ..core.vectors import Array
 from ..errors import UsageError
@@ -30,7 +29,7 @@ from ..log.log_file import LogFile
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
-from ..scenario.operators.program_hand import HandSite
+from ..scenario.operators.program_hand import HandPlayer, HandSite
 
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
@@ -112,25 +111,15 @@ class ReachTask:
         return Judgement(-apart_m * step_s + float(done), succeeded=done)
 
 
-class ActedHand:
-    """The user's hand: it is told at each step what to do."""
+class TakenActions:
+    """The user's program: at each step it does what it was told."""
 
-    def __init__(self, at: HandSite) -> None:
-        self.hand: OwnHand = at.make_hand()
-        self._layout = at.scenario.layout(at.name)
+    def __init__(self, actions: list[Array], every: int) -> None:
+        self._actions, self._every = actions, every
 
-    def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what the user sees at tick k."""
-        return self.hand.view(k, arrays, self._layout)
-
-    def take(self, k: int, arrays: SiteArrays) -> list[float]:
-        """Returns what it does in tick k, see `HandInForce`."""
-        return self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist()).vector
-
-    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what it does until it needs the arm again, as `HandActor` says."""
-        angles = arrays.site[0]["q"][: self._layout.joints]
-        return self.hand.advance_until(k, end, angles.tolist)
+    def act(self, now: HandView) -> Any:
+        """Returns the action of the step."""
+        return self._actions[now.k // self._every]
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
@@ -193,20 +182,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return 1.5 * float(np.linalg.norm(arm.end_effector(spec.q0_rad))) + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
-        self.scenario, at = scenario, self._place(scenario)
-        self._hand = ActedHand(at)
-        self._run = FusedRun(scenario, keep=1, hands={self._user: self._hand})
+        self.scenario, self._k, self._actions = scenario, 0, list[Array]()
+        self._player = HandPlayer(self._place(scenario), TakenActions(self._actions, self._every))
+        self._run = FusedRun(scenario, keep=1, hands={self._user: self._player})
         self._run.plan([scenario.ticks(name) for name in scenario.names])
-        self._ticks, self._k = scenario.ticks(self._user), 0
-        self._actions: list[Array] = []
-        self._tick_rate_hz = scenario.sites[self._user].rate_hz
+        self._ticks, self._tick_rate_hz = scenario.ticks(self._user), scenario.sites[self._user].rate_hz
 
     def _look(self) -> Scene:
         names, run = self.scenario.names, self._run
         arms = self.scenario.arms
-        q = {name: run.arrays(n).site[0]["q"][: arms[name].counts.joints] for n, name in enumerate(names)}
+        own = [run.arrays(n).site[0]["q"][: arms[one].counts.joints] for n, one in enumerate(names)]
+        q = {name: angles.copy() for name, angles in zip(names, own, strict=True)}
         places = {name: np.array(arms[name].end_effector(q[name])) for name in names}
-        view = self._hand.view(self._k, run.arrays(names.index(self._user)))
+        seen = run.arrays(names.index(self._user)), self.scenario.layout(self._user)
+        view = self._player.hand.view(self._k, *seen)
         return Scene(self._k / self._tick_rate_hz, q, places, view)
 
     def _describe_observation(self) -> spaces.Dict:
@@ -258,11 +247,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Acts, and moves on by a step."""
-        goal = np.clip(np.asarray(action, dtype=np.float64), -self._most, self._most)
-        self._hand.hand.decide(self._k, goal.tolist())
-        self._actions.append(goal)
+        self._actions.append(np.clip(np.asarray(action, dtype=np.float64), -self._most, self._most))
         self._k += self._every
         self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
+        if self._player.failure:
+            raise UsageError(self._player.failure)
         scene, diverged = self._look(), self._run.diverged_s is not None
         said = self.task.judge(scene)
         ended = said.succeeded or said.failed or diverged
@@ -278,16 +267,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
-        hand, actions = ActedHand(self._place(self.scenario)), list(self._actions)
-
-        def act(site: Any, k: int) -> list[float]:
-            if hand.hand.is_asked(k) and k // self._every < len(actions):
-                hand.hand.decide(k, actions[k // self._every].tolist())
-            return hand.take(k, site.arrays)
-
+        player = HandPlayer(self._place(self.scenario), TakenActions(self._actions, self._every))
         lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
         with LogFile(Path(path), force=force) as stream:
-            write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: act})
+            write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: player.track})
         return Path(path)
 
 

@@ -6,7 +6,7 @@ the run goes on without it: whoever else holds the arm, and all other sites, nev
 
 import math
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 from msgspec import Meta, field
@@ -14,6 +14,7 @@ from msgspec import Meta, field
 from ... import fields
 from ...core.own_hand import HandContext, HandProgram, HandView, OwnHand
 from ...core.site_arrays import SiteArrays
+from ...core.site_step import Site
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
 from ...laws.interface import make_instance
@@ -113,9 +114,7 @@ class HandSite(NamedTuple):
     def make_hand(self) -> OwnHand:
         """Returns the hand."""
         tick_rate_hz, arm = self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
-        place: Callable[[Sequence[float]], Sequence[float]] = arm.end_effector
-        if self.spec.mode == "joint":
-            place = list
+        place: Any = list if self.spec.mode == "joint" else arm.end_effector
         delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
         return OwnHand(self.spec.rules(tick_rate_hz, arm.counts), tick_rate_hz // self.rate_hz, delay, place)
 
@@ -129,7 +128,7 @@ class HandPlayer:
         news: ticks, and sentences on what it has done that no event names yet.
     """
 
-    def __init__(self, at: HandSite, program: HandProgram, watch: Watch = call_plainly) -> None:
+    def __init__(self, at: HandSite, program: Any, watch: Watch = call_plainly) -> None:
         self._program, self._watch = program, watch
         self.failure, self.news = "", list[tuple[int, str]]()
         self._site, self._code, self._layout = at.name, at.program, at.scenario.layout(at.name)
@@ -143,6 +142,10 @@ class HandPlayer:
         step = self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist())
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
+
+    def track(self, site: Site, k: int) -> list[float]:
+        """Does as `take` at a site."""
+        return self.take(k, site.arrays)
 
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
