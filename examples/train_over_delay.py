@@ -114,17 +114,19 @@ def report(found: list[dict[str, Any]]) -> dict[str, tuple[float, float, float]]
 
 
 def draw(found: list[dict[str, Any]], path: Path) -> None:
-    """Draws every seed, and the means."""
+    """Draws every seed, and the means: a row for each network of a test and each of training."""
     import matplotlib.pyplot as plt
 
-    names = list(found[0]["costs"])
-    figure, axes = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
-    for place, name in enumerate(names):
-        values = 1e3 * np.array([one["costs"][name] for one in found])
-        axes.plot(values, np.full(len(values), place), "o", alpha=0.35, color=f"C{place % 2}")
-        axes.plot(values.mean(), place, "|", markersize=22, color="black")
-    axes.set_yticks(range(len(names)), [name.replace(" -> ", ", tested at ") for name in names])
-    axes.set_xlabel("mean distance from the goal, mm (every seed, and their mean)")
+    figure, axes = plt.subplots(figsize=(6.4, 2.8), layout="constrained")
+    rows = [(here, there) for there in NETWORKS for here in NETWORKS]
+    for place, (here, there) in enumerate(rows):
+        values = 1e3 * np.array([one["costs"][f"{here} -> {there}"] for one in found])
+        colour = f"C{list(NETWORKS).index(here)}"
+        axes.plot(values, np.full(len(values), place), "o", alpha=0.4, color=colour)
+        axes.plot(values.mean(), place, "|", markersize=20, markeredgewidth=2, color="black")
+    axes.set_yticks(range(len(rows)), [f"trained: {here}\ntested: {there}" for here, there in rows])
+    axes.set_xlabel("mean distance from the goal, mm; a dot a seed, a bar their mean")
+    axes.set_xlim(left=0.0)
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)
     print(path)

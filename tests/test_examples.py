@@ -196,3 +196,36 @@ def test_a_program_hands_over_and_back_without_a_step(
     times = re.findall(r"([.\d]+) times", capsys.readouterr().out)
     assert len(times) == 3
     assert max(map(float, times)) <= 1.2
+
+
+def test_a_policy_is_the_same_function_in_training_and_as_a_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
+    monkeypatch.syspath_prepend(LOOK.parent)
+    study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
+    env, weights = study["make_env"]("200 ms, bursts"), [0.95, 0.02, -0.11, 0.71]
+    assert 0.0 < study["play"](env, np.array(weights), 3) < 0.2
+    trained = trilat_net.open_log(env.save(tmp_path / "episode.mcap"))
+    hand = {"kind": "own", "class": "reach_policy:ReachPolicy", "rate_hz": 25, **study["FIRM"]}
+    hand |= {"force_limit_n": 200.0, "settings": {"goal_m": env.task.goal.tolist(), "weights": weights}}
+    acted = trilat_net.simulate(env.scenario, {"sites.m2.hands": [hand]}, duration_s=trained["m2"].t_s[-1])
+    for name in trained.sites:
+        count = len(acted[name])
+        assert np.array_equal(acted[name].q, trained[name].q[:count]), name
+
+
+def test_a_study_of_training_reports_intervals(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(LOOK.parent)
+    study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
+    for name in ("train", "run_seed"):
+        study[name].__globals__.update(ROUNDS=1, PAIRS=1, TESTS=1, EPISODE_S=0.4)
+    found = [study["run_seed"](seed) for seed in (1, 2)]
+    assert found[0]["weights"] != found[1]["weights"]
+    spans = study["report"](found)
+    assert all(low <= mean <= high for mean, low, high in spans.values())
+    study["draw"](found, tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
+    assert "2 seeds, 95 % interval" in capsys.readouterr().out

@@ -94,8 +94,8 @@ def load_scenario(
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))
             changed = parse_scenario(source.text, source.name, expanded) if overrides else source
-            laws = [one.get("law") if isinstance(one, dict) else one for one in expanded.values()]
-            return allow_own_code(changed, laws)
+            named = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))  # of laws, hands and plants
+            return allow_own_code(changed, named)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)
