@@ -164,7 +164,7 @@ class RemoteHand(HandPlayer):
         asked = message.n * self._every
         if self.failure or asked > self._asked:  # before the first question it only says that it is there
             return
-        self._dropped["hand: late"] += asked + self.hand.delay < k
+        self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))
         try:
             self.hand.decide(asked, (message.target or message.force) if message.grip else None)
         except ValueError as error:

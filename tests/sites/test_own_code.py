@@ -85,6 +85,7 @@ def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path)
     session = Session.whole(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
     assert_same(run(session), simulate_scenario(scenario))
+    assert not any("hand:" in text for text in session.said)
 
 
 def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
