@@ -91,9 +91,8 @@ class SiteParts:
         self.rates = [scenario.sites[peer].rate_hz for peer in peers]
         self.stats = LoopStats(self.site, self.boot, self.rates)
         self.watchdog = CodeWatchdog()
-        law = scenario.sites[name].control
         self.step: Callable[[TickInput], TickRecord] = self.site.step
-        if isinstance(law, ImportedLaw):
+        if isinstance(law := scenario.sites[name].control, ImportedLaw):
             code, self.step = watch_law(self.site, law.code, clock)
             self.watchdog.codes.append(code)
         self.rings = [
@@ -112,10 +111,9 @@ class SiteParts:
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
-        turn = scenario.names.index(name)
         single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
         send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
-        self.states = StateBlock(self.site, self.boot, send_states, turn, single=single)
+        self.states = StateBlock(self.site, self.boot, send_states, scenario.names.index(name), single=single)
         self.states.holds_samples = not single and may_hold_samples(scenario, name)
         self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)

@@ -8,7 +8,7 @@ import pytest
 
 from sites.hand_process import HandProcess
 from tests.own_code import Circle, Failing, Follower
-from trilat_net.core.own_hand import HandProgram
+from trilat_net.core.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual import simulate_scenario
@@ -32,6 +32,17 @@ def at_m2(kind: str, **keys: Any) -> Scenario:
     return load_scenario("paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0})
 
 
+class Thinking:
+    """A program that takes a time over each view."""
+
+    def __init__(self, program: HandProgram, clock: RelayClock, thinks_ns: int) -> None:
+        self._program, self._clock, self._thinks_ns = program, clock, thinks_ns
+
+    def act(self, now: HandView) -> Any:
+        self._clock.sleep_until(self._clock.monotonic_ns() + self._thinks_ns)
+        return self._program.act(now)
+
+
 def add_program(
     session: Session, program: HandProgram, thinks_ns: int = 0, dies_ns: int | None = None
 ) -> None:
@@ -40,11 +51,11 @@ def add_program(
     def run(clock: RelayClock) -> None:
         at = place_own_hand(session.scenario, "m2")
         assert at is not None
-        with HandProcess(at, program, session.network.join(), clock, SESSION) as hand:
+        thinking = Thinking(program, clock, thinks_ns)
+        with HandProcess(at, thinking, session.network.join(), clock, SESSION) as hand:
             while not hand.over and (dies_ns is None or clock.monotonic_ns() < dies_ns):
-                asked = hand.asked
                 hand.serve()
-                clock.sleep_until(clock.monotonic_ns() + (thinks_ns if hand.asked > asked else 0) + MS_NS)
+                clock.sleep_until(clock.monotonic_ns() + MS_NS)
 
     session.relay.add("hand", run)
 
