@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
-from trilat_net.core.own_hand import HandView
 from trilat_net.core.site_arrays import SiteArrays
 from trilat_net.core.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError
@@ -125,8 +124,9 @@ class RemoteHand(HandPlayer):
             self._decide(k, message)
         return super().take(k, arrays)
 
-    def ask(self, k: int, view: HandView) -> None:
+    def ask(self, k: int, arrays: SiteArrays) -> None:
         """Sends it what it sees."""
+        view = self.view(k, arrays)
         seen = _list_numbers(view) | {"peers": [PeerSeen(**_list_numbers(one)) for one in view.peers]}
         self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **seen)))
         self._asked = k

@@ -145,3 +145,12 @@ def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
 def test_an_environment_that_cannot_be_is_refused(keys: dict[str, Any], problem: str) -> None:
     with pytest.raises((UsageError, ScenarioError), match=problem):
         tn.make_env("paper", **keys)
+
+
+def test_an_action_that_is_none_is_refused() -> None:
+    env = tn.make_env("paper", duration_s=1)
+    env.reset(seed=1)
+    with pytest.raises(UsageError, match="which is not finite"):
+        env.step(np.array([np.nan, 0.0]))
+    with pytest.raises(UsageError, match="3 numbers, not 2"):
+        tn.make_env("paper", duration_s=1).step(np.zeros(3))

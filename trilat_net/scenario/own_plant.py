@@ -57,9 +57,8 @@ class PlantProgram(Protocol):
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
         """Moves on by a period under the control torque ON the joints, N m, shape (n,).
 
-        Returns:
-            q, rad, and qd, rad/s, at its end; and, if it knows it, tau_x, N m: the torque of what touches the
-            arm, in the sign of Eq. (8): ON the arm it is the negative.
+        Returns q, rad, and qd, rad/s, at its end; and, if it knows it, tau_x, N m, of what touches the arm:
+        in the sign of Eq. (8), the negative of the torque ON it.
         """
 
 
@@ -98,10 +97,6 @@ class PlantPlayer:
 
     Attributes:
         state: the arm's motion at the next tick.
-
-    Raises:
-        CodeWithheld: its class may not run.
-        ScenarioError: it cannot be made.
     """
 
     def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:

@@ -20,6 +20,7 @@ from gymnasium import spaces
 from msgspec.structs import replace
 
 from ..core.own_hand import HandView
+from ..core.site_arrays import SiteArrays
 from ..core.ticks import tick_ns
 from ..core.vectors import Array
 from ..errors import UsageError
@@ -111,15 +112,16 @@ class ReachTask:
         return Judgement(-apart_m * step_s + float(done), succeeded=done)
 
 
-class TakenActions:
-    """The user's program: at each step it does what it was told."""
+class ActedHand(HandPlayer):
+    """The user's hand: at each step it does what it was told."""
 
-    def __init__(self, actions: list[Array], every: int) -> None:
+    def __init__(self, at: HandSite, actions: list[Array], every: int) -> None:
+        super().__init__(at, None)
         self._actions, self._every = actions, every
 
-    def act(self, now: HandView) -> Any:
-        """Returns the action of the step."""
-        return self._actions[now.k // self._every]
+    def ask(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
+        """Decides by the action of the step."""
+        self.hand.decide(k, self._actions[k // self._every].tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
@@ -183,7 +185,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def _begin(self, scenario: Scenario) -> None:
         self.scenario, self._k, self._actions = scenario, 0, list[Array]()
-        self._player = HandPlayer(self._place(scenario), TakenActions(self._actions, self._every))
+        self._player = ActedHand(self._place(scenario), self._actions, self._every)
         self._run = FusedRun(scenario, keep=1, hands={self._user: self._player})
         self._run.plan([scenario.ticks(name) for name in scenario.names])
         self._ticks, self._tick_rate_hz = scenario.ticks(self._user), scenario.sites[self._user].rate_hz
@@ -194,8 +196,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         own = [run.arrays(n).site[0]["q"][: arms[one].counts.joints] for n, one in enumerate(names)]
         q = {name: angles.copy() for name, angles in zip(names, own, strict=True)}
         places = {name: np.array(arms[name].end_effector(q[name])) for name in names}
-        seen = run.arrays(names.index(self._user)), self.scenario.layout(self._user)
-        view = self._player.hand.view(self._k, *seen)
+        view = self._player.view(self._k, run.arrays(names.index(self._user)))
         return Scene(self._k / self._tick_rate_hz, q, places, view)
 
     def _describe_observation(self) -> spaces.Dict:
@@ -249,9 +250,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Acts, and moves on by a step."""
         self._actions.append(np.clip(np.asarray(action, dtype=np.float64), -self._most, self._most))
         self._k += self._every
-        self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
-        if self._player.failure:
-            raise UsageError(self._player.failure)
+        try:
+            self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
+        except ValueError as error:
+            raise UsageError(f"an action: {error}") from None
         scene, diverged = self._look(), self._run.diverged_s is not None
         said = self.task.judge(scene)
         ended = said.succeeded or said.failed or diverged
@@ -267,7 +269,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
-        player = HandPlayer(self._place(self.scenario), TakenActions(self._actions, self._every))
+        player = ActedHand(self._place(self.scenario), self._actions, self._every)
         lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
         with LogFile(Path(path), force=force) as stream:
             write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: player.track})

@@ -138,7 +138,7 @@ class HandPlayer:
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
         """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
         if self.hand.is_asked(k) and not self.failure:
-            self.ask(k, self.hand.view(k, arrays, self._layout))
+            self.ask(k, arrays)
         step = self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist())
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
@@ -150,11 +150,16 @@ class HandPlayer:
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
         if self.hand.is_asked(k) and not self.failure:
-            self.ask(k, self.hand.view(k, arrays, self._layout))
+            self.ask(k, arrays)
         return self.hand.advance_until(k, end, arrays.site[0]["q"][: self._layout.joints].tolist)
 
-    def ask(self, k: int, view: HandView) -> None:
+    def view(self, k: int, arrays: SiteArrays) -> HandView:
+        """Returns what it sees at tick k."""
+        return self.hand.view(k, arrays, self._layout)
+
+    def ask(self, k: int, arrays: SiteArrays) -> None:
         """Asks its class at tick k."""
+        view = self.view(k, arrays)
         try:
             self.hand.decide(k, self._watch(k, lambda: self._program.act(view)))
         except (Exception, SystemExit) as error:  # the user's code
