@@ -113,7 +113,6 @@ class RemoteHand(HandPlayer):
     ) -> None:
         super().__init__(at, None)
         self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
-        self._every = at.scenario.sites[at.name].rate_hz // at.rate_hz
         self._asked, self._source = -1, at.source
 
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
@@ -161,7 +160,7 @@ class RemoteHand(HandPlayer):
         return None
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        asked = message.n * self._every
+        asked = message.n * self.hand.every
         if self.failure or asked > self._asked:  # before the first question it only says that it is there
             return
         self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))

@@ -234,8 +234,8 @@ class RunningSession:
                 if not as_site or as_site not in newest:
                     return {} if as_site else newest
                 own = newest[as_site]
-                by_tick = {peer: {one.tick: one for one in kept.get(peer, ())} for peer in own.used}
-                seen = {peer: by_tick[peer].get(tick) for peer, tick in own.used.items()}
+                back = {peer: reversed(kept.get(peer, deque())) for peer in own.used}
+                seen = {at: next((r for r in back[at] if r.tick == k), None) for at, k in own.used.items()}
                 return {as_site: own, **{peer: one for peer, one in seen.items() if one is not None}}
 
             yield find

@@ -198,9 +198,7 @@ def test_a_program_hands_over_and_back_without_a_step(
     assert max(map(float, times)) <= 1.2
 
 
-def test_a_policy_is_the_same_function_in_training_and_as_a_hand(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))

@@ -12,9 +12,7 @@ from .processes import PAPER, Session, Stage
 
 
 @pytest.mark.long
-def test_a_person_takes_over_from_a_policy_in_a_live_session(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_person_takes_over_from_a_policy_live(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """The log of both is verified, and is repeated in virtual time."""
     monkeypatch.setenv("HF_HOME", str(stage.folder))
     session = Session(stage, "play", PAPER, "--duration", "8")

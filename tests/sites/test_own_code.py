@@ -18,7 +18,7 @@ from trilat_net.net.requests import HandMessage
 from trilat_net.net.topics import HAND, key
 from trilat_net.net.wire import encode
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.program_hand import place_own_hand
+from trilat_net.scenario.operators.program_hand import HandSite, place_own_hand
 
 from .relay import RelayClock
 from .sessions import SESSION, Session
@@ -30,6 +30,13 @@ MS_NS = 1_000_000
 def at_m2(kind: str, **keys: Any) -> Scenario:
     hand = {"kind": "own", "class": f"tests.own_code:{kind}", **keys}
     return load_scenario("paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0})
+
+
+def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
+    """A session whose hand at m2 runs in a process of its own."""
+    at = place_own_hand(scenario, "m2")
+    assert at is not None
+    return at, Session.whole(scenario, folder)
 
 
 class Thinking:
@@ -75,9 +82,7 @@ def run(session: Session) -> Log:
 def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path) -> None:
     """In virtual time, live in the process of its site, and live in a process of its own."""
     alone = at_m2(kind.__name__, process=True)
-    at = place_own_hand(alone, "m2")
-    assert at is not None
-    session = Session.whole(alone, tmp_path)
+    at, session = begin(alone, tmp_path)
     add_program(session, kind(at.describe()))
     log = run(session)
     assert_same(log, simulate_scenario(alone))
@@ -91,9 +96,7 @@ def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path)
 
 def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path) -> None:
     scenario = at_m2("Follower", process=True, delay_ms=20.0)
-    at = place_own_hand(scenario, "m2")
-    assert at is not None
-    session = Session.whole(scenario, tmp_path)
+    at, session = begin(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
     assert_same(run(session), simulate_scenario(scenario))
     assert not any("hand:" in text for text in session.said)
@@ -101,9 +104,7 @@ def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path)
 
 def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True, delay_ms=20.0)
-    at = place_own_hand(scenario, "m2")
-    assert at is not None
-    session = Session.whole(scenario, tmp_path)
+    at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), thinks_ns=70 * MS_NS)
     log = run(session)
     assert any("hand: late" in text for text in session.said)
@@ -113,9 +114,7 @@ def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
 
 def test_a_killed_program_lets_go_and_the_session_goes_on(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True)
-    at = place_own_hand(scenario, "m2")
-    assert at is not None
-    session = Session.whole(scenario, tmp_path)
+    at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), dies_ns=2_100 * MS_NS)
     log = run(session)
     assert log.complete
@@ -128,9 +127,7 @@ def test_a_killed_program_lets_go_and_the_session_goes_on(tmp_path: Path) -> Non
 
 def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
     scenario = at_m2("Failing", process=True)
-    at = place_own_hand(scenario, "m2")
-    assert at is not None
-    session = Session.whole(scenario, tmp_path)
+    at, session = begin(scenario, tmp_path)
     failing = Failing(at.describe(), at_s=0.4)
     ended: list[str] = []
 
@@ -152,11 +149,9 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
     assert verify(log).passed
 
 
-def test_a_stranger_moves_no_arm_of_a_hand_of_ones_own(tmp_path: Path) -> None:
+def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True)
-    at = place_own_hand(scenario, "m2")
-    assert at is not None
-    session = Session.whole(scenario, tmp_path)
+    at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()))
 
     def meddle(clock: RelayClock) -> None:

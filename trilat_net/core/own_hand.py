@@ -100,11 +100,8 @@ class OwnHand:
     Args:
         rules: what it may do.
         every: ticks from one question to the next.
-        delay: see below.
-        place: returns where the arm is by its joint angles, in the coordinates of the target.
-
-    Attributes:
         delay: ticks from what it sees to what it does.
+        place: returns where the arm is by its joint angles, in the coordinates of the target.
     """
 
     def __init__(
@@ -114,7 +111,7 @@ class OwnHand:
         delay: int,
         place: Callable[[Sequence[float]], Sequence[float]],
     ) -> None:
-        self._rules, self._every, self.delay = rules, every, delay
+        self._rules, self.every, self.delay = rules, every, delay
         self._place = place
         self._due: deque[tuple[int, HandCommand]] = deque()
         self._memory = HandMemory()
@@ -122,12 +119,12 @@ class OwnHand:
 
     def is_asked(self, k: int) -> bool:
         """True if it decides at this tick."""
-        return k % self._every == 0
+        return k % self.every == 0
 
     def find_next(self, k: int) -> int:
         """Returns the first tick after this one at which it is asked, or what it decided begins to act."""
-        asked = (k // self._every + 1) * self._every
-        return min(asked, *(due for due, _ in self._due if due > k), asked)
+        asked = (k // self.every + 1) * self.every
+        return min([asked, *(due for due, _ in self._due if due > k)])
 
     def view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Returns what it sees at tick k, which its site is about to make."""
@@ -179,14 +176,14 @@ class OwnHand:
             return
         self._newest, due = k, k + self.delay
         command = HandCommand(
-            PROGRAM, k // self._every, goal is not None, numbers, tick_ns(due, self._rules.rate_hz)
+            PROGRAM, k // self.every, goal is not None, numbers, tick_ns(due, self._rules.rate_hz)
         )
         self._due.append((due, command))
 
     def let_go(self, k: int) -> None:
         """Lets go at tick k, whatever was decided before."""
         self._due.clear()
-        command = HandCommand(PROGRAM, k // self._every, False, (), tick_ns(k, self._rules.rate_hz))
+        command = HandCommand(PROGRAM, k // self.every, False, (), tick_ns(k, self._rules.rate_hz))
         self._due.append((k, command))
 
     def advance(self, k: int, angles: Callable[[], Sequence[float]]) -> HandStep:

@@ -8,7 +8,6 @@ plant, and judges the plant by nothing.
 """
 
 import math
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -102,9 +101,8 @@ class PlantPlayer:
     def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
         spec, path = scenario.sites[site], f"sites.{site}.plant"
         self._site, self._code, self._h_s, self._watch = site, plant.code, 1.0 / spec.rate_hz, watch
-        seed = zlib.crc32(f"{scenario.seed}/{site}".encode())
         kind = import_class(plant.code, plant.source_sha256, path, plant.method)
-        context = PlantContext(site, scenario, spec.q0_rad, self._h_s, seed)
+        context = PlantContext(site, scenario, spec.q0_rad, self._h_s, scenario.draw_seed(site))
         self._program: PlantProgram = make_instance(kind, plant.code, context, plant.settings, path=path)
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s)
 

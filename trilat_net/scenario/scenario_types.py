@@ -8,6 +8,7 @@ complete in itself.
 import hashlib
 import math
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -382,6 +383,10 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sites_may_return(self) -> bool:
         """True if a session outlives its sites: each waits for its peers, and aligns with them anew."""
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
+
+    def draw_seed(self, site: str) -> int:
+        """Returns the seed for what code of one's own at a site draws."""
+        return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
         """Returns what the law of a site sends to its peers."""

@@ -211,7 +211,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _observe(self, scene: Scene) -> dict[str, Array]:
         view = scene.view
         own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
-        peers = {f"peer_{name}": np.array([getattr(one, name) for one in view.peers]) for name in _OF_PEERS}
+        peers = {f"peer_{x}": np.array([getattr(one, x) for one in view.peers]) for x in ("q", "qd", "tau_x")}
         alpha, age_s = zip(*((one.alpha, one.age_s) for one in view.peers), strict=True)
         more = {"alpha": np.array(alpha), "age_s": np.array(age_s), "grip": np.array([view.grip])}
         return {**own, **peers, **more, "goal": np.array(self.task.goal, dtype=np.float64)}
@@ -242,8 +242,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         drawn = {key: _draw(self.np_random, of) for key, of in self._vary.items()}
         drawn |= {"seed": int(self.np_random.integers(2**31)), **(options or {})}
         self._begin(load_scenario(self._base, drawn))
-        self.task.begin(self.np_random, self._look())
         scene = self._look()
+        self.task.begin(self.np_random, scene)
         return self._observe(scene), self._inform(scene, succeeded=False)
 
     def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
@@ -274,9 +274,6 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         with LogFile(Path(path), force=force) as stream:
             write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: player.track})
         return Path(path)
-
-
-_OF_PEERS = ("q", "qd", "tau_x")
 
 
 def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:

@@ -5,8 +5,7 @@ the run goes on without it: whoever else holds the arm, and all other sites, nev
 """
 
 import math
-import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 from msgspec import Meta, field
@@ -106,9 +105,8 @@ class HandSite(NamedTuple):
         """Returns what its program knows before it begins."""
         scenario, name, spec = self.scenario, self.name, self.spec
         rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name].counts)
-        seed = zlib.crc32(f"{scenario.seed}/{name}".encode())
         limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
-        own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, seed)
+        own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, scenario.draw_seed(name))
         return HandContext(name, scenario.peers(name), spec.mode, rules.size, *own)
 
     def make_hand(self) -> OwnHand:
@@ -137,9 +135,7 @@ class HandPlayer:
 
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
         """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
-        if self.hand.is_asked(k) and not self.failure:
-            self.ask(k, arrays)
-        step = self.hand.advance(k, lambda: arrays.site[0]["q"][: self._layout.joints].tolist())
+        step = self.hand.advance(k, self._begin(k, arrays))
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
 
@@ -149,9 +145,14 @@ class HandPlayer:
 
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
+        return self.hand.advance_until(k, end, self._begin(k, arrays))
+
+    def _begin(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
+        """Asks, if it is time to; returns what reads the angles of the joints, rad."""
         if self.hand.is_asked(k) and not self.failure:
             self.ask(k, arrays)
-        return self.hand.advance_until(k, end, arrays.site[0]["q"][: self._layout.joints].tolist)
+        angles: Array = arrays.site[0]["q"][: self._layout.joints]
+        return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
         """Returns what it sees at tick k."""
