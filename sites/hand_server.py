@@ -161,7 +161,10 @@ class RemoteHand(HandPlayer):
 
     def _decide(self, k: int, message: HandMessage) -> None:
         asked = message.n * self.hand.every
-        if self.failure or asked > self._asked:  # before the first question it only says that it is there
+        is_here = (
+            message.n == 0 and not message.grip
+        )  # may come after the first question, and decides nothing
+        if self.failure or is_here or asked > self._asked:
             return
         self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))
         try:

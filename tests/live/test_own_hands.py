@@ -14,9 +14,9 @@ VECTORS = ("q", "qd", "tau", "hand")
 
 
 def overrides(*, process: bool) -> list[str]:
-    keys = f'kind="own", class="my_hand:MyHand", delay_ms=400, process={str(process).lower()}'
+    keys = f'kind="own", class="my_hand:MyHand", delay_ms=100, process={str(process).lower()}'
     hand = f"sites.m2.hands=[{{{keys}}}]"
-    return ["--set", hand, "--set", "link.delay_ms=400", "--duration", "6"]
+    return ["--set", hand, "--set", "link.delay_ms=200", "--duration", "6"]
 
 
 def assert_bits_of_virtual_time(log: Log) -> None:

@@ -170,6 +170,22 @@ def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
     assert any("hand: stranger" in text for text in session.said)
 
 
+def test_saying_that_it_is_here_decides_nothing(tmp_path: Path) -> None:
+    """What a program says before its first view may arrive after the site has asked."""
+    scenario = at_m2("Circle", process=True)
+    at, session = begin(scenario, tmp_path)
+    add_program(session, Circle(at.describe()), thinks_ns=3 * MS_NS)
+
+    def say(clock: RelayClock) -> None:
+        publish = session.network.join().publisher(key(SESSION, "m2", HAND))
+        for _ in range(2_000):
+            publish(encode(HandMessage(site="m2", boot=9, source=at.source, n=0, grip=False, sent_ns=1)))
+            clock.sleep_until(clock.monotonic_ns() + MS_NS)
+
+    session.relay.add("here", say)
+    assert_same(run(session), simulate_scenario(scenario))
+
+
 @pytest.mark.parametrize("how", ["raise", "nan"])
 def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> None:
     scenario = at_m2("Failing", settings={"how": how})
