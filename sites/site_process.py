@@ -262,7 +262,7 @@ class RunningSite:
                 measured = parts.plant.state
             self._output = self._step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
             if parts.plant is not None:
-                parts.plant.move(self._output)
+                parts.plant.move(k, self._output.tau)
         except CodeFailed as failed:
             self._failure = failed
             return None

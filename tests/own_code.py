@@ -72,6 +72,24 @@ class Arm:
         return self.arm.q, self.arm.qd
 
 
+class Carousel(Arm):
+    """Moves the scenario's arm, and turns some bodies about the base."""
+
+    def __init__(self, facts: PlantContext, how: str = "") -> None:
+        super().__init__(facts)
+        self.count, self.how, self.t_s = len(facts.bodies_m), how, 0.0
+
+    def step(self, tau: Any, h_s: float) -> Sequence[Any]:
+        self.t_s += h_s
+        return super().step(tau, h_s)
+
+    def poses(self) -> Any:
+        if self.how and self.t_s > 0.1:
+            return {"few": [[0.0] * 7], "nan": [[float("nan")] * 7] * self.count, "short": [[0.0]]}[self.how]
+        half = [0.5 * (self.t_s + n) for n in range(self.count)]
+        return [[n, 0.1 * n, 0.0, np.cos(a), 0.0, 0.0, np.sin(a)] for n, a in enumerate(half)]
+
+
 class Torn(Arm):
     """A plant that fails at its 200th step, in a way."""
 

@@ -202,7 +202,8 @@ def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pyte
     """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
-    env, weights = study["make_env"]("200 ms, bursts"), [0.95, 0.02, -0.11, 0.71]
+    env = study["make_env"](study["STUDIES"]["reach"], "200 ms, bursts")
+    weights = [0.95, 0.02, -0.11, 0.71]
     assert 0.0 < study["play"](env, np.array(weights), 3) < 0.2
     trained = trilat_net.open_log(env.save(tmp_path / "episode.mcap"))
     hand = {"kind": "own", "class": "reach_policy:ReachPolicy", "rate_hz": 25, **study["FIRM"]}
@@ -213,17 +214,19 @@ def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pyte
         assert np.array_equal(acted[name].q, trained[name].q[:count]), name
 
 
+@pytest.mark.parametrize("task", ["reach", "box"])
 def test_a_study_of_training_reports_intervals(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    task: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
-    for name in ("train", "run_seed"):
-        study[name].__globals__.update(ROUNDS=1, PAIRS=1, TESTS=1, EPISODE_S=0.4)
-    found = [study["run_seed"](seed) for seed in (1, 2)]
+    short = study["STUDIES"][task]._replace(rounds=1, pairs=1)
+    study["STUDIES"][task] = short
+    study["run_seed"].__globals__.update(STUDIES=study["STUDIES"], TESTS=1, EPISODE_S=0.4)
+    found = [study["run_seed"](task, seed) for seed in (1, 2)]
     assert found[0]["weights"] != found[1]["weights"]
-    spans = study["report"](found)
+    spans = study["report"](found, short.measure)
     assert all(low <= mean <= high for mean, low, high in spans.values())
-    study["draw"](found, tmp_path / "drawn.png")
+    study["draw"](found, short.measure, tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
     assert "2 seeds, 95 % interval" in capsys.readouterr().out

@@ -32,8 +32,8 @@ def test_a_module_name_is_used_once() -> None:
 
 def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
-    assert len(lines) <= 304
-    assert sum(lines) <= 72_970
+    assert len(lines) <= 318
+    assert sum(lines) <= 76_770
 
 
 def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:

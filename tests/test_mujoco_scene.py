@@ -40,8 +40,10 @@ def test_an_arm_of_a_urdf_is_the_same_arm() -> None:
 
 
 def test_the_box_is_pushed_and_the_users_feel_it() -> None:
-    things = ({"sites.s.plant.thing": thing} for thing in ("nothing", "box"))
-    free, box = (tn.simulate("push.toml", thing, duration_s=6) for thing in things)
+    nothing = {"sites.s.plant.thing": "nothing", "sites.s.plant.bodies": {}}
+    free, box = (tn.simulate("push.toml", thing, duration_s=6) for thing in (nothing, {}))
+    place_m = box["s"].bodies[:, :3]
+    assert place_m[-1, 0] - place_m[0, 0] > 0.1
     assert np.abs(free["s"].tau_x).max() == 0.0
     assert np.abs(box["s"].tau_x).max() > 5.0
     assert np.abs(box["m1"].q[-1] - free["m1"].q[-1]).max() > 0.01

@@ -21,6 +21,12 @@ except ImportError:
     raise ImportError("this plant needs MuJoCo: pip install 'trilat-net[sim]'") from None
 
 THINGS = ("nothing", "box", "door", "slot")
+SIZES_M = {
+    "box": (0.2, 0.2, 0.2),
+    "door": (0.04, 1.0, 0.2),
+    "above": (0.2, 0.12, 0.2),
+    "below": (0.2, 0.12, 0.2),
+}
 TIP_M = 0.03
 
 
@@ -29,7 +35,8 @@ class Scene:
 
     Args:
         facts: the site, its scenario and its start.
-        thing: one of `THINGS`; it stands before the end effector's start, towards +x.
+        thing: one of `THINGS`; it stands before the end effector's start, towards +x. The scenario gives its
+            size and has its pose recorded and drawn: bodies = { box = [0.2, 0.2, 0.2] }.
         mass_kg: of the box.
         friction: between box, floor and end effector.
         spring_nm_rad: of the door.
@@ -52,27 +59,33 @@ class Scene:
         place = facts.scenario.arms[facts.site].end_effector(facts.q0_rad)
         start[: len(place)] = place
         x_m, y_m, z_m = start + np.array([ahead_m, 0.0, 0.0])
+        half = {name: np.array(facts.bodies_m.get(name, size)) / 2.0 for name, size in SIZES_M.items()}
         text = (
             describe_arm(arm.chain, arm.theta, facts.h_s)
             + {
                 "nothing": "",
                 "box": f"""
-                <geom type="plane" pos="0 {y_m - 0.1} 0" zaxis="0 1 0" size="9 9 1" friction="{friction}"/>
-                <body name="thing" pos="{x_m} {y_m} {z_m}"><freejoint/>
-                    <geom type="box" size="0.1 0.1 0.1" mass="{mass_kg}" friction="{friction}"/></body>""",
+                <geom type="plane" pos="0 {y_m - half["box"][1]} 0" zaxis="0 1 0" size="9 9 1"
+                    friction="{friction}"/>
+                <body pos="{x_m} {y_m} {z_m}"><freejoint/><geom name="box" type="box"
+                    size="{_list(half["box"])}" mass="{mass_kg}" friction="{friction}"/></body>""",
                 "door": f"""
-                <body name="thing" pos="{x_m} {y_m - 0.5} {z_m}">
+                <body pos="{x_m} {y_m - half["door"][1]} {z_m}">
                     <joint type="hinge" axis="0 0 1" stiffness="{spring_nm_rad}" damping="1"/>
-                    <geom type="box" pos="0 0.5 0" size="0.02 0.5 0.1" mass="2"/></body>""",
+                    <geom name="door" type="box" pos="0 {half["door"][1]} 0" size="{_list(half["door"])}"
+                    mass="2"/></body>""",
                 "slot": f"""
-                <geom type="box" pos="{x_m} {y_m + 0.1} {z_m}" size="0.1 0.06 0.1" friction="{friction}"/>
-                <geom type="box" pos="{x_m} {y_m - 0.1} {z_m}" size="0.1 0.06 0.1" friction="{friction}"/>""",
+                <geom name="above" type="box" pos="{x_m} {y_m + TIP_M + 0.01 + half["above"][1]} {z_m}"
+                    size="{_list(half["above"])}" friction="{friction}"/>
+                <geom name="below" type="box" pos="{x_m} {y_m - TIP_M - 0.01 - half["below"][1]} {z_m}"
+                    size="{_list(half["below"])}" friction="{friction}"/>""",
             }[thing]
         )
         self.model: Any = mujoco.MjModel.from_xml_string(text + "</worldbody></mujoco>")
         self.data: Any = mujoco.MjData(self.model)
         self.joints = len(facts.q0_rad)
         self.data.qpos[: self.joints] = facts.q0_rad
+        self.bodies = [self.data.geom(name) for name in facts.bodies_m]
         mujoco.mj_forward(self.model, self.data)
 
     def step(self, tau: np.ndarray, h_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -83,9 +96,9 @@ class Scene:
         mujoco.mj_step(self.model, self.data)
         return self.data.qpos[:n], self.data.qvel[:n], -self.data.qfrc_constraint[:n]
 
-    def place_m(self) -> np.ndarray:
-        """Returns where the thing is, m, shape (3,)."""
-        return np.array(self.data.body("thing").xpos)
+    def poses(self) -> list[list[float]]:
+        """Returns where the bodies are that the scenario names, m, and their orientations."""
+        return [[*body.xpos, *_to_quaternion(body.xmat)] for body in self.bodies]
 
 
 def describe_arm(chain: Any, theta: np.ndarray, h_s: float) -> str:

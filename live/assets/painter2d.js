@@ -1,6 +1,20 @@
 // Arms on a plain canvas: where there is no WebGL.
 import { css, siteColour } from "./arms.js";
 
+const EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4].map((n) => [0, 1, 2].map((axis) => 0.5 - ((n >> axis) & 1)));
+
+function bodyPoses(about, site) { // of each body of a plant: its box's edges, and where a point of the body is
+  return about.bodies.map((size, n) => {
+    const [x, y, z, w, ...v] = site.bodies.slice(7 * n, 7 * n + 7);
+    const cross = (a, b) => [0, 1, 2].map((i) => a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]);
+    const at = (p) => {
+      const turned = cross(v, cross(v, p).map((c, i) => c + w * p[i])).map((c, i) => p[i] + 2 * c);
+      return [x + turned[0], y + turned[1], z + turned[2]];
+    };
+    return { at, edges: EDGES.map((corner) => corner.map((c, i) => c * size[i])) };
+  });
+}
+
 export class PlainPainter {
   project(card, point) {
     const { canvas, view } = card;
@@ -47,6 +61,7 @@ export class PlainPainter {
     } else {
       this.line(card, g, site.ghost, css("--soft"), 0.3 * thick, [0.8 * thick, 0.6 * thick]);
     }
+    bodyPoses(about, site).forEach(({ at, edges }) => this.line(card, g, edges.map(at), css("--ink"), 0.18 * thick));
     const [bx, by] = this.project(card, base);
     g.fillStyle = css("--ink");
     g.fillRect(bx - 0.8 * thick, by - 0.8 * thick, 1.6 * thick, 1.6 * thick);

@@ -29,6 +29,8 @@ class ArmScene {
     this.joints = Array.from({ length: count }, (_, n) => this.ball(n === count - 1 ? this.bodyColour : this.jointColour, this.thick * thin * (n === count - 1 ? 1.05 : 1.22)));
     this.ghosts = about.task ? [] : this.links.map(() => this.tube(this.ghostColour, 0.62 * this.thick * thin, false));
     this.goal = this.ball(this.ghostColour, (about.task ? 1.6 : 0.9) * this.thick, false);
+    this.bodyBoxColour = new THREE.MeshStandardMaterial({ roughness: 0.8 });
+    this.bodies = about.bodies.map((size_m) => this.mesh(new THREE.BoxGeometry(...size_m), this.bodyBoxColour, true));
     for (const { at, normal } of about.walls) this.wall(vector(at), vector(normal), size);
     this.colour();
   }
@@ -98,6 +100,7 @@ class ArmScene {
     this.jointColour.color.set(css("--card")).lerp(new THREE.Color(siteColour(this.card.about)), 0.25);
     this.baseColour.color.set(css("--soft"));
     this.ghostColour.color.set(css("--ink"));
+    this.bodyBoxColour.color.set(css("--soft"));
     this.wallColour.color.set(css("--line"));
     this.lineColour.color.set(css("--grid"));
   }
@@ -118,6 +121,11 @@ class ArmScene {
     this.links.forEach((tube, n) => this.span(tube, points[n], points[n + 1]));
     this.joints.forEach((ball, n) => ball.position.copy(points[n]));
     this.ghosts.forEach((tube, n) => this.span(tube, wanted[n], wanted[n + 1]));
+    this.bodies.forEach((box, n) => {
+      const [x, y, z, w, ...v] = site.bodies.slice(7 * n, 7 * n + 7);
+      box.position.set(x, y, z);
+      box.quaternion.set(...v, w);
+    });
     this.goal.position.copy(wanted[wanted.length - 1]);
   }
 

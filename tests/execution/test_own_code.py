@@ -17,6 +17,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.imported_code import allowed_code
 from trilat_net.scenario.operators.program_hand import HandPlayer, place_own_hand
+from trilat_net.scenario.own_plant import make_plant_players
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
 
@@ -184,7 +185,62 @@ def test_a_plant_that_fails_ends_the_run_named(how: str, problem: str, tmp_path:
     assert tn.verify(log).passed
 
 
-def test_the_compiled_run_takes_no_plant_and_says_so() -> None:
+BODIES = {"box": [0.2, 0.2, 0.2], "lid": [0.4, 0.1, 0.02]}
+
+
+@pytest.mark.usefixtures("kept_consents")
+def test_bodies_of_a_plant_are_in_every_record() -> None:
+    log = without_code(tn.simulate("paper", with_plant("Carousel", bodies=BODIES)))
+    part = log["s"]
+    half = 0.5 * (part.t_s[:, np.newaxis] + [0.0, 1.0])
+    assert np.allclose(part.bodies[:, [3, 10]], np.cos(half), atol=1e-9)
+    assert np.allclose(part.bodies[:, [6, 13]], np.sin(half), atol=1e-9)
+    table = log.table("s")
+    assert np.array_equal(table["lid_x_m"].values, part.bodies[:, 7])
+    assert log["m1"].bodies.size == 0
+    assert tn.verify(log, virtual=True).passed
+
+
+@pytest.mark.parametrize(
+    ("how", "problem"),
+    [("few", "not seven numbers for each of 2"), ("nan", "not finite"), ("short", "not seven")],
+)
+def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
+    with pytest.raises(PlantFailed, match=f"Carousel of s failed at tick 99: ValueError: .*{problem}"):
+        tn.simulate("paper", with_plant("Carousel", bodies=BODIES, how=how))
+
+
+@pytest.mark.parametrize(
+    ("bodies", "kind", "problem"),
+    [
+        (BODIES, "Arm", r"Arm has no poses\(\)"),
+        ({"box": [0.2, 0.2]}, "Carousel", r"three sizes, m, above 0 and up to 100, is \[0.2, 0.2\]"),
+        ({"box": [0.2, 0.2, -1.0]}, "Carousel", "three sizes, m"),
+        ({"The Box": [1.0, 1.0, 1.0]}, "Carousel", "a body is named by a to z"),
+        (3, "Carousel", r"the sizes of at most 32 bodies, as in \{ box"),
+    ],
+)
+def test_bodies_that_cannot_be_are_refused(bodies: Any, kind: str, problem: str) -> None:
+    with pytest.raises(ScenarioError, match=problem) as refused:
+        tn.simulate("paper", with_plant(kind, bodies=bodies))
+    assert refused.value.path.startswith("sites.s.plant.bodies")
+
+
+@pytest.mark.parametrize("rate_hz", [1000, 400])
+def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
+    scenario = load_scenario("paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz})
+    log = simulate_scenario(scenario)
+    run = FusedRun(scenario, keep=2000, plants=make_plant_players(scenario))
+    for until_s in (0.3, 0.3015, 1.0):
+        run.advance(until_s)
+    for (_, rows), site in zip(run.take_records(), scenario.names, strict=True):
+        columns = scenario.layout(site).columns()
+        for signal in SIGNALS:
+            recorded = np.array(getattr(log[site], signal))
+            assert rows[:, columns[signal]].tobytes() == recorded.tobytes(), signal
+
+
+def test_a_sweep_takes_no_plant_and_says_so() -> None:
     with pytest.raises(ScenarioError, match="is a plant of one's own") as refused:
         FusedRun(load_scenario("paper", with_plant()))
     assert refused.value.path == "sites.s.plant"

@@ -51,7 +51,9 @@ def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
                 arrivals, missing = inputs.arrivals(state.rx)
                 assert not missing
                 record = site.step(TickInput(state.tick, arrivals))
-                assert record._replace(x=[], xd=[], wrench=[]) == read_output(state, part.peers)
+                assert record._replace(x=[], xd=[], wrench=[], hand=[], bodies=[]) == read_output(
+                    state, part.peers
+                )
 
 
 def test_rerun_changes_what_changed_gain_changes_and_nothing_else() -> None:

@@ -70,6 +70,7 @@ outputs = st.builds(
     mem=st.lists(finite, max_size=3),
     ch=st.one_of(st.just(()), row(3)),
     hand=st.one_of(st.just(()), row(7)),
+    bodies=st.one_of(st.just(()), row(7)),
     **dict.fromkeys(TASK_VECTORS, st.just(())),
     **{name: row(length) for name, length in STATE_VECTORS.items()},
 )

@@ -122,7 +122,7 @@ def test_a_task_of_ones_own_judges() -> None:
 def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
     task, random = ReachTask(radius_m=0.3), np.random.default_rng(1)
     start = np.array([1.0, 0.5])
-    scene = Scene(0.0, {}, {"s": start}, None)  # type: ignore[arg-type]
+    scene = Scene(0.0, {}, {"s": start}, None, {})  # type: ignore[arg-type]
     goals = []
     for _ in range(2000):
         task.begin(random, scene)

@@ -171,6 +171,7 @@ class Layout(NamedTuple):
         task: true: the coordinates are those of the end effector, else the joint angles.
         sent: numbers that the law sends in a record, see `LawChannel.floats`.
         hand: numbers that a live hand has in a record, see `live_hand`; 0: the site has none.
+        bodies: numbers of the poses of its plant's bodies, see `TickRecord.bodies`.
     """
 
     joints: int = JOINTS
@@ -180,6 +181,7 @@ class Layout(NamedTuple):
     task: bool = False
     sent: int = 0
     hand: int = 0
+    bodies: int = 0
 
     @classmethod
     def of_arm(
@@ -201,12 +203,13 @@ class Layout(NamedTuple):
         n, m = self.joints, self.shared
         vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
         shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
-        others = {name: count for name, count in (("ch", self.sent), ("hand", self.hand)) if count}
-        return {**vectors, "theta_hat": self.parameters, **shared, **others}
+        others = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
+        given = {name: count for name, count in others.items() if count}
+        return {**vectors, "theta_hat": self.parameters, **shared, **given}
 
     def columns(self) -> dict[str, slice]:
         """Returns where the vectors that a tick computes stand in its row of floats, in their order."""
-        lengths = {name: count for name, count in self.lengths().items() if name != "hand"}
+        lengths = {name: n for name, n in self.lengths().items() if name not in ("hand", "bodies")}
         ends = accumulate(lengths.values())
         return {
             name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
@@ -367,11 +370,12 @@ class SiteSetup(NamedTuple):
     limits: MotionLimits = MotionLimits()
     rest: RestGains = RestGains()
     bit: int = 0
+    bodies: int = 0
 
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain, self.channel.floats, self.actors)
+        return Layout.of_arm(self.chain, self.channel.floats, self.actors)._replace(bodies=7 * self.bodies)
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:

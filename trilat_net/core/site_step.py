@@ -47,6 +47,7 @@ from .vectors import Row
 
 _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_NO_TASK: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class Site:
@@ -74,7 +75,8 @@ class Site:
         self.layout = setup.layout
         columns = self.layout.columns()
         columns.pop("ch", None)
-        self._columns = tuple(columns.values())
+        motion = tuple(columns.values())
+        self._columns = motion[:7], motion[7:]
         self._buffers = build_tick_buffers(setup)
         arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
         self._pack_arrival, self._arrival_size = arrival.pack_into, arrival.size
@@ -85,7 +87,6 @@ class Site:
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
-        self._sends = bool(self._sent.size)
         self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
         self._hand = self._arrays.actors[live[0]] if live else None
@@ -155,8 +156,10 @@ class Site:
         for command in tick.commands:
             self.order(command, t_ns)
         packed = self._pack(tick.k, tick.arrivals)
+        bodies: Sequence[float] = ()
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
+            bodies = tick.measured.bodies
             s.q, s.qd = tick.measured.q, tick.measured.qd
             s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
         hand = self._take_hand(tick.hand)
@@ -171,26 +174,15 @@ class Site:
             memory = self._ask_law(tick.k, t_ns)
             self._act(tick.k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
         row = self._buffers.record.tolist()
-        q, qd, q_des, qd_des, tau, tau_x, theta_hat, *task = self._columns
+        motion, task = self._columns
         mode = self._mode.item()
-        record = TickRecord(
-            tick.k,
-            t_ns,
-            _MODES[mode],
-            row[q],
-            row[qd],
-            row[q_des],
-            row[qd_des],
-            row[tau],
-            row[tau_x],
-            row[theta_hat],
-            self._used.tolist(),
-            self._crc(packed, count),
-            [command.text for command in tick.commands],
-            self._held_memory() + memory if self._remembers or mode not in (_RUN, _DIVERGED) else [],
-            *(row[column] for column in task),
-        )
-        return record._replace(ch=self._sent.tolist(), hand=hand) if self._sends or hand else record
+        texts = [command.text for command in tick.commands]
+        memory = self._held_memory() + memory if self._remembers or mode not in (_RUN, _DIVERGED) else []
+        taken = self._used.tolist(), self._crc(packed, count), texts, memory
+        states = [row[column] for column in motion]
+        shared = [row[column] for column in task] or _NO_TASK
+        sent = self._sent.tolist() or (), hand, bodies
+        return TickRecord._make((tick.k, t_ns, _MODES[mode], *states, *taken, *shared, *sent))
 
     def _ask_law(self, k: int, t_ns: int) -> list[float]:
         """Stage 6 of a plugged law; returns its memory.
@@ -240,11 +232,11 @@ class Site:
         angles: list[float] = self._site[0]["q"][: self.layout.joints].tolist()
         return angles
 
-    def _take_hand(self, vector: Sequence[float]) -> list[float]:
-        """Puts what a live hand does into its row; returns it as a record has it, [] if there is none."""
+    def _take_hand(self, vector: Sequence[float]) -> Sequence[float]:
+        """Puts what a live hand does into its row; returns it as a record has it, () if there is none."""
         row = self._hand
         if row is None:
-            return []
+            return ()
         size = (self.layout.hand - 3) // 2
         taken = list(vector) or free_hand(size)
         hand = HandInForce.read(taken)

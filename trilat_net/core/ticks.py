@@ -165,11 +165,13 @@ class PlantState(NamedTuple):
         q: joint angles, rad.
         qd: joint velocities, rad/s.
         tau_x: torque of operator and environment, N m, in the sign of the record; empty: none is measured.
+        bodies: poses of what else is in its scene, as a record has them.
     """
 
     q: Sequence[float]
     qd: Sequence[float]
     tau_x: Sequence[float] = ()
+    bodies: Sequence[float] = ()
 
 
 class TickInput(NamedTuple):
@@ -218,6 +220,8 @@ class TickRecord(NamedTuple):
         wrench: what tau_x amounts to there, N and N m.
         ch: what the site's law sends besides, see `LawChannel`.
         hand: what a live hand does in this tick, see `live_hand`; empty if the site has none.
+        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base frame, m, and
+            the unit quaternion w, x, y, z; empty if it has none.
     """
 
     tick: int
@@ -239,6 +243,7 @@ class TickRecord(NamedTuple):
     wrench: Sequence[float] = ()
     ch: Sequence[float] = ()
     hand: Sequence[float] = ()
+    bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Returns the motion and the exogenous torque that peers get, in the coordinates that sites share."""

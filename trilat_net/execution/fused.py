@@ -13,7 +13,7 @@ handed over at the first tick after it: none is in use earlier (L2).
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -46,6 +46,7 @@ from ..scenario import Scenario
 from ..scenario.code_consent import find_user_laws
 from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
+from ..scenario.own_plant import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 
@@ -85,14 +86,14 @@ class RunState:
             own.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
 
 
-def check_fusable(scenario: Scenario) -> None:
-    """Refuses a scenario that the compiled loop cannot run.
+def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
+    """Refuses a scenario that the compiled loop cannot run; arms of `plants` are moved by those.
 
     Raises:
-        ScenarioError: an arm is external, or a site is so much slower than another that too many samples
+        ScenarioError: another arm is external, or a site is so much slower than another that too many samples
             would arrive in one of its ticks.
     """
-    refuse_external_arms(scenario)
+    refuse_external_arms(scenario, plants)
     if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
         raise ScenarioError(
             f"the fastest site makes {ratio} ticks within one of the slowest, at most {MAX_ARRIVALS} "
@@ -165,7 +166,8 @@ class FusedRun:
 
     Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
     `keep` of a site's last records are kept for `take_records`. With `inputs` it is a recorded run again;
-    else hands of one's own act, and `hands` in their place: the loop pauses where one is asked.
+    else hands of one's own act, and `hands` in their place: the loop pauses where one is asked. `plants` move
+    arms of sites, between any two ticks.
 
     Raises:
         ScenarioError: see `check_fusable`; or a law cannot be made.
@@ -178,8 +180,9 @@ class FusedRun:
         keep: int = 0,
         inputs: RunInputs | None = None,
         hands: Mapping[str, HandActor] = {},
+        plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
-        check_fusable(scenario)
+        check_fusable(scenario, plants)
         self._scenario = scenario
         self._apart_rad = apart_rad
         self._inputs = inputs or make_prompt_inputs(len(scenario.names))
@@ -208,7 +211,8 @@ class FusedRun:
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self._taken_ticks = [0] * count
-        self._acted: dict[int, int] = {}
+        self._plants = {i: plants[name] for i, name in enumerate(scenario.names) if name in plants}
+        self._acted, self._moved = dict[int, int](), dict.fromkeys(self._plants, 0)
         self._selected: dict[int, SiteArrays] = {}
         self.ran_s = 0.0
 
@@ -261,13 +265,25 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Steps every site up to a time, in pieces within which no hand is asked."""
-        while self._hands and self.diverged_s is None:
-            before_ns = min(self._let_act(i) for i in self._hands)
-            if before_ns > last_ns:
+        """Steps every site up to a time, in pieces within which no hand is asked and no plant moves."""
+        while self.has_programs and self.diverged_s is None:
+            asked_ns = [*map(self._let_act, self._hands), *map(self._let_move, self._plants)]
+            if min(asked_ns) > last_ns:
                 break
-            self._step_piece(before_ns - 1)
+            self._step_piece(min(asked_ns) - 1)
         self._step_piece(last_ns)
+        for i in self._plants:
+            self._let_move(i)
+
+    def _let_move(self, i: int) -> int:
+        """Lets the plant of a site move on to the site's next tick; returns the time of the one after, ns."""
+        k, plant, own = int(self._progress[i]["tick"]), self._plants[i], self.arrays(i).site[0]
+        if k > self._moved[i]:
+            plant.move(k - 1, self.records[i, self._layouts[i].columns()["tau"]].tolist())
+        self._moved[i], n = k, self._layouts[i].joints
+        own["q"][:n], own["qd"][:n] = plant.state.q, plant.state.qd
+        own["sensed"][:n] = [-torque for torque in plant.state.tau_x] or 0.0
+        return NEVER_NS if self._progress[i]["t_ns"] == NEVER_NS else tick_ns(k + 1, plant.rate_hz)
 
     def _let_act(self, i: int) -> int:
         """Lets the hand of a site act at the ticks before it is asked again; returns the time of that, ns."""
@@ -357,8 +373,8 @@ class FusedRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if hands of one's own act in it."""
-        return bool(self._hands)
+        """True if hands or plants of one's own act in it."""
+        return bool(self._hands or self._plants)
 
     def copy_state(self, other: "FusedRun") -> None:
         """Becomes equal to another run of the same scenario, which is planned alike."""

@@ -36,7 +36,7 @@ ReceivedMotion = State | Arrival
 
 
 _MOTION = attrgetter("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-_REST = attrgetter("x", "xd", "wrench", "ch", "hand")
+_REST = attrgetter("x", "xd", "wrench", "ch", "hand", "bodies")
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:

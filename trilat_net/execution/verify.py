@@ -80,7 +80,7 @@ def _pack(a: State | TickRecord) -> bytes:
         "d",
         [
             *(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat),
-            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand),
+            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand, *a.bodies),
         ],
     ).tobytes()
 
@@ -335,7 +335,7 @@ class SiteVerifier:
             arrivals, missing = self._inputs.arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
-        plant = PlantState(state.q, state.qd, state.tau_x) if self._external else None
+        plant = PlantState(state.q, state.qd, state.tau_x, state.bodies) if self._external else None
         output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant, state.hand))
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)

@@ -238,7 +238,7 @@ def execute_virtual(
         at = arm.get(k) if plant is None else plant.state
         output = site.step(TickInput(k, arrivals, ordered.get(k, ()), at, hand))
         if plant is not None:
-            plant.move(output)
+            plant.move(k, output.tau)
         joined.send(site.name, output)
         yield SiteTick(site, arrivals, output)
         if output.mode is Mode.DIVERGED:

@@ -154,7 +154,8 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     peers = {name: scenario.peers(name) for name in scenario.names}
     states = {name: log[name].states for name in log.sites}
     arms = {
-        name: {s.tick: PlantState(s.q, s.qd, s.tau_x) for s in states[name]} for name in log.scenario.external
+        name: {s.tick: PlantState(s.q, s.qd, s.tau_x, s.bodies) for s in states[name]}
+        for name in log.scenario.external
     }
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}

@@ -15,6 +15,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
@@ -255,8 +256,21 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
         yield Column(column, site.hand[:, 3 + n].copy(), unit, meaning, f"hand[{3 + n}]", held)
 
 
+def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
+    axes = (*(("m", axis) for axis in "xyz"), *(("", f"q{axis}") for axis in "wxyz"))
+    for n, (body, (unit, axis)) in enumerate(product(bodies, axes)):
+        text = f"{axis} of the {'place' if unit else 'unit quaternion'} of {body}, a body of its plant"
+        yield Column(
+            add_unit_suffix(f"{body}_{axis}", unit), site.bodies[:, n].copy(), unit, text, f"bodies[{n}]"
+        )
+
+
 def build_state_table(
-    site: SiteLog, arm: ArmModel, peer_rates_hz: Mapping[str, int], hand_mode: str = "tip"
+    site: SiteLog,
+    arm: ArmModel,
+    peer_rates_hz: Mapping[str, int],
+    hand_mode: str = "tip",
+    bodies: Iterable[str] = (),
 ) -> Table:
     """Returns the records of a site with its arm, a row each, in order of their ticks."""
     docs = read_field_docs(State)
@@ -265,6 +279,7 @@ def build_state_table(
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
     columns += _make_hand_columns(site, arm, hand_mode)
+    columns += _make_bodies_columns(site, bodies)
     for peer, rate_hz in peer_rates_hz.items():
         used = site.used[peer]
         known: NDArray[np.bool_] = used >= 0

@@ -440,7 +440,8 @@ class Log(Result, Mapping[str, SiteLog]):
                 rates_hz = {p: self.scenario.sites[p].rate_hz for p in site.peers}
                 live = find_live_hand(self.scenario.sites[name].hands)
                 mode = "tip" if live is None else live.mode
-                return build_state_table(site, self.scenario.arms[name], rates_hz, mode)
+                bodies = self.scenario.bodies_m(name)
+                return build_state_table(site, self.scenario.arms[name], rates_hz, mode, bodies)
             case "link":
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":

@@ -315,6 +315,7 @@ class SiteLog:
     wrench = _RecordVector("What tau_x amounts to there, shape (K, m), N and N m.")
     ch = _RecordVector("All that the site's law sends, shape (K, C); `sent` has it by name.")
     hand = _RecordVector("What somebody who holds the arm does, shape (K, h), see `HandInForce`.")
+    bodies = _RecordVector("Poses of the bodies of its plant, shape (K, 7 b), m and quaternions.")
     mem = _RecordField(record_columns.decode_strings, "Further memory of the site, shape (K,), a list each.")
     t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
     late_us = _RecordField(

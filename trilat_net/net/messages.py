@@ -77,6 +77,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         hand: what somebody who holds the arm does: grip from 0 to 1, number of the newest message (-1
             without), who holds it (0: nobody), target, its velocity, see `core.live_hand`; left out without
             a live hand.
+        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base frame, m, and
+            the unit quaternion w, x, y, z; left out without any.
     """
 
     v: int
@@ -106,6 +108,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     wrench: list[float] = []
     ch: list[float] = []
     hand: list[float] = []
+    bodies: list[float] = []
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -321,7 +324,7 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 TASK_VECTORS = ("x", "xd", "wrench")
-STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand")
+STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand", "bodies")
 """The vectors of a record; their lengths are those of the site's `Layout`."""
 
 

@@ -9,6 +9,7 @@ Payloads are MessagePack maps with string keys and plain lists, as the types of 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cache
+from itertools import chain
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -77,10 +78,10 @@ def encode_state(
         WireError: a number is not finite.
     """
     (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *task) = output
-    x, xd, wrench, ch, hand = task
-    numbers = [*q, *qd, *q_des, *qd_des, *tau, *tau_x, *theta_hat, *mem, *x, *xd, *wrench, *ch, *hand]
+    x, xd, wrench, ch, hand, bodies = task
+    vectors = (q, qd, q_des, qd_des, tau, tau_x, theta_hat, mem, *task)
     # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
-    if not _isfinite(sum(numbers)) and not all(map(_isfinite, numbers)):
+    if not _isfinite(sum(map(sum, vectors))) and not all(map(_isfinite, chain.from_iterable(vectors))):
         raise WireError("not finite", f"{site} at tick {tick}")
     fields = {
         "v": VERSION,
@@ -112,6 +113,8 @@ def encode_state(
         fields["ch"] = ch
     if hand:
         fields["hand"] = hand
+    if bodies:
+        fields["bodies"] = bodies
     return _encode(fields)
 
 

@@ -228,8 +228,18 @@ class Charts:
         if arm.chain is not None:
             return {"site": site, "colour": index, **self._projected(site)}
         values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
-        table = self._site_table(site, values)
-        return {"site": site, "colour": index, "links_m": list(arm.lengths_m), "table": table}
+        edges = self._edges(site, np.arange(len(part)))
+        table = self._site_table(site, np.hstack([values, *edges]))
+        links = {"links_m": list(arm.lengths_m), "bodies": len(edges)}
+        return {"site": site, "colour": index, **links, "table": table}
+
+    def _edges(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """Returns the edges of the bodies of a site's plant in some records, shape (K, 2 P) each."""
+        sizes_m, arm = self._log.scenario.bodies_m(site).values(), self._log.scenario.arms[site]
+        if not sizes_m:
+            return []
+        traced = arm_poses.trace_bodies_m(arm, sizes_m, self._log[site].bodies[rows])
+        return [picture_scale(self._log, self._bounds_m) * path.reshape(len(rows), -1) for path in traced]
 
     def _projected(self, site: str) -> JsonObject:
         part, arm = self._log[site], self._log.scenario.arms[site]
@@ -244,8 +254,9 @@ class Charts:
         )
         factor = picture_scale(self._log, self._bounds_m)
         points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * factor
-        table = self._store(site, part.tick[rows], points.reshape(len(rows), -1))
-        return {"points": points.shape[2], "table": table}
+        edges = self._edges(site, rows)
+        table = self._store(site, part.tick[rows], np.hstack([points.reshape(len(rows), -1), *edges]))
+        return {"points": points.shape[2], "bodies": len(edges), "table": table}
 
 
 def _chart(section: str, title: str, unit: str, series: list[JsonObject], **options: Any) -> JsonObject:

@@ -8,21 +8,27 @@ plant, and judges the plant by nothing.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from msgspec import Meta, field
 
-from ..core.ticks import PlantState, TickRecord
+from ..core.ticks import PlantState
 from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError
-from ..fields import Frozen
+from ..fields import Frozen, is_number
 from ..laws.interface import make_instance
 from .imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
+
+
+T = TypeVar("T")
+_BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
+_MAX_BODIES, _MAX_SIZE_M = 32, 100.0
 
 
 class PlantContext(NamedTuple):
@@ -41,6 +47,7 @@ class PlantContext(NamedTuple):
         q0_rad: the arm's start pose, rad, shape (n,).
         h_s: the period of a tick, s.
         seed: for what it draws: of the scenario and the site.
+        bodies_m: the bodies that it moves besides the arm, by name: sizes along x, y and z of their own, m.
     """
 
     site: str
@@ -48,6 +55,7 @@ class PlantContext(NamedTuple):
     q0_rad: tuple[float, ...]
     h_s: float
     seed: int
+    bodies_m: Mapping[str, tuple[float, float, float]]
 
 
 class PlantProgram(Protocol):
@@ -60,6 +68,12 @@ class PlantProgram(Protocol):
         in the sign of Eq. (8), the negative of the torque ON it.
         """
 
+    def poses(self) -> Sequence[Sequence[float]]:
+        """Returns where its bodies are now, in the order of `PlantContext.bodies_m`; asked only with any.
+
+        Seven numbers each: x, y, z of its middle in the arm's base frame, m, and the quaternion w, x, y, z.
+        """
+
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
     """The plant of a site in a scenario.
@@ -67,6 +81,8 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
     Attributes:
         code: its class, as in "my_plant:Scene".
         source_sha256: hash of the file of its class.
+        bodies: what else it moves, by name: sizes of a box around it, along its own x, y and z, m; where they
+            are is recorded and drawn.
         settings: the arguments of its class, by name.
     """
 
@@ -74,6 +90,7 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
     code: Annotated[str, Meta(pattern=CLASS_PATTERN, max_length=200)]
     source_sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
+    bodies: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -85,10 +102,27 @@ def resolve_plant(written: Any, path: str) -> Any:
     code = table.get("class")
     if not isinstance(code, str):
         raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
+    bodies = {"bodies": _check_bodies(table["bodies"], f"{path}.bodies")} if "bodies" in table else {}
     if "source_sha256" in table:
-        return dict(table)
-    settings = {key: value for key, value in table.items() if key != "class"}
-    return {"class": code, "source_sha256": read_code(code, path).sha256, "settings": settings}
+        return {**table, **bodies}
+    settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
+    return {"class": code, "source_sha256": read_code(code, path).sha256, "settings": settings, **bodies}
+
+
+def _check_bodies(written: Any, path: str) -> Any:
+    if not isinstance(written, Mapping) or len(written) > _MAX_BODIES:
+        example = "{ box = [0.2, 0.2, 0.1] }"
+        raise ScenarioError(f"must be the sizes of at most {_MAX_BODIES} bodies, as in {example}", path=path)
+    for name, size in written.items():
+        if not _BODY_NAME.fullmatch(name):
+            raise ScenarioError(f"a body is named by a to z, 0 to 9 and _, not {name!r}", path=path)
+        given = isinstance(size, list | tuple) and all(
+            is_number(one) and 0.0 < one <= _MAX_SIZE_M for one in size
+        )
+        if not given or len(size) != 3:
+            problem = f"must be three sizes, m, above 0 and up to {_MAX_SIZE_M:g}, is {size!r}"
+            raise ScenarioError(problem, path=f"{path}.{name}")
+    return written
 
 
 class PlantPlayer:
@@ -96,35 +130,60 @@ class PlantPlayer:
 
     Attributes:
         state: the arm's motion at the next tick.
+        rate_hz: the tick rate of its site, Hz.
     """
 
     def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
         spec, path = scenario.sites[site], f"sites.{site}.plant"
-        self._site, self._code, self._h_s, self._watch = site, plant.code, 1.0 / spec.rate_hz, watch
+        self._site, self._code, self._watch, self.rate_hz = site, plant.code, watch, spec.rate_hz
         kind = import_class(plant.code, plant.source_sha256, path, plant.method)
-        context = PlantContext(site, scenario, spec.q0_rad, self._h_s, scenario.draw_seed(site))
+        if plant.bodies and not hasattr(kind, "poses"):
+            raise ScenarioError(
+                f"{plant.code} has no poses(), which says where they are", path=f"{path}.bodies"
+            )
+        context = PlantContext(
+            site, scenario, spec.q0_rad, 1.0 / spec.rate_hz, scenario.draw_seed(site), plant.bodies
+        )
         self._program: PlantProgram = make_instance(kind, plant.code, context, plant.settings, path=path)
-        self.state = PlantState(spec.q0_rad, spec.qd0_rad_s)
+        self._bodies = len(plant.bodies)
+        self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), self._ask(0, self._place))
 
-    def move(self, output: TickRecord) -> None:
-        """Moves on to the next tick under the torque of a record.
+    def move(self, tick: int, tau: Sequence[float]) -> None:
+        """Moves on from a tick to the next under its control torque, N m, shape (n,).
 
         Raises:
             PlantFailed: it raised, or says no motion of such an arm.
         """
-        try:
-            given = np.array(output.tau), self._h_s
-            q, qd, *rest = self._watch(output.tick, lambda: self._program.step(*given))
-            found = [[float(one) for one in vector] for vector in (q, qd, *rest[:1])]
-        except (Exception, SystemExit) as error:  # the user's code
-            raise self._failed(output.tick, f"{type(error).__name__}: {error}") from error
+        found = self._ask(tick, lambda: self._step(tau))
         for name, vector in zip(("q", "qd", "tau_x"), found, strict=False):
-            if len(vector) != len(output.q):
-                problem = f"{name} has {len(vector)} numbers, and the arm has {len(output.q)} joints"
-                raise self._failed(output.tick, problem)
+            if len(vector) != len(tau):
+                problem = f"{name} has {len(vector)} numbers, and the arm has {len(tau)} joints"
+                raise self._failed(tick, problem)
             if not all(map(math.isfinite, vector)):
-                raise self._failed(output.tick, f"{name} is {vector}, which is not finite")
-        self.state = PlantState(*found)
+                raise self._failed(tick, f"{name} is {vector}, which is not finite")
+        bodies = self._ask(tick, self._place)
+        self.state = PlantState(found[0], found[1], found[2] if len(found) > 2 else (), bodies)
+
+    def _step(self, tau: Sequence[float]) -> list[list[float]]:
+        q, qd, *rest = self._program.step(np.array(tau), 1.0 / self.rate_hz)
+        return [[float(one) for one in vector] for vector in (q, qd, *rest[:1])]
+
+    def _place(self) -> list[float]:
+        if not self._bodies:
+            return []
+        poses = [[float(one) for one in pose] for pose in self._program.poses()]
+        if [len(pose) for pose in poses] != [7] * self._bodies:
+            raise ValueError(f"poses() is {poses}, not seven numbers for each of {self._bodies} bodies")
+        if not all(math.isfinite(one) for pose in poses for one in pose):
+            raise ValueError(f"poses() is {poses}, which is not finite")
+        return [one for pose in poses for one in pose]
+
+    def _ask(self, tick: int, call: Callable[[], T]) -> T:
+        try:
+            found: T = self._watch(tick, call)
+            return found
+        except (Exception, SystemExit) as error:  # the user's code
+            raise self._failed(tick, f"{type(error).__name__}: {error}") from error
 
     def _failed(self, tick: int, problem: str) -> PlantFailed:
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)

@@ -397,7 +397,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns how many numbers the vectors of a site have."""
         live = find_live_hand(self.sites[site].hands)
         actors = () if live is None else (live.actor,)
-        return site_setup.Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
+        found = site_setup.Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
+        return found._replace(bodies=7 * len(self.bodies_m(site)))
+
+    def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
+        """Returns the bodies that a site's plant moves besides its arm: their sizes along their axes, m."""
+        plant = self.sites[site].plant
+        return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> site_setup.SiteSetup:
         """Returns all that the core needs to build a site."""
@@ -423,6 +429,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
+            bodies=len(self.bodies_m(site)),
             limits=spec.limits.motion,
             rest=self._rest_gains(site) if spec.on_stale.action == "glide" else site_setup.RestGains(),
             bit=1 << self.names.index(site),

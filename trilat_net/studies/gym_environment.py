@@ -31,6 +31,7 @@ from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
+from ..scenario.own_plant import make_plant_players
 
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
@@ -45,12 +46,14 @@ class Scene(NamedTuple):
         q: joint angles by site, rad, shape (n,).
         end_effector_m: place of the end effector by site, m.
         view: what the user sees.
+        bodies: the poses of the bodies of plants, by site and then name, as a record has them, shape (7,).
     """
 
     t_s: float
     q: dict[str, Array]
     end_effector_m: dict[str, Array]
     view: HandView
+    bodies: dict[str, dict[str, Array]]
 
 
 class Judgement(NamedTuple):
@@ -71,8 +74,8 @@ class EpisodeTask(Protocol):
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
         """Draws the task of an episode."""
 
-    def judge(self, scene: Scene) -> Judgement:
-        """Returns the reward of a step, and whether the task is done or has failed."""
+    def judge(self, scene: Scene) -> float | tuple[Any, ...]:
+        """Returns the reward of a step; or with it whether the task is done, as a `Judgement` or a tuple."""
 
 
 class ReachTask:
@@ -186,7 +189,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _begin(self, scenario: Scenario) -> None:
         self.scenario, self._k, self._actions = scenario, 0, list[Array]()
         self._player = ActedHand(self._place(scenario), self._actions, self._every)
-        self._run = FusedRun(scenario, keep=1, hands={self._user: self._player})
+        self._plants = make_plant_players(scenario)
+        self._run = FusedRun(scenario, keep=1, hands={self._user: self._player}, plants=self._plants)
         self._run.plan([scenario.ticks(name) for name in scenario.names])
         self._ticks, self._tick_rate_hz = scenario.ticks(self._user), scenario.sites[self._user].rate_hz
 
@@ -197,7 +201,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         q = {name: angles.copy() for name, angles in zip(names, own, strict=True)}
         places = {name: np.array(arms[name].end_effector(q[name])) for name in names}
         view = self._player.view(self._k, run.arrays(names.index(self._user)))
-        return Scene(self._k / self._tick_rate_hz, q, places, view)
+        poses = {site: np.reshape(plant.state.bodies, (-1, 7)) for site, plant in self._plants.items()}
+        bodies = {
+            site: dict(zip(self.scenario.bodies_m(site), at, strict=True)) for site, at in poses.items()
+        }
+        return Scene(self._k / self._tick_rate_hz, q, places, view, bodies)
 
     def _describe_observation(self) -> spaces.Dict:
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
@@ -256,6 +264,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise UsageError(f"an action: {error}") from None
         scene, diverged = self._look(), self._run.diverged_s is not None
         said = self.task.judge(scene)
+        said = Judgement(*said) if isinstance(said, tuple) else Judgement(said)
         ended = said.succeeded or said.failed or diverged
         truncated = self._k + self._every > self._ticks and not ended
         info = self._inform(scene, succeeded=said.succeeded)

@@ -2,6 +2,7 @@
 (() => {
   "use strict";
   const { page, tables } = window.trilat;
+  const EDGES = 32; // numbers of the path along the edges of a body
   const SVG = "http://www.w3.org/2000/svg";
   const row = document.querySelector("#arms .row");
   const slider = document.querySelector("#arms input");
@@ -27,9 +28,10 @@
     const shadow = element(svg, "polyline", { class: "shadow" });
     const desired = element(svg, "polyline", { class: "desired" });
     const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
+    const bodies = Array.from({ length: arm.bodies }, () => element(svg, "polyline", { class: "body" }));
     const joints = Array.from({ length: arm.points || 2 }, () => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
     element(svg, "rect", { class: "base", x: -0.05, y: -0.05, width: 0.1, height: 0.1 });
-    return { arm, shadow, desired, actual, joints };
+    return { arm, shadow, desired, actual, joints, bodies };
   });
   const at = (table, time) => {
     const { t, columns } = tables[table];
@@ -58,13 +60,17 @@
     const now = Math.max(0, Math.min(page.end_s, time));
     slider.value = (1000 * now) / page.end_s;
     clock.textContent = `${now.toFixed(3)} s`;
-    for (const { arm, shadow, desired, actual, joints } of drawn) {
+    for (const { arm, shadow, desired, actual, joints, bodies } of drawn) {
       const q = at(arm.table, now);
       const known = q !== null;
       const [points, reference, shadows] = known ? places(arm, q) : [[], [], []];
       actual.setAttribute("points", known ? `0,0 ${points.join(" ")}` : "");
       desired.setAttribute("points", known ? `0,0 ${reference.join(" ")}` : "");
       shadow.setAttribute("points", shadows.length ? `0,0 ${shadows.join(" ")}` : "");
+      bodies.forEach((body, n) => {
+        const edges = known ? q.slice(q.length - EDGES * (bodies.length - n)).slice(0, EDGES) : [];
+        body.setAttribute("points", edges.map((v, place) => (place % 2 ? -v : v)).join(" "));
+      });
       joints.forEach((joint, n) => {
         joint.setAttribute("visibility", known ? "visible" : "hidden");
         if (known) { joint.setAttribute("cx", points[n][0]); joint.setAttribute("cy", points[n][1]); }

@@ -4,7 +4,7 @@ Invariant: forward kinematics are those of the core; the reference pose is dashe
 seen along parallel lines from one fixed direction, with up where gravity does not pull.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
@@ -32,6 +32,10 @@ _SHADOW: dict[str, Any] = {"color": "#c9c9c9", "linewidth": 1.6, "solid_capstyle
 _DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
 PictureBox = tuple[float, float, float, float]
 """Left, right, bottom and top."""
+_BOX_PATH = 0.5 * np.array(
+    [[1 - 2 * (n >> axis & 1) for axis in range(3)] for n in (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)]
+)
+"""Along all edges of a box of sides 1."""
 _BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
 
 
@@ -39,13 +43,32 @@ class ArmPose(NamedTuple):
     """A site at an instant: its base, joints and end effector, (L, 2), and the path of the last, (P, 2), m.
 
     `shadow` is what a light straight above would cast onto a floor at the base: that of a chain, (L, 2), or
-    nothing, (0, 2).
+    nothing, (0, 2). `bodies` are those of its plant, see `trace_bodies_m`.
     """
 
     actual: Array
     desired: Array
     path: Array
     shadow: Array
+    bodies: Sequence[Array] = ()
+
+
+def trace_bodies_m(arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array) -> list[Array]:
+    """Returns the edges of the boxes of a plant's bodies as paths in the plane of a picture, (K, P, 2), m.
+
+    Args:
+        arm: of the site.
+        sizes_m: of each body, along its own axes, m.
+        poses: as records have them, shape (K, 7 b).
+    """
+    found = []
+    for size, pose in zip(sizes_m, np.split(poses, poses.shape[1] // 7, axis=1), strict=True):
+        w, v = pose[:, np.newaxis, 3:4], pose[:, np.newaxis, 4:]
+        corners = np.broadcast_to(_BOX_PATH * np.asarray(size), (len(pose), *_BOX_PATH.shape))
+        turned = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
+        edges = turned + pose[:, np.newaxis, :3]
+        found.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
+    return found
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
@@ -93,12 +116,16 @@ def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     actual = project_arm_m(arm, found)
     desired = project_arm_m(arm, joint_positions_m(arm, reference_angles(part)[last : last + 1])[0])
     shadow = project_arm_m(arm, found[-1 if arm.chain else len(found) :][:1], onto_floor=True)
-    return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2))
+    sizes_m = log.scenario.bodies_m(site).values()
+    bodies = (
+        [path[0] for path in trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])] if sizes_m else ()
+    )
+    return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2), bodies)
 
 
 def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     """Returns left, right, bottom and top of a box around poses with a margin, m; the base is inside."""
-    points = [np.concatenate(drawn) for drawn in poses if drawn is not None]
+    points = [np.concatenate([*one[:4], *one.bodies]) for one in poses if one is not None]
     every = np.concatenate([*points, np.zeros((1, 2))])
     low, high = every.min(axis=0), every.max(axis=0)
     centre = (low + high) / 2.0
@@ -148,6 +175,8 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
         return
     if len(drawn.shadow):
         axes.plot(*drawn.shadow.T, **_SHADOW)
+    for path in drawn.bodies:
+        axes.plot(*path.T, color=style.REFERENCE, linewidth=0.8)
     axes.plot(*drawn.path.T, color=colour, linewidth=0.6, alpha=0.55)
     axes.plot(*drawn.desired.T, **_DESIRED)
     axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")
@@ -167,7 +196,10 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float = 1.0) -> str:
         cells.append(f'<span class="head">{escape(site)}</span>')
         for t in times:
             drawn = pose_at(log, site, t)
-            scaled = None if drawn is None else ArmPose(*(factor * points for points in drawn))
+            scaled = None
+            if drawn is not None:
+                bodies = [factor * path for path in drawn.bodies]
+                scaled = ArmPose._make([*(factor * points for points in drawn[:4]), bodies])
             cells.append(_render_picture(scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"))
     note = "Gray: the shadow on a floor at the base; up is where gravity does not pull."
     chains = any(arm.chain for arm in log.scenario.arms.values())
@@ -189,6 +221,7 @@ def _render_picture(drawn: ArmPose | None, index: int, bounds: PictureBox, label
             (f"path site-{index}", drawn.path),
             ("desired", drawn.desired),
             (f"arm site-{index}", drawn.actual),
+            *(("body", path) for path in drawn.bodies),
         ]
         if len(drawn.shadow):
             ground = ""
