@@ -198,6 +198,16 @@ def test_a_program_hands_over_and_back_without_a_step(
     assert max(map(float, times)) <= 1.2
 
 
+def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a ramp the slave comes to its goal, with smaller steps of the reference than at once."""
+    monkeypatch.syspath_prepend(LOOK.parent)
+    takeover, weights = runpy.run_path(str(LOOK.with_name("takeover.py"))), np.array([0.95, -0.3, 0.3, 0.5])
+    left, abrupt, blended = (takeover["run"](weights, 3, ramp_s) for ramp_s in takeover["WAYS"].values())
+    assert blended["success"] == 1.0 > left["success"]
+    assert blended["jump"] < abrupt["jump"]
+    assert blended["without_control_s"] == 0.0
+
+
 def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
     monkeypatch.syspath_prepend(LOOK.parent)

@@ -44,6 +44,34 @@ def test_records_are_those_of_virtual_time(
 
 
 @pytest.mark.long
+def test_a_person_takes_over_from_a_running_program(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ramps of a second: no reference steps further than 1.2 times the motion itself, and no site holds."""
+    monkeypatch.chdir(stage.folder)
+    tn.new_hand("my_hand.py")
+    path = "to_m=[1.6, 0.5], stiffness_n_m=300.0, damping_n_s_m=30.0, move_start_s=0.0, move_end_s=8.0"
+    ramps = ", ".join(
+        f"{{at_s={at_s}, dominance='s', to={{m1={m1}, m2={m2}}}, ramp_s=1.0}}"
+        for at_s, m1, m2 in ((3.0, 0.9, 0.1), (6.0, 0.1, 0.9))
+    )
+    keys = [
+        f"sites.m1.hands=[{{kind='tip_spring', {path}}}]",
+        "sites.m2.hands=[{kind='own', class='my_hand:MyHand', process=true}]",
+        "dominance.s={m1=0.1, m2=0.9}",
+        f"timeline=[{ramps}]",
+        "duration_s=9",
+    ]
+    words = [word for key in keys for word in ("--set", key)]
+    running = stage.start("demo", "demo", "paper", *words, "--out", "out")
+    assert running.code(120.0) == 0, running
+    log = open_log(stage.folder / "out" / "run.mcap", law=stage.folder / "my_hand.py")
+    found = tn.metrics(log).run
+    assert found["takeovers"].value == 2
+    assert 0.0 < found["lead_jump"].value <= 1.2
+    assert {state.mode for name in log.sites for state in log[name].states} == {"run"}
+    assert tn.verify(log).passed
+
+
+@pytest.mark.long
 def test_a_killed_program_lets_go_and_the_others_go_on(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGKILL in the middle: silence of 200 ms, a grip that fades within 100 ms, no site that holds."""
     monkeypatch.chdir(stage.folder)
