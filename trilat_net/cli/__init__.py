@@ -84,6 +84,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
     "scenario": {"help": "The shipped scenarios and your own."},
     "new": {"help": "A control law, a hand or a plant of your own, with its test."},
     "trace": {"help": "Imports delays that other programs measured."},
+    "experiment": {"help": "Experiments with participants, from a protocol to its table."},
     "set": {"callback": options.spread(sessions.set_command)},
     "keys": {"help": "Keys that authenticate members of a session, and sign logs."},
 }

@@ -1,0 +1,39 @@
+"""A short experiment of synthetic participants, as a protocol."""
+
+from pathlib import Path
+
+TEXT = """
+name = "short"
+scenario = "paper"
+users = {users}
+participants = 2
+design = "{design}"
+trials = 2
+foreperiod_s = [0.2, 0.3]
+[set]
+rate_hz = 250
+control = {{ law = "p_d", K = 100.0, d = 40.0 }}
+sites.m1.q0_rad = [-0.6, 1.2]
+sites.m1.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
+sites.m2.q0_rad = [-0.6, 1.2]
+sites.m2.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
+sites.s = {{ q0_rad = [-0.6, 1.2] }}
+dominance.m1 = {{ m2 = 0.2, s = 0.8 }}
+dominance.m2 = {{ m1 = 0.2, s = 0.8 }}
+dominance.s = {{ m1 = 0.7, m2 = 0.3 }}
+[conditions.near]
+"link.delay_ms" = 0
+[conditions.far]
+"link.delay_ms" = 200
+[task]
+{task}
+"""
+REACH = 'kind = "reach"\ntargets = 4\ndistance_m = 0.1\nwidth_m = 0.05\ntimeout_s = 6.0\ndwell_s = 0.2'
+TRACK = 'kind = "track"\nduration_s = 2.0\namplitude_m = 0.05'
+
+
+def write_protocol(folder: Path, users: str = '["m1"]', task: str = REACH) -> Path:
+    file = folder / "short.toml"
+    design = "fixed" if "m2" in users else "williams"
+    file.write_text(TEXT.format(users=users, task=task, design=design), encoding="utf-8")
+    return file

@@ -1,0 +1,67 @@
+"""The statistics of an experiment: a function of its journal, with every number in a table."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from trilat_net.errors import UsageError
+from trilat_net.studies.experiment.experiment_run import begin_experiment
+
+from .experiments import write_protocol
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    where = tmp_path_factory.mktemp("analysis")
+    return tn.run_experiment(write_protocol(where), where / "out", jobs=1).folder
+
+
+def test_means_are_those_of_the_table(folder: Path) -> None:
+    found = tn.analyse_experiment(folder)
+    with (folder / "trials.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for mean in found.means["completion_s"]:
+        own = [
+            np.mean(
+                [
+                    float(r["completion_s"])
+                    for r in rows
+                    if (r["participant"], r["condition"]) == (who, mean.condition)
+                ]
+            )
+            for who in ("P1", "P2")
+        ]
+        assert mean.mean == pytest.approx(np.mean(own))
+        assert mean.number == 2
+    assert [one.condition for one in found.means["completion_s"]] == ["near", "far"]
+
+
+def test_everything_is_written_and_named(folder: Path, tmp_path: Path) -> None:
+    found = tn.analyse_experiment(folder, tmp_path / "there")
+    assert all(path.exists() for path in found.paths)
+    assert (tmp_path / "there" / "completion_s.png").read_bytes().startswith(b"\x89PNG")
+    facts = json.loads((tmp_path / "there" / "analysis.json").read_text(encoding="utf-8"))
+    assert facts["digest"] == tn.open_experiment(folder).plan.digest
+    with (tmp_path / "there" / "comparisons.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["measure"] for row in rows} == set(found.means)
+    first = next(row for row in rows if row["measure"] == "completion_s")
+    assert float(first["interval_low"]) < float(first["difference"]) < float(first["interval_high"])
+
+
+def test_methods_paragraph_has_delays_as_measured(folder: Path) -> None:
+    found = tn.analyse_experiment(folder)
+    assert found.methods.startswith("The data of 2 participants were analysed; 0 more were excluded.")
+    assert "far (delay 200 ms)" in found.methods
+    assert tn.open_experiment(folder).plan.digest in found.methods
+    assert found.methods in found.summary()
+
+
+def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:
+    begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
+    with pytest.raises(UsageError, match="no trial that counts is done yet"):
+        tn.analyse_experiment(begun.folder)

@@ -1,0 +1,116 @@
+"""Protocols of experiments: orders that balance, a digest, and everything that is wrong at once."""
+
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import trilat_net as tn
+from trilat_net.errors import UsageError
+from trilat_net.studies.experiment.protocol import Protocol, list_orders, plan_experiment, read_protocol
+
+LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"}]}
+
+
+def make_protocol(**keys: Any) -> Protocol:
+    conditions = {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}}
+    given = {"name": "study", "scenario": "paper", "set": LIVE, "conditions": conditions, "participants": 4}
+    return msgspec.convert({**given, **keys}, Protocol)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7])
+def test_williams_balances_places_and_neighbours(count: int) -> None:
+    """Williams, Aust. J. Sci. Res. A 2, 1949: equally often at each place, and after each other one."""
+    names = [f"c{n}" for n in range(count)]
+    orders = list_orders("williams", names, 1)
+    assert len(orders) == count * (1 + count % 2)
+    places = Counter((place, name) for order in orders for place, name in enumerate(order))
+    after = Counter(pair for order in orders for pair in pairwise(order))
+    assert set(places.values()) == {len(orders) // count}
+    assert set(after.values()) == {len(orders) // count}
+    assert len(after) == count * (count - 1)
+
+
+def test_latin_square_balances_places() -> None:
+    orders = list_orders("latin", ["a", "b", "c"], 1)
+    assert all(sorted(column) == ["a", "b", "c"] for column in zip(*orders, strict=True))
+
+
+def test_random_orders_are_a_function_of_the_seed() -> None:
+    names = ["a", "b", "c", "d"]
+    assert list_orders("random", names, 3) == list_orders("random", names, 3)
+    assert list_orders("random", names, 3) != list_orders("random", names, 4)
+    assert list_orders("fixed", names, 3) == [tuple(names)]
+
+
+def test_every_trial_has_its_place_and_seed() -> None:
+    plan = plan_experiment(make_protocol(practice=1, trials=3))
+    assert len(plan.trials) == 4 * 2 * 4
+    assert [one.number for one in plan.trials] == list(range(1, 33))
+    assert len({one.seed for one in plan.trials}) == len({one.file for one in plan.trials}) == 32
+    assert sum(one.practice for one in plan.trials) == 8
+    assert [one.before for one in plan.trials[:8]] == list(range(8))
+    assert plan.list_orders()["P1"] == ["near", "far"]
+    assert plan.list_orders()["P2"] == ["far", "near"]
+
+
+def test_pairs_hold_two_masters() -> None:
+    plan = plan_experiment(make_protocol(users=["m1", "m2"]))
+    assert [one.group for one in plan.trials[:: len(plan.trials) // 2]] == [("P1", "P2"), ("P3", "P4")]
+
+
+def test_digest_knows_what_was_planned() -> None:
+    first = plan_experiment(make_protocol()).digest
+    assert plan_experiment(make_protocol()).digest == first
+    assert plan_experiment(make_protocol(seed=2)).digest != first
+    assert plan_experiment(make_protocol(set={**LIVE, "rate_hz": 500})).digest != first
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"participants": 3}, "a williams design of 2 conditions has 2 orders: the number of participants"),
+        (
+            {"users": ["m1", "m2"], "participants": 5},
+            "5 participants make no pairs: their number must be even",
+        ),
+        ({"users": ["m1", "m2", "s"]}, "users are one or two sites, not m1, m2, s"),
+        ({"users": ["m3"]}, "condition near: .*has no site m3; there are m1, m2, s"),
+        ({"users": ["s"]}, "has no live hand, so nobody can hold it"),
+        ({"participants": ["A", "A"]}, "two participants have one pseudonym"),
+        ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
+        (
+            {"conditions": {"a": {"link.delay_ms": -1}, "b": {"control.K": 1}}},
+            "condition a: .*; condition b: ",
+        ),
+    ],
+)
+def test_all_that_is_wrong_is_named_before_anybody_sits_down(keys: dict[str, Any], problem: str) -> None:
+    with pytest.raises(UsageError, match=problem):
+        plan_experiment(make_protocol(**keys))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("name = 3", "Expected `str`, got `int` - at `\\$.name`; the keys of a protocol are name, scenario"),
+        ("name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3", "unknown field `trails`"),
+        ("name =", "is no TOML"),
+    ],
+)
+def test_file_that_is_no_protocol_is_refused(text: str, problem: str, tmp_path: Path) -> None:
+    file = tmp_path / "one.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(UsageError, match=problem):
+        read_protocol(file)
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_protocol(tmp_path / "none.toml")
+
+
+def test_template_is_a_protocol(tmp_path: Path) -> None:
+    plan = tn.check_experiment(tn.new_experiment(tmp_path / "reaching.toml"))
+    assert "12 participants at m1, reaching to a ring of targets" in plan.summary()
+    assert plan.to_dict()["counted"] == 12 * 4 * 4

@@ -1,0 +1,81 @@
+"""Experiments with people: write a protocol, check it, run it, see how far it is, and analyse it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..reporting import terminal_output as terminal
+from . import options
+from .options import value
+
+ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol (TOML).", metavar="FILE")]
+FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
+
+
+@options.command("reaching.toml")
+def experiment_new_command(file: ProtocolArgument, force: options.ForceOption = False) -> None:
+    """Writes a protocol with comments, which runs as it is."""
+    from ..studies.experiment.experiment_run import new_experiment
+
+    new_experiment(file, force=force)
+    terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
+
+
+@options.command("reaching.toml")
+def experiment_check_command(file: ProtocolArgument, as_json: options.JsonOption = False) -> None:
+    """Prints the plan of a protocol, or everything that is wrong with it."""
+    from ..studies.experiment.experiment_run import check_experiment
+
+    terminal.print_result(check_experiment(file), as_json=as_json)
+
+
+@options.command("reaching.toml", "runs/experiment-reaching-001")
+def experiment_run_command(
+    file: Annotated[Path, typer.Argument(help="A protocol, or the folder of one that goes on.")],
+    out: Annotated[Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs an experiment with synthetic participants, in virtual time: a verified log for each trial."""
+    from ..studies.experiment.experiment_run import begin_experiment, open_experiment
+    from .studies import show_progress
+
+    begun = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
+    with terminal.lines_aside(as_json):
+        terminal.print_text(
+            f"{len(begun.plan.trials)} trials, into {begun.folder}; it goes on after Ctrl-C by"
+        )
+        terminal.print_text(f"  trilat experiment run {begun.folder}")
+        with show_progress("trials", terminal.print_text) as show:
+            begun.run(jobs, show, on)
+    terminal.print_result(begun, as_json=as_json)
+
+
+@options.command("runs/experiment-reaching-001")
+def experiment_analyse_command(
+    folder: FolderArgument,
+    out: Annotated[Path | None, value("--out -o", "DIR", "Default: its folder analysis.")] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Compares the conditions of an experiment: tables, figures, a paragraph for a paper."""
+    from ..studies.experiment.experiment_analysis import analyse_experiment
+
+    found = analyse_experiment(folder, out)
+    terminal.print_result(found, as_json=as_json)
+    terminal.print_paths([] if as_json else found.paths)
+
+
+@options.command("runs/experiment-reaching-001")
+def experiment_status_command(folder: FolderArgument, as_json: options.JsonOption = False) -> None:
+    """Prints how far an experiment is, and whether its logs are those that its trials wrote."""
+    from ..studies.experiment.experiment_run import list_log_problems, open_experiment
+
+    found = open_experiment(folder)
+    problems = list(list_log_problems(found))
+    terminal.print_result(found, as_json=as_json)
+    for problem in problems:
+        terminal.err.print(problem, markup=False, highlight=False)
+    if problems:
+        raise typer.Exit(1)

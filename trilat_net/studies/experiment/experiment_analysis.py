@@ -1,0 +1,232 @@
+"""What an experiment found: means by condition, comparisons, a mixed model, figures, a methods paragraph.
+
+Invariant: it is a function of the journal. Practice does not count; a trial that failed does, with the time
+that it had. Every number of a figure or a sentence is in a table.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import UsageError
+from ...files import find_version, make_folder, write_whole
+from ...reporting.result_text import Block, TextTable
+from ...results import Result
+from ...scenario.describe import flatten_table
+from .condition_figures import draw_conditions
+from .experiment_run import Experiment, open_experiment
+from .movement_measures import measure_throughput
+from .statistics import (
+    CONFIDENCE,
+    Comparison,
+    ConditionMean,
+    Row,
+    compare_conditions,
+    fit_mixed_model,
+    summarise_conditions,
+    write_methods,
+)
+
+MEASURES = (
+    "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
+    "force_mean_user1_n", "force_mean_user2_n", "succeeded",
+)  # fmt: skip
+"""What is compared, as far as trials have it, and differ in it."""
+FOLDER = "analysis"
+
+
+class ExperimentAnalysis(Result):
+    """The statistics of an experiment.
+
+    Attributes:
+        rows: the trials that count; `throughput_rows` has one for each participant and condition.
+        means: by measure, for each condition.
+        comparisons: by measure, of every two conditions.
+        methods: the paragraph of a paper.
+        paths: the files that were written.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment, protocol = experiment, experiment.plan.protocol
+        self.unit = "pair" if len(protocol.users) > 1 else "participant"
+        order = list(protocol.conditions).index
+        counted = [row for row in experiment.to_rows() if not row["practice"]]
+        self.rows = sorted(counted, key=lambda row: order(row["condition"]))
+        if not self.rows:
+            raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
+        self.throughput_rows = list(self._find_throughput())
+        self.means: dict[str, list[ConditionMean]] = {}
+        self.comparisons: dict[str, list[Comparison]] = {}
+        for measure in MEASURES:
+            rows = self.of(measure)
+            if len({row.get(measure) for row in rows}) > 1:
+                self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
+                self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
+        self.methods, self.paths = self._write_methods(), list[Path]()
+
+    def of(self, measure: str) -> Sequence[Row]:
+        """Returns the rows that have a measure."""
+        return self.throughput_rows if measure.startswith("throughput") else self.rows
+
+    def _find_throughput(self) -> Iterator[dict[str, Any]]:
+        """Yields the throughput of each participant and condition, where the task is to reach."""
+        by: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for row in self.rows:
+            by.setdefault((row[self.unit], row["condition"]), []).append(row)
+        for (who, condition), rows in by.items():
+            done = [row for row in rows if row["succeeded"]]
+            if self._experiment.plan.protocol.task.words.startswith("reaching") and len(done) > 1:
+                left, aims, ends = (
+                    np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in done])
+                    for name in ("start", "target", "end")
+                )
+                found = measure_throughput(left, aims, ends, [row["completion_s"] for row in done])
+                if found is not None:
+                    yield {self.unit: who, "condition": condition, "throughput_bits_s": found.bits_s}
+
+    def _write_methods(self) -> str:
+        plan = self._experiment.plan
+        protocol, scenario = plan.protocol, next(iter(plan.scenarios.values()))
+        who = dict.fromkeys(row[self.unit] for row in self.rows)
+        delays = {
+            name: {
+                "delay_ms": round(
+                    float(np.mean([r["delay_ms"] for r in self.rows if r["condition"] == name])), 1
+                )
+            }
+            for name in protocol.conditions
+            if any(row["condition"] == name for row in self.rows)
+        }
+        control = dict(
+            flatten_table(json.loads(json.dumps(_plain(scenario.sites[protocol.users[0]].control))))
+        )
+        law = str(control.pop("law"))
+        pairs = {"pairs": len(who)} if self.unit == "pair" else {}
+        facts: dict[str, Any] = {
+            "participants": len(who) * len(protocol.users),
+            **pairs,
+            "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
+            "design": protocol.design,
+            "blocks": len(protocol.conditions),
+            "trials": protocol.trials,
+            "conditions": delays,
+            "law": law,
+            "rate_hz": scenario.sites[protocol.users[0]].rate_hz,
+            "gains": control,
+            "seeds": [protocol.seed],
+            "program": f"trilat-net {find_version()}",
+            "digest": plan.digest,
+            "measures": list(self.means),
+            "unit": self.unit,
+            "correction": "Holm",
+        }
+        return write_methods(facts)
+
+    def write(self, folder: Path) -> "ExperimentAnalysis":
+        """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
+        made = make_folder(folder)
+        write_whole(made / "conditions.csv", _encode_csv(self._list_means()), force=True)
+        write_whole(made / "comparisons.csv", _encode_csv(self.to_rows()), force=True)
+        write_whole(made / "methods.txt", self.methods + "\n", force=True)
+        write_whole(made / "analysis.json", json.dumps(self.to_dict(), indent=1) + "\n", force=True)
+        self.paths = [
+            made / name for name in ("conditions.csv", "comparisons.csv", "methods.txt", "analysis.json")
+        ]
+        for measure in self.means:
+            path = made / f"{measure}.png"
+            draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)
+            self.paths.append(path)
+        return self
+
+    def _list_means(self) -> list[dict[str, Any]]:
+        return [{"measure": name, **one._asdict()} for name, means in self.means.items() for one in means]
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row for each comparison."""
+        return [one._asdict() for found in self.comparisons.values() for one in found]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns it as `trilat experiment analyse --json`."""
+        facts = {"name": self._experiment.plan.protocol.name, "digest": self._experiment.plan.digest}
+        models = {}
+        if find_spec("statsmodels") is not None:
+            models = {name: fit_mixed_model(self.of(name), name)._asdict() for name in self.means}
+            for model in models.values():
+                model["effects"] = [effect._asdict() for effect in model["effects"]]
+        whole = {"conditions": self._list_means(), "comparisons": self.to_rows(), "mixed_models": models}
+        return {**facts, **whole, "methods": self.methods}
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text: a table of conditions and one of comparisons for each measure."""
+        for measure, means in self.means.items():
+            yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
+            rows = [(one.condition, str(one.number), f"{one.mean:.4g}", _span(one.interval)) for one in means]
+            yield TextTable(("condition", "n", "mean", "interval"), rows, align="lrrl")
+            yield ""
+            found = [
+                (
+                    f"{one.second} - {one.first}",
+                    _number(one.difference),
+                    _span(one.interval),
+                    _number(one.t),
+                    _number(one.p_holm),
+                    _number(one.d_z),
+                )
+                for one in self.comparisons[measure]
+            ]
+            heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
+            yield TextTable(heads, found, align="lrlrrr")
+            yield ""
+        yield self.methods
+
+
+def analyse_experiment(folder: str | Path, out: str | Path | None = None) -> ExperimentAnalysis:
+    """Returns the statistics of an experiment, written into its folder; `trilat experiment analyse`.
+
+    Args:
+        folder: of the experiment.
+        out: where tables and figures go; by default its folder `analysis`.
+
+    Raises:
+        UsageError: there is no experiment, or no trial is done.
+    """
+    experiment = open_experiment(folder)
+    return ExperimentAnalysis(experiment).write(experiment.folder / FOLDER if out is None else Path(out))
+
+
+def _plain(control: Any) -> Mapping[str, Any]:
+    import msgspec
+
+    plain: Mapping[str, Any] = msgspec.to_builtins(control)
+    return plain
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _span(interval: tuple[float, float] | None) -> str:
+    return "-" if interval is None else f"[{interval[0]:.4g}, {interval[1]:.4g}]"
+
+
+def _encode_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    stream = io.StringIO()
+    spans = ("interval", "bootstrap")
+    flat = [
+        {
+            key if key not in spans else f"{key}_{end}": (one if key not in spans else one and one[n])
+            for key, one in row.items()
+            for n, end in enumerate(("low", "high") if key in spans else ("",))
+        }
+        for row in rows
+    ]
+    writer = csv.DictWriter(stream, list(flat[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    return stream.getvalue()

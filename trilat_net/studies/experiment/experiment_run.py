@@ -1,0 +1,239 @@
+"""Runs an experiment in its folder: a verified log for each trial, the journal, and tables in the end.
+
+Invariant: a folder belongs to one plan, by its digest. A trial in the journal is never made again, and
+one that was interrupted is made anew, whole: nothing is there twice and nothing is lost, wherever it was
+killed. The tables are a function of the journal.
+"""
+
+import csv
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ...errors import UsageError
+from ...files import make_folder, make_results_folder, write_whole
+from ...reporting.result_text import Block, TextTable
+from ...results import Result
+from ...scenario import parse_scenario
+from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ..study_folder import RunJournal, build_resume_hint
+from .protocol import ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
+from .trial_run import TrialEntry, run_trial
+
+PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, TRIALS_FILE = (
+    "protocol.toml", "protocol.json", "trials.journal", "trials.csv",
+)  # fmt: skip
+LOGS = "logs"
+
+
+class ExperimentStatus(NamedTuple):
+    """How far an experiment is.
+
+    Attributes:
+        done: trials that are in the journal.
+        total: trials of the plan.
+        next: the first trial that is left; None: all are done.
+    """
+
+    done: int
+    total: int
+    next: PlannedTrial | None
+
+
+class Experiment(Result):
+    """An experiment in its folder.
+
+    Attributes:
+        folder: where it is.
+        plan: its protocol and trials.
+    """
+
+    def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
+        self.folder, self.plan = folder, plan
+        self._remedy = build_resume_hint("experiment", "run", str(folder))
+
+    def _open(self) -> RunJournal[TrialEntry]:
+        return RunJournal(self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy)
+
+    def read_entries(self) -> dict[int, TrialEntry]:
+        """Returns the trials that are done, by number."""
+        with self._open() as journal:
+            return {entry.cell: entry for entry in journal.done.values()}
+
+    def status(self) -> ExperimentStatus:
+        """Returns how far it is."""
+        done = self.read_entries()
+        left = (one for one in self.plan.trials if one.number not in done)
+        return ExperimentStatus(len(done), len(self.plan.trials), next(left, None))
+
+    def run(
+        self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
+    ) -> "Experiment":
+        """Makes the trials that are left, with synthetic participants, and writes the tables."""
+        logs, plan = make_folder(self.folder / LOGS), self.plan
+        with self._open() as journal:
+            done = {entry.cell for entry in journal.done.values()}
+            left = [one for one in plan.trials if one.number not in done]
+            texts = {name: scenario.text for name, scenario in plan.scenarios.items()}
+            tasks = [(plan.protocol, texts[one.condition], one, plan.digest, logs) for one in left]
+            with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
+                journal.complete(pool, run_trial, tasks, len(done), len(plan.trials), show)
+        self.write_tables()
+        return self
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row for each trial that is done, in the order of the plan."""
+        done, rows = self.read_entries(), []
+        for planned in self.plan.trials:
+            if (entry := done.get(planned.number)) is None:
+                continue
+            named = {"trial_number": planned.number, "pair" if len(planned.group) > 1 else "participant": ""}
+            named[list(named)[-1]] = "-".join(planned.group)
+            facts = {"condition": planned.condition, "block": planned.block, "trial": planned.trial}
+            kind = {"practice": int(planned.practice), "succeeded": int(entry.succeeded)}
+            log = {"log": f"{LOGS}/{planned.file}", "log_sha256": entry.sha256}
+            rows.append({**named, **facts, **kind, **entry.measures, **log})
+        return rows
+
+    def write_tables(self) -> Path:
+        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path."""
+        rows, stream = self.to_rows(), io.StringIO()
+        if rows:
+            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        write_whole(self.folder / TRIALS_FILE, stream.getvalue(), force=True)
+        return self.folder / TRIALS_FILE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns its plan and how far it is, as `trilat experiment status --json`."""
+        status, protocol = self.status(), self.plan.protocol
+        return {
+            "name": protocol.name,
+            "digest": self.plan.digest,
+            "folder": str(self.folder),
+            "groups": len(protocol.groups),
+            "conditions": list(protocol.conditions),
+            "trials": status.total,
+            "done": status.done,
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text: a row for each condition."""
+        status, rows = self.status(), [row for row in self.to_rows() if not row["practice"]]
+        yield f"{self.plan.protocol.name}: {status.done} of {status.total} trials, in {self.folder}"
+        table = []
+        for condition in self.plan.protocol.conditions:
+            of = [row for row in rows if row["condition"] == condition]
+            if of:
+                means = [sum(row[key] for row in of) / len(of) for key in _SHOWN]
+                table.append((condition, str(len(of)), *(f"{mean:.3g}" for mean in means)))
+        yield TextTable(("condition", "trials", *_SHOWN), table, align="l" + "r" * (1 + len(_SHOWN)))
+        if status.next is not None:
+            yield f"next: trial {status.next.number}, {', '.join(status.next.group)}, {status.next.condition}"
+
+
+_SHOWN = ("succeeded", "completion_s", "error_end_mm", "error_rms_mm", "path_m", "sparc")
+
+
+def new_experiment(file: str | Path, *, force: bool = False) -> Path:
+    """Writes a protocol with comments, which runs as it is; the command is `trilat experiment new`.
+
+    >>> tn.new_experiment("reaching.toml").name
+    'reaching.toml'
+
+    Raises:
+        UsageError: the file exists.
+    """
+    template = resources.files("trilat_net") / "scenarios" / "_experiment.txt"
+    write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
+    return Path(file)
+
+
+def check_experiment(file: str | Path) -> ExperimentPlan:
+    """Returns the plan of a protocol, if it can be carried out; the command is `trilat experiment check`.
+
+    >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
+    240
+
+    Raises:
+        UsageError: it cannot; the error names everything that is wrong.
+    """
+    return plan_experiment(read_protocol(file), Path(file).parent)
+
+
+def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
+    """Returns an experiment in a new folder; by default the next free runs/experiment-NAME-N."""
+    plan = check_experiment(file)
+    folder = make_results_folder(
+        None if out is None else Path(out), f"experiment-{plan.protocol.name}", force=None
+    )
+    write_whole(folder / PROTOCOL_FILE, Path(file).read_text(encoding="utf-8"))
+    texts = {name: scenario.text for name, scenario in plan.scenarios.items()}
+    trials = [{**one._asdict(), "log": f"{LOGS}/{one.file}"} for one in plan.trials]
+    protocol = msgspec.to_builtins(plan.protocol)
+    facts = {"digest": plan.digest, "protocol": protocol, "trials": trials, "scenarios": texts}
+    write_whole(folder / PLAN_FILE, json.dumps(facts, indent=1) + "\n")
+    return Experiment(folder, plan)
+
+
+def open_experiment(folder: str | Path) -> Experiment:
+    """Returns the experiment of a folder, as it was planned.
+
+    Raises:
+        UsageError: there is none, or its plan was changed.
+    """
+    path = Path(folder)
+    try:
+        facts = json.loads((path / PLAN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise UsageError(f"{path}: holds no experiment; `trilat experiment run FILE` begins one") from None
+    scenarios = {name: parse_scenario(text, str(path)) for name, text in facts["scenarios"].items()}
+    protocol = read_protocol(path / PROTOCOL_FILE)
+    plan = plan_experiment(protocol, scenarios=scenarios)
+    if plan.digest != facts["digest"]:
+        raise UsageError(f"{path}: its protocol was changed after it began: begin another experiment")
+    return Experiment(path, plan)
+
+
+def run_experiment(
+    source: str | Path,
+    out: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Callable[[int, int], None] = ignore_progress,
+) -> Experiment:
+    """Runs an experiment with synthetic participants; the command is `trilat experiment run`.
+
+    Args:
+        source: the protocol's file, or the folder of an experiment that was begun: it goes on.
+        out: the folder; by default the next free runs/experiment-NAME-N.
+        jobs: how many processes; None for one per core.
+        on: what runs the trials instead: a Dask scheduler's address or an executor.
+        progress: called with the trials done, and in all.
+
+    Raises:
+        UsageError: the protocol cannot be carried out, or the folder holds something else.
+    """
+    begun = open_experiment(source) if Path(source).is_dir() else begin_experiment(source, out)
+    return begun.run(jobs, progress, on)
+
+
+def list_log_problems(experiment: Experiment) -> Iterator[str]:
+    """Yields the trials that are done whose log is missing, or is not the one that they wrote."""
+    done = experiment.read_entries()
+    for planned in experiment.plan.trials:
+        entry, path = done.get(planned.number), experiment.folder / LOGS / planned.file
+        if entry is None:
+            continue
+        if not path.exists():
+            yield f"{path}: is missing"
+        elif hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
+            yield f"{path}: is not the log that the trial wrote"

@@ -1,0 +1,261 @@
+"""The protocol of an experiment with people, from one TOML file, and the trials that follow from it.
+
+Invariant: the plan is a function of the protocol. Its digest, over the protocol and the text of the scenario
+of every condition, stands in the log of every trial: what was planned before anybody sat down can be shown
+afterwards. A protocol that cannot be carried out is refused as a whole, with everything that is wrong.
+"""
+
+import hashlib
+import itertools
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta, field
+
+from ...errors import ScenarioError, TrilatError, UsageError
+from ...fields import Frozen
+from ...reporting.result_text import Block, TextTable
+from ...results import Result
+from ...scenario import Scenario, load_scenario
+from .synthetic_participant import ParticipantModel
+from .tasks import AnyTask, Reach
+
+Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
+Count = Annotated[int, Meta(ge=1, le=1000)]
+
+
+class Protocol(Frozen, frozen=True):
+    """An experiment, as its file has it.
+
+    Attributes:
+        name: of the experiment.
+        title: in words.
+        scenario: name or path of the scenario that all conditions are made of.
+        users: the sites that participants hold; two of them are held by a pair.
+        participants: how many, or their pseudonyms.
+        design: how the order of conditions is balanced over participants, see `order_conditions`.
+        trials: trials of a block that count; a block is all trials of one condition.
+        practice: trials before those, which do not.
+        foreperiod_s: range of the time from the begin of a trial until its target appears, s; drawn evenly.
+        seed: of orders, targets and synthetic participants.
+        set: keys of the scenario that are alike in all conditions.
+        conditions: the keys of the scenario that each sets, by name.
+        task: what a participant does.
+        model: the numbers of synthetic participants.
+    """
+
+    name: Name
+    scenario: str
+    conditions: dict[Name, dict[str, Any]]
+    set: dict[str, Any] = field(default_factory=dict)
+    title: str = ""
+    users: tuple[str, ...] = ("m1",)
+    participants: Count | tuple[str, ...] = 12
+    design: Literal["williams", "latin", "random", "fixed"] = "williams"
+    trials: Count = 10
+    practice: Annotated[int, Meta(ge=0, le=1000)] = 0
+    foreperiod_s: tuple[Wait, Wait] = (0.5, 1.0)
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 1
+    task: AnyTask = field(default_factory=Reach)
+    model: ParticipantModel = field(default_factory=ParticipantModel)
+
+    @property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Who takes part together: one participant, or a pair."""
+        names = self.participants
+        if isinstance(names, int):
+            names = tuple(f"P{n:0{len(str(self.participants))}d}" for n in range(1, names + 1))
+        size = len(self.users)
+        return [names[n : n + size] for n in range(0, len(names), size)]
+
+
+class PlannedTrial(NamedTuple):
+    """One trial of the plan.
+
+    Attributes:
+        number: its place in the experiment, from 1.
+        group: who takes part, by the users of the protocol.
+        condition: by name.
+        block: the how manyth condition of this group it is, from 1.
+        trial: its place in the block, from 1; practice comes first.
+        practice: whether it does not count.
+        before: how many trials the group has made before.
+        seed: of what is drawn in it.
+    """
+
+    number: int
+    group: tuple[str, ...]
+    condition: str
+    block: int
+    trial: int
+    practice: bool
+    before: int
+    seed: int
+
+    @property
+    def file(self) -> str:
+        """The name of its log."""
+        who = "-".join(self.group)
+        return f"{self.number:05d}-{who}-b{self.block}-t{self.trial:02d}-{self.condition}.mcap"
+
+
+@dataclass(frozen=True, repr=False)
+class ExperimentPlan(Result):
+    """A protocol, the scenario of every condition, and all trials in their order.
+
+    Attributes:
+        digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
+    """
+
+    protocol: Protocol
+    scenarios: Mapping[str, Scenario]
+    trials: Sequence[PlannedTrial]
+    digest: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns it as `trilat experiment check --json`."""
+        protocol = self.protocol
+        facts = {"name": protocol.name, "digest": self.digest, "groups": len(protocol.groups)}
+        counts = {"trials": len(self.trials), "counted": sum(not one.practice for one in self.trials)}
+        return {**facts, **counts, "conditions": list(protocol.conditions), "orders": self.list_orders()}
+
+    def list_orders(self) -> dict[str, list[str]]:
+        """Returns the order of conditions of each group, by its name."""
+        found: dict[str, list[str]] = {}
+        for trial in self.trials:
+            order = found.setdefault("-".join(trial.group), [])
+            if trial.condition not in order:
+                order.append(trial.condition)
+        return found
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text."""
+        protocol, facts = self.protocol, self.to_dict()
+        whose = "pairs" if len(protocol.users) > 1 else "participants"
+        yield f"{protocol.name}: {protocol.title or protocol.task.words}"
+        yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.words}"
+        each = f"{len(protocol.conditions)} conditions of {protocol.practice} + {protocol.trials} trials"
+        longest_s = protocol.foreperiod_s[1] + protocol.task.longest_s
+        yield f"{each}: {len(self.trials)} trials of at most {longest_s:g} s; design {protocol.design}"
+        yield TextTable(
+            ("", "order of conditions"), [(name, ", ".join(one)) for name, one in facts["orders"].items()]
+        )
+        yield f"sha256 of the plan {self.digest}"
+
+
+def read_protocol(file: str | Path) -> Protocol:
+    """Returns the protocol of a file.
+
+    Raises:
+        UsageError: it cannot be read, or a key or value of it is not valid.
+    """
+    path = Path(file)
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        return msgspec.convert(tables, Protocol)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: is no TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        valid = ", ".join(one.encode_name for one in msgspec.structs.fields(Protocol))
+        raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
+
+
+def plan_experiment(
+    protocol: Protocol, folder: Path | None = None, scenarios: Mapping[str, Scenario] | None = None
+) -> ExperimentPlan:
+    """Returns the plan of a protocol; a path of its scenario is from `folder`, or all `scenarios` are given.
+
+    Raises:
+        UsageError: it cannot be carried out; the error names everything that is wrong.
+    """
+    problems = list(_find_problems(protocol))
+    found = dict(scenarios or {})
+    source: str | Path = protocol.scenario
+    if folder is not None and (folder / protocol.scenario).is_file():
+        source = folder / protocol.scenario
+    for name, keys in protocol.conditions.items() if scenarios is None else ():
+        try:
+            found[name] = _prepare(load_scenario(source, {**protocol.set, **keys}), protocol)
+        except TrilatError as error:
+            problems.append(f"condition {name}: {error}")
+    if problems:
+        raise UsageError(f"{protocol.name}: " + "; ".join(problems))
+    texts = {name: scenario.text for name, scenario in found.items()}
+    whole = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
+    return ExperimentPlan(protocol, found, list(_list_trials(protocol)), hashlib.sha256(whole).hexdigest())
+
+
+def _find_problems(protocol: Protocol) -> Iterator[str]:
+    """Yields what no scenario is needed to see."""
+    size, names = len(protocol.users), [name for group in protocol.groups for name in group]
+    if protocol.foreperiod_s[0] > protocol.foreperiod_s[1]:
+        yield f"foreperiod_s is from the shorter to the longer time, not {list(protocol.foreperiod_s)}"
+    if len(set(names)) < len(names):
+        yield "two participants have one pseudonym"
+    if not 1 <= size <= 2 or len(set(protocol.users)) < size:
+        yield f"users are one or two sites, not {', '.join(protocol.users)}"
+    elif len(names) % size:
+        yield f"{len(names)} participants make no pairs: their number must be even"
+    rows = len(list_orders(protocol.design, list(protocol.conditions), protocol.seed))
+    if protocol.design in ("williams", "latin") and len(protocol.groups) % rows:
+        whose = "pairs" if size == 2 else "participants"
+        yield (
+            f"a {protocol.design} design of {len(protocol.conditions)} conditions has {rows} orders: the "
+            f"number of {whose} must be a multiple of {rows}, is {len(protocol.groups)}"
+        )
+
+
+def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
+    """Returns the scenario of a condition, if participants can hold its masters."""
+    for user in protocol.users:
+        if user not in scenario.names:
+            raise ScenarioError(f"has no site {user}; there are {', '.join(scenario.names)}", path="users")
+        if not any(getattr(hand, "is_open", False) for hand in scenario.sites[user].hands):
+            raise ScenarioError(
+                "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
+                path=f"sites.{user}.hands",
+            )
+    return scenario
+
+
+def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
+    """Returns the orders of conditions that participants get in turn.
+
+    Williams (1949): each condition is equally often at each place, and equally often right after each other
+    one; of an odd number of conditions there are twice as many orders. A cyclic Latin square balances places
+    alone. "random": every permutation, shuffled; "fixed": as written.
+    """
+    n = len(conditions)
+    if design == "fixed":
+        return [tuple(conditions)]
+    if design == "random":
+        random = np.random.default_rng(seed)
+        return [tuple(np.array(conditions)[random.permutation(n)].tolist()) for _ in range(1000)]
+    first = list(range(n))
+    if design == "williams":  # 0, 1, n - 1, 2, n - 2, ...
+        first = [0, *(place for k in range(1, n // 2 + 1) for place in dict.fromkeys((k, n - k)))][:n]
+    rows = [[(place + shift) % n for place in first] for shift in range(n)]
+    if design == "williams" and n % 2:
+        rows += [row[::-1] for row in rows]
+    return [tuple(conditions[place] for place in row) for row in rows]
+
+
+def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
+    orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
+    each = protocol.practice + protocol.trials
+    number = 0
+    for n, group in enumerate(protocol.groups):
+        for block, trial in itertools.product(range(len(protocol.conditions)), range(each)):
+            condition, number = orders[n % len(orders)][block], number + 1
+            drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
+            seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
+            before = block * each + trial
+            yield PlannedTrial(number, group, condition, block + 1, trial + 1, practice, before, seed)
