@@ -19,7 +19,7 @@ TOKEN_BYTES = 16
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What somebody may do, and what is shown to him.
+    """What somebody may do, and which view of the arms is shown.
 
     Attributes:
         kind: an experimenter may do everything, a user holds the arm of one site, a watcher does nothing.

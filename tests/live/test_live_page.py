@@ -141,6 +141,11 @@ def test_a_users_page_draws_what_its_site_has_in_use(count: int, stage: Stage) -
         take_hold(page, 0, 60.0, 10.0)
         shows(page, f"drawn.length >= {count}", 180.0)
         drawn = page.evaluate("drawn")
+        shows(page, "trilat.frame.sites.s.age_ms >= 300")
+        with page_client(page_address(running)) as experimenter:
+            experimenter.take()
+            experimenter.send(do="ages", shown=False)
+            shows(page, "!('age_ms' in trilat.frame.sites.s)")
         assert page.is_hidden("#plots")
         assert page.is_hidden("#side")
         assert page.is_hidden("#part")

@@ -105,3 +105,17 @@ def test_a_user_is_told_nothing_that_it_cannot_know(tmp_path: Path) -> None:
         assert frame["links"] == frame["shares"] == {}
         assert {*frame} == {"t", "sites", "links", "shares", "energy", "ended"}
     assert frames
+
+
+def test_bodies_at_a_peer_are_drawn_as_old_as_its_arm(tmp_path: Path) -> None:
+    plant = {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}
+    keys = {"sites.s.plant": plant, "duration_s": 1.5, "link.delay_ms": 300}
+    session = Session.whole(load_scenario("paper", keys), tmp_path)
+    frames: Frames = []
+    session.stranger(looking(frames, "m1"))
+    log = session.run()
+    for frame in frames:
+        known = frame["sites"]["s"]
+        there = [] if known["tick"] < 0 else log["s"].states[known["tick"]].bodies
+        assert known["bodies"] == np.round(there, 5).tolist()
+    assert len({str(frame["sites"]["s"]["bodies"]) for frame in frames}) > 20
