@@ -62,7 +62,7 @@ def live_session(folder: Path) -> Iterator[tuple[str, int]]:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     lines = iter(process.stdout)
-    address = next(found[1] for line in lines if (found := re.search(r"the page: (\S+)", line)))
+    address = next(found[1] for line in lines if (found := re.search(r"experimenter: (\S+)", line)))
     try:
         yield address, process.pid
     finally:

@@ -79,6 +79,12 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
     text: Annotated[str, Meta(min_length=1, max_length=80)]
 
 
+class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
+    """Users are to see how old what they see of their peers is, or no longer."""
+
+    shown: bool
+
+
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     """The page takes hold of an arm, moves what it holds, or lets go.
 
@@ -97,7 +103,16 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
 
 Order = SetLink | SetShares
 _DECODER = msgspec.json.Decoder(
-    Seen | TakePart | AnswerPage | StopArms | SetLink | SetShares | MoveHand | MarkMoment | EndSession
+    Seen
+    | TakePart
+    | AnswerPage
+    | StopArms
+    | SetLink
+    | SetShares
+    | ShowAges
+    | MoveHand
+    | MarkMoment
+    | EndSession
 )
 _RATES: dict[type[PageMessage], tuple[float, int]] = {
     PageMessage: (240.0, 480),
@@ -181,13 +196,17 @@ class PageHands:
 
 
 class OrderDesk:
-    """The orders of all pages to the sites; `replies` are the answers that nobody has read yet."""
+    """The orders of all pages to the sites.
+
+    Attributes:
+        replies: the answers that nobody has read yet: site, channel of the order, if it is accepted, text.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
         self._bus, self._clock, self._session = bus, clock, session
         self._waiting: dict[tuple[str, str], ChangeRequest] = {}
         self._open: dict[tuple[str, str], tuple[Inbox, int]] = {}
-        self.replies: list[tuple[str, bool, str]] = []
+        self.replies: list[tuple[str, str, bool, str]] = []
         self.refused: Counter[str] = Counter()
 
     def order(self, order: Order, sites: Collection[str], links: Collection[str]) -> None:
@@ -227,12 +246,12 @@ class OrderDesk:
                 del self._open[site, channel]
                 try:
                     reply = decode(answer[1], ChangeReply)
-                    self.replies.append((site, reply.accepted, reply.text))
+                    self.replies.append((site, channel, reply.accepted, reply.text))
                 except WireError as error:
                     self.refused[error.reason] += 1
             elif now_ns - asked_ns > REPLY_TIMEOUT_NS:
                 del self._open[site, channel]
-                self.replies.append((site, False, f"{site} does not answer"))
+                self.replies.append((site, channel, False, f"{site} does not answer"))
         for (site, what), request in list(self._waiting.items()):
             if (site, topics.SET) not in self._open:
                 del self._waiting[site, what]

@@ -4,16 +4,14 @@ It is an onlooker of a session that is started for it, or of one that runs alrea
 for it nor needs it, and runs on if it fails. A browser is opened only where there is one.
 
 Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
-page sees fewer frames and nobody waits for it. A page of another origin, without the token, with too many or
-too large messages is refused and counted; nothing of it reaches a site. One thread serves all pages and takes
-in the session's messages.
+page sees fewer frames and nobody waits for it. A page of another origin, without a token, with messages that
+are too many, too large or not of its role is refused and counted; nothing of it reaches a site. One thread
+serves all pages and takes in the session's messages.
 """
 
 import asyncio
-import hmac
 import logging
 import os
-import secrets
 import socket
 import sys
 import threading
@@ -25,7 +23,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import msgspec
 from websockets.asyncio.server import ServerConnection, serve
@@ -34,6 +32,7 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.http11 import Request, Response
 
 from trilat_net.errors import UsageError, WireError
+from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -51,10 +50,12 @@ from .page_orders import (
     Seen,
     SetLink,
     SetShares,
+    ShowAges,
     StopArms,
     TakePart,
     read_page_message,
 )
+from .page_roles import Role, RoleLinks
 from .session_frames import SessionFrames, show_event
 from .session_view import SessionView
 
@@ -136,15 +137,16 @@ class Page:
     """One connected page.
 
     Attributes:
+        role: what it may do, and as which site it is shown the arms.
         asks: the pages that it has asked whether it may take part, and when, ns.
         wake: set when there is a frame that it has not got.
         excess: how many messages it has sent that were too many.
     """
 
     def __init__(
-        self, connection: ServerConnection, number: int, hands: PageHands, *, takes_part: bool
+        self, connection: ServerConnection, number: int, role: Role, hands: PageHands, *, takes_part: bool
     ) -> None:
-        self.connection, self.number = connection, number
+        self.connection, self.number, self.role = connection, number, role
         self.hands, self.takes_part = hands, takes_part
         self.asks: tuple[set[Page], int] | None = None
         self.wake = asyncio.Event()
@@ -192,12 +194,12 @@ class PageServer:
     """Serves one session's page; a context, inside of which the server's thread runs.
 
     Args:
-        options: how it is served; at another address than this machine's it needs the token.
+        options: how it is served; at another address than this machine's links need their tokens.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
 
     Attributes:
-        address: where a browser finds the page, token included.
+        address: where a browser finds the page of an experimenter, token included.
         end_requested: set once a page has asked for the end.
     """
 
@@ -218,10 +220,13 @@ class PageServer:
         self._frames = SessionFrames(self.view)
         self._desk = OrderDesk(bus, clock, session)
         self.refused: Counter[str] = self._desk.refused
-        self._token = "" if options.host in LOOPBACK else secrets.token_urlsafe(16)
+        self._guarded = options.host not in LOOPBACK
+        self._links, self._told = RoleLinks(guarded=self._guarded), False
         self._files = _list_assets()
         self._pages: set[Page] = set()
         self._frame: dict[str, Any] | None = None
+        self._known: dict[str, dict[str, Any]] = {}
+        self._ages = True
         self._n = 0
         self._notices: list[dict[str, Any]] = []
         self.end_requested = threading.Event()
@@ -286,18 +291,31 @@ class PageServer:
         async with server, asyncio.TaskGroup() as tasks:
             self._pages.clear()
             self._port = server.sockets[0].getsockname()[1]
-            shown = f"[{self._host}]" if ":" in self._host else self._host
-            self.address = f"http://{shown}:{self._port}/" + (f"?token={self._token}" if self._token else "")
+            self.address = self._links.link(self._base, Role())
             self._ready.set()
             ticking = tasks.create_task(self._tick())
             await self._stop.wait()
             ticking.cancel()
 
+    @property
+    def _base(self) -> str:
+        return f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}/"
+
+    def _tell_links(self) -> None:
+        """Tells the links of the other roles at the terminal, once the scenario is known."""
+        if self._told or self.view.scenario is None:
+            return
+        self._told = True
+        users = [name for name, spec in self.view.scenario.sites.items() if spec.role == "master"]
+        for line in self._links.list_users(self._base, users):
+            self._say(line)
+
     async def _tick(self) -> None:
         """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
         while True:
             begun_ns = self._clock.monotonic_ns()
-            for step in (self._desk.poll, self.view.poll, self._settle_asked, self._make_frame):
+            polls = self._desk.poll, self.view.poll
+            for step in (*polls, self._tell_links, self._settle_asked, self._make_frame):
                 try:
                     step()
                 except Exception as error:
@@ -309,11 +327,13 @@ class PageServer:
 
     def _make_frame(self) -> None:
         self._n += 1
-        for site, accepted, text in self._desk.replies:
-            self._notices.append({"n": self._n, "site": site, "ok": accepted, "text": text})
+        for site, channel, accepted, text in self._desk.replies:
+            notice = {"n": self._n, "site": site, "of": channel, "ok": accepted, "text": text}
+            self._notices.append(notice)
         self._desk.replies.clear()
         del self._notices[:-20]
         self._frame = self._frames.make() or self._frame
+        self._known.clear()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answers a request for a file; None lets a socket open."""
@@ -350,24 +370,24 @@ class PageServer:
     def _problem_of(self, request: Request, query: str) -> str | None:
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
-        if not self._token and name not in LOOPBACK:
+        if not self._guarded and name not in LOOPBACK:
             return "foreign host"  # a name of somebody else's that leads here
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"http://{host}":
             return "foreign origin"
-        path = urlsplit(request.path).path
-        if self._token and path in ("/", "/index.html", "/socket"):
-            given = parse_qs(query).get("token", [""])[0]
-            if not hmac.compare_digest(given.encode(), self._token.encode()):
-                return "no token"
+        if urlsplit(request.path).path == "/socket" and self._links.find(query) is None:
+            return "no token"
         return None
 
     async def _attend(self, connection: ServerConnection) -> None:
         """Serves one page until it goes."""
+        assert connection.request is not None
+        role = self._links.find(urlsplit(connection.request.path).query)
+        assert role is not None  # or it would have been refused
         self._met += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
-        alone = not any(other.takes_part for other in self._pages)
-        page = Page(connection, self._met, hands, takes_part=alone)
+        alone = role.kind == "experimenter" and not any(one.takes_part for one in self._list_experimenters())
+        page = Page(connection, self._met, role, hands, takes_part=alone or role.kind == "user")
         self._pages.add(page)
         sending = asyncio.create_task(self._send(page))
         try:
@@ -405,7 +425,9 @@ class PageServer:
 
     def _obey(self, page: Page, message: PageMessage) -> None:
         view = self.view
-        if isinstance(message, Seen):
+        if not page.role.may(message):
+            self.refused["not of its role"] += 1
+        elif isinstance(message, Seen):
             page.drawn = min(message.n, page.sent)
             while page.unseen and page.unseen[0] <= page.drawn:
                 page.unseen.popleft()
@@ -423,6 +445,8 @@ class PageServer:
         elif isinstance(message, MarkMoment):
             if view.scenario is not None:
                 self._desk.mark(view.scenario.names[0], message.text)
+        elif isinstance(message, ShowAges):
+            self._ages = message.shown
         elif isinstance(message, MoveHand):
             self._move_hand(page, message)
         elif isinstance(message, EndSession) and self._ends:
@@ -434,9 +458,12 @@ class PageServer:
             page.takes_part, page.asks = False, None
             page.hands.release()
         elif not page.takes_part and page.asks is None:
-            holders = {other for other in self._pages - {page} if self._list_held(other)}
+            holders = {other for other in self._list_experimenters() - {page} if self._list_held(other)}
             page.asks = (holders, self._clock.monotonic_ns()) if holders else None
             page.takes_part = not holders
+
+    def _list_experimenters(self) -> set[Page]:
+        return {page for page in self._pages if page.role.kind == "experimenter"}
 
     def _let_take_part(self, page: Page, answer: AnswerPage) -> None:
         for other in self._pages:
@@ -477,20 +504,53 @@ class PageServer:
                 begins = self._frame is not None
                 if not begins and page.sent and self._n - page.sent < WAITING_FRAMES:
                     continue
+                scenario = self.view.scenario
+                if scenario is not None and page.role.site not in ("", *scenario.names):
+                    return await page.connection.close(_POLICY_VIOLATION, "the session has no such site")
                 page.notified, page.sent = page.sent, self._n
                 page.unseen.append(page.sent)
                 try:
-                    payload = encode(self._frame_for(page) if greeted and begins else self._greet())
+                    payload = encode(self._frame_for(page) if greeted and begins else self._greet(page.role))
                 except Exception as error:
                     self._count_failure("frame", error)
                     continue
                 greeted = begins
                 await page.connection.send(payload, text=True)
 
-    def _greet(self) -> dict[str, Any]:
-        return {"hello": {**self._frames.describe(), "n": self._n, "ends": self._ends}}
+    def _greet(self, role: Role) -> dict[str, Any]:
+        about = self._frames.describe_narrowed() if role.site else self._frames.describe()
+        ends = self._ends and role.kind == "experimenter"
+        return {"hello": {**about, "role": role.kind, "as": role.site, "n": self._n, "ends": ends}}
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
+        notices = [one for one in self._notices if one["n"] > page.notified]
+        if page.role.site:
+            shown = self._show_as(page.role.site)
+            notices = [one for one in notices if one["of"] == topics.STOP]
+        else:
+            shown = self._show_all(page)
+        return {
+            "n": self._n,
+            **shown,
+            "notices": notices,
+            "ages": self._ages,
+            "pages": len(self._pages),
+            "takes_part": page.takes_part,
+            "asks": page.asks is not None,
+            "asked": [one.number for one in self._pages if one.asks is not None and page in one.asks[0]],
+            "holds": self._list_held(page),
+            "refused": sum(self.refused.values()),
+        }
+
+    def _show_as(self, site: str) -> dict[str, Any]:
+        """Returns what a site knows at this frame."""
+        if site not in self._known:
+            assert self._frame is not None
+            self._known[site] = self._frames.narrow(self._frame, site, ages=self._ages)
+        return {**self._known[site], "points": [], "energies": [], "events": []}
+
+    def _show_all(self, page: Page) -> dict[str, Any]:
+        """Returns what is, and what has been added to plots and events since the page's last frame."""
         frames, view = self._frames, self.view
         first = page.points == 0 and page.energies == 0
         most = 100_000 if first else POINTS_PER_FRAME
@@ -502,20 +562,7 @@ class PageServer:
             frames.energies.count,
             view.events.count,
         )
-        return {
-            "n": self._n,
-            **(self._frame or {}),
-            "points": points,
-            "energies": energies,
-            "events": events,
-            "notices": [one for one in self._notices if one["n"] > page.notified],
-            "pages": len(self._pages),
-            "takes_part": page.takes_part,
-            "asks": page.asks is not None,
-            "asked": [one.number for one in self._pages if one.asks is not None and page in one.asks[0]],
-            "holds": self._list_held(page),
-            "refused": sum(self.refused.values()),
-        }
+        return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
 
 @contextmanager
@@ -536,7 +583,7 @@ def serve_page(
 ) -> Iterator[PageServer]:
     """Serves a page inside the block, and opens a browser at it."""
     with PageServer(bus, clock, session, options, ends=ends, say=say) as page:
-        say(f"the page: {page.address}")
+        say(f"experimenter: {page.address}")
         with suppress(OSError, webbrowser.Error):
             if options.opens and _has_browser():
                 webbrowser.open(page.address)

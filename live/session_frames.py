@@ -2,7 +2,8 @@
 
 Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next frame
 is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people by the transpose of
-the Jacobian, which near a singular pose gives the least force that explains the torque.
+the Jacobian, which near a singular pose gives the least force that explains the torque. A frame as one site
+knows the session shows of a peer nothing but the pose of the sample that the site's newest record has in use.
 """
 
 from contextlib import suppress
@@ -79,21 +80,27 @@ class ArmFrames:
             "law": type(self._spec.control).__struct_config__.tag,
         }
 
+    def pose(self, q: Array) -> Json:
+        """Returns the arm at its joints' coordinates q, shape (n,), rad."""
+        return {"points": _rounded(joint_positions_m(self._model, q[np.newaxis])[0]), "q": _rounded(q)}
+
+    def at_start(self) -> Json:
+        """Returns the arm as a scenario places it: before tick 0."""
+        return {**self.pose(np.array(self._spec.q0_rad, dtype=np.float64)), "tick": -1, "bodies": []}
+
     def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
         """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
         split = split_torque(own, self._scenario)
         last = slice(len(own.known) - 1, None)
         hand, wall = self._hand_force(own, split), self._wall_force(own, split)
         e, tau = np.linalg.norm(own.e, axis=1), np.abs(own.tau)
-        points = joint_positions_m(self._model, own.q[last])[0]
         if self._model.shares_pose:
             ghost = own.q_des[-1, :3][np.newaxis] / self._scale
         else:
             ghost = joint_positions_m(self._model, own.q_des[last])[0]
         now = {
-            "points": _rounded(points),
+            **self.pose(own.q[-1]),
             "ghost": _rounded(ghost),
-            "q": _rounded(own.q[-1]),
             "e": float(e[-1]),
             "tau": _rounded(own.tau[-1], 3),
             "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
@@ -147,6 +154,7 @@ class SessionFrames:
         self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
+        self._known: dict[tuple[str, str], Json] = {}
 
     def describe(self) -> Json:
         """Returns the session as a page needs it once: sites, links, columns of the plots."""
@@ -204,6 +212,48 @@ class SessionFrames:
             "dropped": sum(view.dropped.values()),
         }
 
+    def describe_narrowed(self) -> Json:
+        """Returns the session as a page needs it that shows it as one site knows it."""
+        about = self.describe()
+        hidden: Json = {"about": "", "links": {}, "shares": {}, "columns": []}
+        return {**about, **hidden} if about["running"] else about
+
+    def narrow(self, frame: Json, site: str, *, ages: bool) -> Json:
+        """Returns a frame as one site knows the session: its own arm now, its peers as it has them in use.
+
+        Args:
+            frame: the newest that `make` has returned.
+            site: whose knowledge it is.
+            ages: true: each peer has the age of what is shown, ms.
+        """
+        own = frame["sites"][site]
+        known = {name: self._find_known(own, site, name) for name in frame["sites"] if name != site}
+        if ages:
+            rates = {name: self._view.sites[name].window.rate_hz for name in known}
+            for name, peer in known.items():
+                age_ms = own["t"] * 1e3 - peer["tick"] * 1e3 / rates[name]
+                known[name] = {**peer, "age_ms": age_ms if peer["tick"] >= 0 else None}
+        sites = {name: known.get(name, own) for name in frame["sites"]}
+        return {
+            "t": own["t"],
+            "sites": sites,
+            "links": {},
+            "shares": {},
+            "energy": "",
+            "ended": frame["ended"],
+        }
+
+    def _find_known(self, own: Json, site: str, peer: str) -> Json:
+        """Returns a peer at the sample in use; while its record is not there, the one that was found last."""
+        known = self._known.get((site, peer)) or self._arms[peer].at_start()
+        used, other = own["used"].get(peer, -1), self._view.sites[peer]
+        if used != known["tick"] and other.window.knows(used):
+            q = other.window.rows(used, used).q[0]
+            bodies = _rounded(np.array(other.bodies.get(used, [])))
+            known = {**self._arms[peer].pose(q), "tick": used, "bodies": bodies}
+        self._known[site, peer] = known
+        return known
+
     def _site_now(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
         window, record, stats = site.window, site.record, site.stats
         assert record is not None
@@ -220,6 +270,7 @@ class SessionFrames:
             "new": newest > seen,
             "t": record.t_ns / NS_PER_S,
             "tick": record.tick,
+            "used": record.used,
             "mode": record.mode,
             "bodies": _rounded(np.array(record.bodies)),
             "alarm": None if alarm is None else alarm._asdict(),

@@ -13,6 +13,7 @@ import msgspec
 from recorder.backfill import GapRepair
 from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
 from trilat_net.analysis.certificate.running_energy import (
+    KEPT_S,
     EnergyCourse,
     RecordWindow,
     RunningEnergy,
@@ -70,6 +71,7 @@ class SiteView:
         record, stats: the newest; None before the first.
         holds_from: its first tick that was seen.
         holder: who took hold of its arm last.
+        bodies: poses of its plant's bodies by tick, as far back as the window reaches; {} without bodies.
         layout: of its records, if it may go on without a lost one of its peers; else None.
     """
 
@@ -82,6 +84,7 @@ class SiteView:
         self.hand = find_live_hand(scenario.sites[name].hands, is_open=True)
         self.reception, self.window = SiteReception(scenario, name, boot), window
         self.holder = ""
+        self.bodies: dict[int, list[float]] = {}
         self.dropped: Counter[str] = Counter()
         self.repair = GapRepair(bus, session, self.reception, self.dropped)
         self.record: State | None = None
@@ -243,6 +246,10 @@ class SessionView:
             if site.record is None or content.tick > site.record.tick:
                 site.record = content
             site.window.take(content)
+            if content.bodies:
+                site.bodies[content.tick] = content.bodies
+                while len(site.bodies) > KEPT_S * site.window.rate_hz:
+                    del site.bodies[next(iter(site.bodies))]
             for text in content.cmd:
                 self._change(name, text)
         elif isinstance(content, LinkStats):

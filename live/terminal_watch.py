@@ -125,7 +125,7 @@ def show_in_terminal(
                 desk.stop(watch.view.sites)
             desk.poll()
             while desk.replies:
-                display.say(desk.replies.pop(0)[2])
+                display.say(desk.replies.pop(0)[3])
             if display.due:
                 display.show(watch.title, watch.rows(), watch.alarms)
 

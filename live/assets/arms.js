@@ -98,9 +98,10 @@ class ArmCard {
     if (performance.now() < this.nextWords) return;
     this.nextWords = performance.now() + WORDS_MS;
     const size = (force) => Math.hypot(...force);
-    const parts = [["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
+    const parts = site.e === undefined ? [] : [["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
       ["hand", `${size(site.hand).toFixed(1)} N`, "more"]];
-    if (this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, ""]);
+    if (site.age_ms !== undefined) parts.push(["age", site.age_ms === null ? "–" : `${site.age_ms.toFixed(0)} ms`, ""]);
+    if (site.e !== undefined && this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, ""]);
     const text = parts.map(([key, value, kind]) => `<span class="${kind}">${key} <b>${value}</b></span>`).join("");
     if (text !== this.written) { this.written = text; this.foot.innerHTML = text; }
   }

@@ -1,12 +1,13 @@
 // People's hands: drag an end effector, a gamepad, or keys. What they ask for goes to the server at most sixty
-// times a second, and now and then while they rest, so that the site knows that they still hold.
+// times a second, and now and then while they rest, so that the site knows that they still hold. A user's page
+// holds its own arm alone.
 const EVERY_MS = 1000 / 60;
 const STILL_MS = 50;
 const REACH_PX = 34;
 
 export class Hands {
-  constructor(arms, hello, send, page) {
-    Object.assign(this, { arms, send, page, chosen: null, pads: [] });
+  constructor(arms, hello, send, page, stop) {
+    Object.assign(this, { arms, send, page, stop, own: arms.byName[hello.as], chosen: null, stopping: new Set() });
     for (const card of arms.cards) this.listen(card);
     addEventListener("keydown", (event) => this.key(event, true));
     addEventListener("keyup", (event) => this.key(event, false));
@@ -14,10 +15,11 @@ export class Hands {
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
     this.keys = new Set();
     addEventListener("gamepadconnected", () => { this.padded = true; });
+    if (this.own) this.choose(this.own);
     setInterval(() => this.beat(), EVERY_MS);
   }
 
-  can(card) { return this.page.takesPart && ["tip", "force"].includes(card.about.hand?.mode) && Boolean(card.project); }
+  can(card) { return this.page.takesPart && [undefined, card].includes(this.own) && ["tip", "force"].includes(card.about.hand?.mode) && Boolean(card.project); }
 
   goal(card) { // the target; for an arm that is pushed the force, as far as the pointer is from the tip
     const { hand, reach } = card.about;
@@ -141,11 +143,14 @@ export class Hands {
     card.hold.to = this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to);
   }
 
-  gamepads() { // asked for only once there is one; the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad
+  gamepads() { // asked for only once there is one; the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad; "select" stops every arm
     if (!this.padded) return;
     const pads = (navigator.getGamepads?.() || []).filter(Boolean);
     pads.forEach((pad, n) => {
-      const card = pads.length > 1 ? this.arms.cards[n] : this.chosen || this.arms.cards[0];
+      const select = Boolean(pad.buttons[8]?.pressed);
+      if (select && !this.stopping.has(pad.index)) this.stop();
+      this.stopping[select ? "add" : "delete"](pad.index);
+      const card = this.own ? this.own : pads.length > 1 ? this.arms.cards[n] : this.chosen || this.arms.cards[0];
       if (!card || !this.can(card)) return;
       const pressed = pad.buttons[0]?.pressed || (pad.buttons[7]?.value || 0) > 0.3;
       if (pressed && !card.hold && this.tip(card)) this.take(card, [...this.tip(card)], { pad: pad.index });

@@ -40,6 +40,8 @@ function begin(hello) {
   $("title").textContent = hello.title || "trilat live";
   $("session").textContent = `session ${hello.session}`;
   $("end").hidden = !hello.ends;
+  document.body.className = `${hello.role}${hello.as ? " as" : ""}`;
+  $("whose").textContent = hello.as ? `as ${hello.as} knows it: its own arm now, the others as received` : "as it is, without delay";
   document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
@@ -52,23 +54,22 @@ function begin(hello) {
   if (parts !== null) return;
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
-  const hands = new Hands(arms, hello, send, page);
-  parts = {
-    arms, hands, names,
-    network: new Network(hello, send, page),
-    plots: new Plots($("plots"), hello, page),
-    shares: new Shares($("shares"), $("share-rows"), hello, send, page),
-  };
+  const hands = new Hands(arms, hello, send, page, stop);
+  const network = hello.as ? null : new Network(hello, send, page); // what a site does not know is not on its user's page
+  const plots = hello.as ? null : new Plots($("plots"), hello, page);
+  const shares = hello.as ? null : new Shares($("shares"), $("share-rows"), hello, send, page);
+  parts = { arms, hands, names, network, plots, shares };
   page.parts = parts;
 }
 
 function take(frame) {
   if (parts === null) return;
+  for (const site of Object.values(frame.sites)) for (const key of ["ghost", "hand", "wall"]) site[key] ??= []; // not known of a peer
   page.frame = frame;
   page.frames += 1;
   if (page.takesPart !== frame.takes_part) {
     page.takesPart = frame.takes_part;
-    for (const control of document.querySelectorAll("#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end")) {
+    for (const control of document.querySelectorAll("#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages")) {
       control.disabled = !frame.takes_part;
     }
     $("part").setAttribute("aria-pressed", frame.takes_part);
@@ -91,10 +92,12 @@ function take(frame) {
   for (const { ok, text } of frame.notices) if (!ok) notice(text);
   if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
   events(frame.events);
-  parts.plots.take(frame);
+  parts.plots?.take(frame);
+  $("ages").checked = frame.ages;
   if (performance.now() < nextWords) return;
   nextWords = performance.now() + WORDS_MS;
   $("clock").textContent = `${frame.t.toFixed(1)} s`;
+  if (page.hello.as) return;
   const pages = frame.pages === 1 ? "1 page" : `${frame.pages} pages`;
   const late = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
   const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";
@@ -157,9 +160,9 @@ function draw() {
   parts.arms.draw(frame);
   turn = (turn + 1) % (busy > BUSY_MS ? 4 : 1); // where drawing is slow, arms come first
   if (turn === 0) {
-    parts.network.draw(frame);
-    parts.shares.draw(frame);
-    parts.plots.draw();
+    parts.network?.draw(frame);
+    parts.shares?.draw(frame);
+    parts.plots?.draw();
   }
   busy += 0.1 * (performance.now() - begun - busy);
   lag += 0.1 * (begun - asked - lag);
@@ -170,8 +173,10 @@ function draw() {
 
 function connect() {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
-  socket = new WebSocket(`${scheme}://${location.host}/socket${location.search}`);
-  socket.addEventListener("open", () => { pause = 500; });
+  const query = [location.search.slice(1), location.hash.slice(1)].filter(Boolean).join("&"); // the fragment is the token
+  let opened = false;
+  socket = new WebSocket(`${scheme}://${location.host}/socket?${query}`);
+  socket.addEventListener("open", () => { pause = 500; opened = true; });
   socket.addEventListener("message", ({ data }) => {
     const message = JSON.parse(data);
     if (message.hello) {
@@ -187,11 +192,16 @@ function connect() {
     state(page.frame?.ended ? "ended" : "not connected", page.frame?.ended ? "" : "bad");
     parts?.hands.letGo();
     if (code === 1008) return notice(`the server closed this page: ${reason}`, 1e9);
+    if (!opened) { // a browser does not say why
+      fetch(`/socket?${query}`).then(async (answer) => { if (answer.status === 403) notice(`the server refuses this link: ${await answer.text()}`); }, () => {});
+    }
     setTimeout(connect, pause);
     pause = Math.min(2 * pause, 8000);
   });
 }
 
+addEventListener("hashchange", () => location.reload()); // another link
+$("ages").addEventListener("change", () => send({ do: "ages", shown: $("ages").checked }));
 $("part").addEventListener("click", () => send({ do: "control", want: !page.takesPart }));
 for (const answer of ["yes", "no"]) {
   $(`ask-${answer}`).addEventListener("click", () => send({ do: "answer", page: page.asked[0], yes: answer === "yes" }));
@@ -209,6 +219,6 @@ $("mark").addEventListener("click", mark);
 $("mark-text").addEventListener("keydown", (event) => { if (event.key === "Enter") mark(); });
 addEventListener("keydown", (event) => {
   if (event.key === "Escape" && !event.repeat) stop();
-  if (!event.target.matches("input, select, textarea") && event.key.toLowerCase() === "m" && !event.ctrlKey && !event.metaKey) mark();
+  if (page.hello?.role === "experimenter" && !event.target.matches("input, select, textarea") && event.key.toLowerCase() === "m" && !event.ctrlKey && !event.metaKey) mark();
 });
 connect();

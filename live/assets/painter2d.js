@@ -4,7 +4,7 @@ import { css, siteColour } from "./arms.js";
 const EDGES = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4].map((n) => [0, 1, 2].map((axis) => 0.5 - ((n >> axis) & 1)));
 
 function bodyPoses(about, site) { // of each body of a plant: its box's edges, and where a point of the body is
-  return about.bodies.map((size, n) => {
+  return (site.bodies.length ? about.bodies : []).map((size, n) => {
     const [x, y, z, w, ...v] = site.bodies.slice(7 * n, 7 * n + 7);
     const cross = (a, b) => [0, 1, 2].map((i) => a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]);
     const at = (p) => {
@@ -54,7 +54,7 @@ export class PlainPainter {
     g.clearRect(0, 0, canvas.width, canvas.height);
     for (const { at, normal } of about.walls) this.wall(card, g, at, normal);
     const base = about.planar ? [0, 0] : [0, 0, 0];
-    if (about.task) {
+    if (about.task && site.ghost.length) {
       g.strokeStyle = css("--soft");
       g.lineWidth = 0.25 * thick;
       g.beginPath(); g.arc(...this.project(card, site.ghost[0]), 0.6 * thick, 0, 2 * Math.PI); g.stroke();

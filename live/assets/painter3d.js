@@ -120,13 +120,16 @@ class ArmScene {
     const wanted = site.ghost.map(vector);
     this.links.forEach((tube, n) => this.span(tube, points[n], points[n + 1]));
     this.joints.forEach((ball, n) => ball.position.copy(points[n]));
-    this.ghosts.forEach((tube, n) => this.span(tube, wanted[n], wanted[n + 1]));
+    this.goal.visible = wanted.length > 0; // of a peer nobody knows where it ought to be
+    this.ghosts.forEach((tube, n) => { if (wanted.length) this.span(tube, wanted[n], wanted[n + 1]); else tube.visible = false; });
     this.bodies.forEach((box, n) => {
+      box.visible = site.bodies.length > 0;
+      if (!box.visible) return;
       const [x, y, z, w, ...v] = site.bodies.slice(7 * n, 7 * n + 7);
       box.position.set(x, y, z);
       box.quaternion.set(...v, w);
     });
-    this.goal.position.copy(wanted[wanted.length - 1]);
+    if (wanted.length) this.goal.position.copy(wanted[wanted.length - 1]);
   }
 
   look(aspect) {

@@ -67,8 +67,12 @@ def browser_page(url: str, *, gl: bool = True, **options: Any) -> Iterator[Page]
 
 
 def page_address(process: Process) -> str:
-    process.prints("the page: ")
-    found = re.search(r"the page: (\S+)", process.text())
+    return role_address(process, "experimenter")
+
+
+def role_address(process: Process, role: str) -> str:
+    process.prints(f"{role}: ")
+    found = re.search(rf"{role}: (\S+)", process.text())
     assert found is not None
     return found[1]
 

@@ -13,9 +13,16 @@ from trilat_net.net.clock import SystemClock
 PATIENCE_S = 60.0
 
 
+def socket_address(link: str) -> str:
+    """Where the page of a link opens its socket, as `main.js` finds it."""
+    parts = urlsplit(link)
+    query = "&".join(filter(None, (parts.query, parts.fragment)))
+    return f"ws://{parts.netloc}/socket" + (f"?{query}" if query else "")
+
+
 @contextmanager
-def page_client(address: str) -> Iterator["PageClient"]:
-    with connect(f"ws://{urlsplit(address).netloc}/socket", max_size=None) as socket:
+def page_client(link: str) -> Iterator["PageClient"]:
+    with connect(socket_address(link), max_size=None) as socket:
         yield PageClient(socket)
 
 

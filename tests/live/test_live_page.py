@@ -12,6 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from tests.net.waiting import until
+from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.log.log_reader import Log, open_log
 
@@ -21,10 +22,12 @@ from .browsers import (
     launch,
     needs_browser,
     page_address,
+    role_address,
     shows,
     take_hold,
     tip_px,
 )
+from .page_client import page_client
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
 pytestmark = needs_browser
@@ -114,6 +117,51 @@ def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
         assert page.evaluate("scrollY") == 0  # the page does not scroll under a finger that leads an arm
     running.signal(signal.SIGINT)
     running.prints("checking the log")
+
+
+KEEP_DRAWN = """
+const arms = trilat.parts.arms, draw = arms.draw.bind(arms);
+window.drawn = [];
+arms.draw = (frame) => {
+  draw(frame);
+  const shown = Object.entries(frame.sites).map(([name, { tick, points }]) => [name, [tick, points]]);
+  drawn.push(Object.fromEntries(shown));
+};
+drawn.length;
+"""
+
+
+@pytest.mark.parametrize("count", [150, pytest.param(1000, marks=pytest.mark.long)])
+def test_a_users_page_draws_what_its_site_has_in_use(count: int, stage: Stage) -> None:
+    """At 300 ms, while the user moves: every frame that the browser draws, held against the log."""
+    running = live(stage, "play", "--set", "rate_hz=250", "--set", "link.delay_ms=300")
+    with browser_page(role_address(running, "user m1"), gl=False) as page:
+        shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
+        page.evaluate(KEEP_DRAWN)
+        take_hold(page, 0, 60.0, 10.0)
+        shows(page, f"drawn.length >= {count}", 180.0)
+        drawn = page.evaluate("drawn")
+        shows(page, "trilat.frame.sites.s.age_ms >= 300")
+        with page_client(page_address(running)) as experimenter:
+            experimenter.take()
+            experimenter.send(do="ages", shown=False)
+            shows(page, "!('age_ms' in trilat.frame.sites.s)")
+        assert page.is_hidden("#plots")
+        assert page.is_hidden("#side")
+        assert page.is_hidden("#part")
+        assert "as m1 knows it" in page.inner_text("#whose")
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
+    log = open_log(stage.folder / "out" / "run.mcap")
+    ages = []
+    for frame in drawn:
+        own = frame["m1"][0]
+        for name, (tick, points) in frame.items():
+            assert tick == (own if name == "m1" else log["m1"].states[own].used[name])
+            q = np.array([log[name].states[tick].q])
+            assert points == np.round(joint_positions_m(log.scenario.arms[name], q)[0], 5).tolist()
+        ages.append(own - frame["s"][0])
+    assert min(ages) >= 75  # 300 ms of 250 ticks a second
 
 
 PAD = """
@@ -267,3 +315,37 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
     assert "*** s STOPPED" in running.text()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("who", "way"),
+    [
+        ("user m1", "key"),
+        ("user m2", "pad"),
+        ("watcher", "finger"),
+        ("watcher", "key"),
+        ("experimenter", "pad"),
+    ],
+)
+def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
+    running = live(stage, "play", "--set", "rate_hz=250")
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    link = role_address(running, who)
+    with browser_page(link, gl=False, **(phone if way == "finger" else {})) as page:
+        shows(page, "trilat.frame && trilat.frame.t > 1")
+        if way == "key":
+            page.keyboard.press("Escape")
+        elif way == "pad":
+            page.evaluate(PAD)
+            page.evaluate("dispatchEvent(new Event('gamepadconnected')); pad.buttons[8].pressed = true")
+        else:
+            box = page.locator("#stop").bounding_box()
+            assert box is not None
+            assert min(box["height"], box["width"]) >= 44.0
+            assert 844.0 - 20.0 <= box["y"] + box["height"] <= 844.0
+            page.tap("#stop")
+        with page_client(page_address(running)) as watching:
+            watching.shows("stopped")
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")

@@ -16,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
 from live.page_server import MOST_EXCESS, PageOptions, PageServer
 from tests.cli.running import trilat
+from tests.live.page_client import socket_address
 from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
@@ -23,6 +24,7 @@ from trilat_net.net.clock import SystemClock
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.scenario import load_scenario
 
 
 @pytest.fixture
@@ -36,11 +38,8 @@ def server(network: LocalNetwork) -> Iterator[PageServer]:
         yield made
 
 
-def socket(server: PageServer, origin: str | None = None, host: str | None = None) -> ClientConnection:
-    address = urlsplit(server.address)
-    there = f"ws://{address.netloc}/socket?{address.query}"
-    headers = {} if host is None else {"Host": host}
-    return connect(there, origin=origin, additional_headers=headers, max_size=None)
+def socket(server: PageServer, origin: str | None = None, link: str = "") -> ClientConnection:
+    return connect(socket_address(link or server.address), origin=origin, max_size=None)
 
 
 def get(server: PageServer, path: str, **headers: str) -> tuple[int, str, bytes]:
@@ -120,12 +119,14 @@ def test_another_address_than_loopback_demands_insecure_and_a_token(network: Loc
         PageOptions(host="0.0.0.0").check()
     PageOptions(host="0.0.0.0", insecure=True).check()
     with PageServer(network.join(), SystemClock(), "s1", PageOptions(host="0.0.0.0")) as server:
-        token = urlsplit(server.address).query
+        token = urlsplit(server.address).fragment
         assert len(token) > len("token=") + 20
-        for query in ("", "?token=", "?token=guess", f"?{token}x"):
-            assert get(server, f"/{query}")[0] == 403
-        assert get(server, f"/?{token}")[0] == 200
-        assert server.refused["no token"] == 4
+        for query in ("", "?token=", "?token=guess", f"?{token}x", "?token=%C3%A9", f"?as=m1&{token}x"):
+            assert get(server, f"/socket{query}")[0] == 403
+        assert server.refused["no token"] == 6
+        with socket(server) as page:
+            assert "hello" in hears(page)
+        assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
 
 
 @pytest.mark.parametrize(
@@ -335,3 +336,104 @@ def reached(server: PageServer) -> bool:
     with contextlib.suppress(OSError):
         return get(server, "/")[0] == 200
     return False
+
+
+ORDERS = [
+    '{"do":"link","link":"m1->s","to":{"delay_ms":1}}',
+    '{"do":"shares","site":"s","to":{"m1":1.0}}',
+    '{"do":"mark","text":"a"}',
+    '{"do":"control","want":true}',
+    '{"do":"answer","page":1,"yes":true}',
+    '{"do":"ages","shown":false}',
+    '{"do":"end"}',
+    '{"do":"hand","site":"m2","grip":true,"to":[1.0,0.5]}',
+]
+"""What no user of m1 may ask for; nor may a watcher, who may not hold m1 either."""
+OWN_HAND = '{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}'
+
+
+def told_links(server: PageServer, said: list[str]) -> dict[str, str]:
+    server.view.scenario = load_scenario("paper")
+    until(lambda: len(said) == 3)
+    return dict(line.split(": ", 1) for line in [*said, f"experimenter: {server.address}"])
+
+
+@pytest.fixture(params=[PageOptions(), PageOptions(host="0.0.0.0", insecure=True)], ids=["open", "tokens"])
+def roles(
+    network: LocalNetwork, request: pytest.FixtureRequest
+) -> Iterator[tuple[PageServer, dict[str, str]]]:
+    said: list[str] = []
+    options: PageOptions = request.param
+    with PageServer(network.join(), SystemClock(), "s1", options, ends=True, say=said.append) as made:
+        yield made, told_links(made, said)
+
+
+def test_each_role_has_a_link_that_says_who_it_is(roles: tuple[PageServer, dict[str, str]]) -> None:
+    server, links = roles
+    assert list(links) == ["user m1", "user m2", "watcher", "experimenter"]
+    seen = {}
+    for who, link in links.items():
+        with socket(server, link=link) as page:
+            hello = hears(page)["hello"]
+            assert isinstance(hello, dict)
+            seen[who] = hello["role"], hello["as"], hello["ends"]
+    assert seen == {
+        "user m1": ("user", "m1", False),
+        "user m2": ("user", "m2", False),
+        "watcher": ("watcher", "", False),
+        "experimenter": ("experimenter", "", True),
+    }
+
+
+@pytest.mark.parametrize("who", ["user m1", "watcher"])
+def test_users_and_watchers_give_no_orders_but_stop(
+    roles: tuple[PageServer, dict[str, str]], who: str, network: LocalNetwork
+) -> None:
+    server, links = roles
+    stops, changes = (network.join().questions(f"trilat/s1/s/{kind}") for kind in ("stop", "set"))
+    with socket(server, link=links[who]) as page:
+        server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
+        for order in ORDERS:
+            page.send(order)
+        until(lambda: server.refused["not of its role"] == len(ORDERS))
+        page.send(OWN_HAND)  # there is no m1 here: what may be sent reaches nobody
+        until(lambda: server.refused.total() == len(ORDERS) + 1)
+        assert server.refused["nobody can hold it"] == (who == "user m1")
+        page.send('{"do":"stop"}')
+        query = until(stops.poll)
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop")
+    assert changes.poll() is None
+    assert not server.end_requested.is_set()
+
+
+def test_a_users_token_opens_no_other_view() -> None:
+    said: list[str] = []
+    guarded = PageOptions(host="0.0.0.0", insecure=True)
+    with PageServer(LocalNetwork().join(), SystemClock(), "s1", guarded, say=said.append) as server:
+        links = told_links(server, said)
+        token = urlsplit(links["user m1"]).fragment
+        for query in ("", "?as=m2", "?as=s", "?as=", "?watch", "?watch&as=m2"):
+            with pytest.raises(InvalidStatus, match="403"):
+                socket(server, link=f"{links['user m1'].partition('?')[0]}{query}#{token}")
+        watching = urlsplit(links["watcher"]).fragment
+        with socket(server, link=f"{links['watcher'].partition('?')[0]}#{watching}") as page:
+            assert '"role":"watcher"' in str(page.recv(timeout=5))  # without the word too
+    assert server.refused["no token"] == 6
+
+
+def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
+    """Nobody asks a user, and a user asks nobody."""
+    with PageServer(network.join(), SystemClock(), "s1") as server:
+        with socket(server, link=server.address + "?as=m1") as user, socket(server) as page:
+            hears(user), hears(page)
+            until(lambda: len(server._pages) == 2)
+            taking = {one.role.kind: one.takes_part for one in server._pages}
+        assert taking == {"user": True, "experimenter": True}
+
+
+def test_a_page_as_no_site_of_the_session_is_closed(server: PageServer) -> None:
+    server.view.scenario = load_scenario("paper")
+    with socket(server, link=server.address + "?as=m9") as page, pytest.raises(ConnectionClosed) as closed:
+        hears(page)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.reason == "the session has no such site"
