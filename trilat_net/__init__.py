@@ -68,6 +68,7 @@ if _TYPE_CHECKING:
     from .scenario.skeletons import new_plant as new_plant
     from .studies.arm_gains import tune_arm as tune_arm
     from .studies.experiment.experiment_analysis import analyse_experiment as analyse_experiment
+    from .studies.experiment.experiment_analysis import compute_experiment_power as compute_experiment_power
     from .studies.experiment.experiment_run import check_experiment as check_experiment
     from .studies.experiment.experiment_run import new_experiment as new_experiment
     from .studies.experiment.experiment_run import open_experiment as open_experiment
@@ -101,7 +102,7 @@ _NAMES = {
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
     "trilat_net.studies.arm_gains": "tune_arm",
-    "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment",
+    "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment compute_experiment_power",
     "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment open_experiment "
     "run_experiment",
     "trilat_net.studies.trials": "check trials",

@@ -23,6 +23,7 @@ NO_RESULT = {
     ),  # run until they end
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
     *(f"trilat new {kind}" for kind in ("law", "hand", "plant")),
+    "trilat experiment new",
     *(f"trilat {name}" for name in ("scenario show", "scenario new", "keys new", "keys pair")),  # files
 }
 """Commands that print what they do, and find nothing."""

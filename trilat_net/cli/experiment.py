@@ -67,6 +67,19 @@ def experiment_analyse_command(
     terminal.print_paths([] if as_json else found.paths)
 
 
+@options.command("0.8 --participants 16")
+def experiment_power_command(
+    effect: Annotated[float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)],
+    participants: Annotated[int | None, value("--participants", "N", "How many there are.", min=2)] = None,
+    seed: Annotated[int, value("--seed", "S", "Of the experiments that are drawn.")] = 1,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Tells how many participants it takes to find an effect, by theory and by drawn experiments."""
+    from ..studies.experiment.experiment_analysis import compute_experiment_power
+
+    terminal.print_result(compute_experiment_power(effect, participants, seed=seed), as_json=as_json)
+
+
 @options.command("runs/experiment-reaching-001")
 def experiment_status_command(folder: FolderArgument, as_json: options.JsonOption = False) -> None:
     """Prints how far an experiment is, and whether its logs are those that its trials wrote."""

@@ -28,7 +28,10 @@ from .statistics import (
     ConditionMean,
     Row,
     compare_conditions,
+    find_least_number,
     fit_mixed_model,
+    power,
+    simulate_power,
     summarise_conditions,
     write_methods,
 )
@@ -189,6 +192,10 @@ class ExperimentAnalysis(Result):
 def analyse_experiment(folder: str | Path, out: str | Path | None = None) -> ExperimentAnalysis:
     """Returns the statistics of an experiment, written into its folder; `trilat experiment analyse`.
 
+    >>> found = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
+    >>> found.means["completion_s"][0].interval  # doctest: +SKIP
+    (3.06, 3.22)
+
     Args:
         folder: of the experiment.
         out: where tables and figures go; by default its folder `analysis`.
@@ -198,6 +205,68 @@ def analyse_experiment(folder: str | Path, out: str | Path | None = None) -> Exp
     """
     experiment = open_experiment(folder)
     return ExperimentAnalysis(experiment).write(experiment.folder / FOLDER if out is None else Path(out))
+
+
+class PowerOfExperiment(Result):
+    """How many participants an effect needs.
+
+    Attributes:
+        d_z: the effect, mean over standard deviation of the differences within participants.
+        least: the least number of participants by the power that is wanted.
+        participants: how many there are to be; None: it is not asked.
+        power: with so many, by the noncentral t.
+        simulated: the same by drawn experiments, with its 95 % interval.
+    """
+
+    def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
+        self.d_z, self.participants = d_z, participants
+        self.least = {wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)}
+        self.power = self.simulated = None
+        if participants is not None:
+            means, deviation = {"first": 0.0, "second": d_z}, 0.5**0.5
+            self.power = power(d_z, participants)
+            (self.simulated,) = simulate_power(means, participants, trial_deviation=deviation, seed=seed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns it as `trilat experiment power --json`."""
+        drawn = None if self.simulated is None else self.simulated._asdict()
+        least = {f"{wanted:g}": number for wanted, number in self.least.items()}
+        return {
+            "d_z": self.d_z,
+            "least": least,
+            "participants": self.participants,
+            "power": self.power,
+            "simulated": drawn,
+        }
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields its text."""
+        yield f"paired comparison of two conditions, two-sided, alpha 0.05, effect d_z {self.d_z:g}"
+        yield TextTable(
+            ("power", "participants"), [(f"{p:g}", str(n)) for p, n in self.least.items()], align="rr"
+        )
+        if self.power is not None and self.simulated is not None:
+            drawn = f"{self.simulated.found:.3f} {_span(self.simulated.interval)} of 500 drawn experiments"
+            yield f"with {self.participants} participants: power {self.power:.3f}; found in {drawn}"
+
+
+def compute_experiment_power(
+    effect: float, participants: int | None = None, *, seed: int = 1
+) -> PowerOfExperiment:
+    """Returns how many participants an effect needs; the command is `trilat experiment power`.
+
+    >>> tn.compute_experiment_power(0.5).least[0.8]
+    34
+
+    Args:
+        effect: mean over standard deviation of the differences within participants, Cohen's d_z.
+        participants: how many there are to be, of whom the power is told and simulated.
+        seed: of the experiments that are drawn.
+
+    Raises:
+        UsageError: the effect is too small to be found.
+    """
+    return PowerOfExperiment(effect, participants, seed)
 
 
 def _plain(control: Any) -> Mapping[str, Any]:

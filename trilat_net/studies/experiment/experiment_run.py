@@ -184,7 +184,10 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder, as it was planned.
+    """Returns the experiment of a folder, as it was planned; the command is `trilat experiment status`.
+
+    >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
+    240
 
     Raises:
         UsageError: there is none, or its plan was changed.
@@ -211,6 +214,9 @@ def run_experiment(
     progress: Callable[[int, int], None] = ignore_progress,
 ) -> Experiment:
     """Runs an experiment with synthetic participants; the command is `trilat experiment run`.
+
+    >>> done = tn.run_experiment(tn.new_experiment("reaching.toml"), "reaching")  # doctest: +SKIP
+    >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:
         source: the protocol's file, or the folder of an experiment that was begun: it goes on.

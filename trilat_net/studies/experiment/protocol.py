@@ -23,7 +23,7 @@ from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
 from .synthetic_participant import ParticipantModel
-from .tasks import AnyTask, Reach
+from .tasks import AnyTask, ReachTrial
 
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
@@ -62,7 +62,7 @@ class Protocol(Frozen, frozen=True):
     practice: Annotated[int, Meta(ge=0, le=1000)] = 0
     foreperiod_s: tuple[Wait, Wait] = (0.5, 1.0)
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 1
-    task: AnyTask = field(default_factory=Reach)
+    task: AnyTask = field(default_factory=ReachTrial)
     model: ParticipantModel = field(default_factory=ParticipantModel)
 
     @property

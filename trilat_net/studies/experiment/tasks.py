@@ -81,7 +81,7 @@ class Outcome(NamedTuple):
     ended_s: float
 
 
-class Reach(TrialTask, frozen=True, tag="reach"):
+class ReachTrial(TrialTask, frozen=True, tag="reach"):
     """Targets on a ring about the start, in the order of ISO 9241-411: each across from the one before.
 
     Attributes:
@@ -115,7 +115,7 @@ class Reach(TrialTask, frozen=True, tag="reach"):
 
 
 class _ReachGoal(TrialGoal):
-    def __init__(self, task: Reach, start_m: Array, target_m: Array) -> None:
+    def __init__(self, task: ReachTrial, start_m: Array, target_m: Array) -> None:
         super().__init__(start_m, task.width_m)
         self._task, self._target_m, self._inside_s = task, target_m, math.inf
 
@@ -130,7 +130,7 @@ class _ReachGoal(TrialGoal):
         return Outcome(False, t_s) if t_s >= self.appears_s + self._task.timeout_s else None
 
 
-class Track(TrialTask, frozen=True, tag="track"):
+class TrackTrial(TrialTask, frozen=True, tag="track"):
     """A path of sines of unlike frequencies along one axis, which nobody can foresee.
 
     Attributes:
@@ -163,7 +163,7 @@ class Track(TrialTask, frozen=True, tag="track"):
 class _TrackGoal(TrialGoal):
     moves = True
 
-    def __init__(self, task: Track, start_m: Array, phases: Array) -> None:
+    def __init__(self, task: TrackTrial, start_m: Array, phases: Array) -> None:
         super().__init__(start_m, task.width_m)
         self._task, self._phases = task, phases
 
@@ -178,7 +178,7 @@ class _TrackGoal(TrialGoal):
         return Outcome(True, t_s) if t_s >= self.appears_s + self._task.duration_s else None
 
 
-AnyTask = Reach | Track
+AnyTask = ReachTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
