@@ -57,12 +57,17 @@ def experiment_run_command(
 def experiment_analyse_command(
     folder: FolderArgument,
     out: Annotated[Path | None, value("--out -o", "DIR", "Default: its folder analysis.")] = None,
+    exclude: Annotated[
+        list[str] | None,
+        value("--exclude", "WHO=WHY", "Leave out a participant or pair, and say why; repeatable."),
+    ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Compares the conditions of an experiment: tables, figures, a paragraph for a paper."""
     from ..studies.experiment.experiment_analysis import analyse_experiment
 
-    found = analyse_experiment(folder, out)
+    left_out = dict(entry.partition("=")[::2] for entry in exclude or [])
+    found = analyse_experiment(folder, out, exclude=left_out)
     terminal.print_result(found, as_json=as_json)
     terminal.print_paths([] if as_json else found.paths)
 

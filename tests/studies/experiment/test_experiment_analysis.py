@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.experiment_run import begin_experiment
 
@@ -45,6 +46,8 @@ def test_everything_is_written_and_named(folder: Path, tmp_path: Path) -> None:
     assert all(path.exists() for path in found.paths)
     assert (tmp_path / "there" / "completion_s.png").read_bytes().startswith(b"\x89PNG")
     facts = json.loads((tmp_path / "there" / "analysis.json").read_text(encoding="utf-8"))
+    assert is_documented("experiment analyse", {**facts, "mixed_models": {}})
+    assert is_documented("experiment power", tn.compute_experiment_power(0.5).to_dict())
     assert facts["digest"] == tn.open_experiment(folder).plan.digest
     with (tmp_path / "there" / "comparisons.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -59,6 +62,16 @@ def test_methods_paragraph_has_delays_as_measured(folder: Path) -> None:
     assert "far (delay 200 ms)" in found.methods
     assert tn.open_experiment(folder).plan.digest in found.methods
     assert found.methods in found.summary()
+
+
+def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -> None:
+    found = tn.analyse_experiment(folder, tmp_path / "there", exclude={"P2": "stopped in block 2"})
+    assert found.methods.startswith(
+        "The data of 1 participants were analysed; 1 more were excluded (P2: stopped in block 2)."
+    )
+    assert {row["participant"] for row in found.rows} == {"P1"}
+    with pytest.raises(UsageError, match="there is no participant P9: there are P1, P2"):
+        tn.analyse_experiment(folder, tmp_path / "other", exclude={"P9": ""})
 
 
 def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment, list_log_problems
 from trilat_net.studies.experiment.tasks import place_slave
@@ -61,6 +62,8 @@ def test_tables_are_tidy(done: Experiment) -> None:
     assert all(float(row["completion_s"]) > 0.2 for row in rows)
     assert done.to_frame().shape[0] == 8
     assert "8 of 8 trials" in done.summary()
+    assert is_documented("experiment run", done.to_dict())
+    assert is_documented("experiment check", done.plan.to_dict())
 
 
 def test_delay_makes_reaching_slower(done: Experiment) -> None:

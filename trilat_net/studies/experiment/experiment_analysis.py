@@ -55,11 +55,17 @@ class ExperimentAnalysis(Result):
         paths: the files that were written.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
-        self._experiment, protocol = experiment, experiment.plan.protocol
+    def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
+        self._experiment, self._exclude, protocol = experiment, exclude, experiment.plan.protocol
         self.unit = "pair" if len(protocol.users) > 1 else "participant"
         order = list(protocol.conditions).index
-        counted = [row for row in experiment.to_rows() if not row["practice"]]
+        who = {"-".join(group) for group in protocol.groups}
+        if unknown := sorted(exclude.keys() - who):
+            raise UsageError(
+                f"there is no {self.unit} {', '.join(unknown)}: there are {', '.join(sorted(who))}"
+            )
+        kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
+        counted = [row for row in kept if not row["practice"]]
         self.rows = sorted(counted, key=lambda row: order(row["condition"]))
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
@@ -111,10 +117,12 @@ class ExperimentAnalysis(Result):
         )
         law = str(control.pop("law"))
         pairs = {"pairs": len(who)} if self.unit == "pair" else {}
+        reasons = ", ".join(f"{name}: {why}" if why else name for name, why in self._exclude.items())
         facts: dict[str, Any] = {
             "participants": len(who) * len(protocol.users),
             **pairs,
             "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
+            **({"exclusions": reasons} if reasons else {}),
             "design": protocol.design,
             "blocks": len(protocol.conditions),
             "trials": protocol.trials,
@@ -189,7 +197,12 @@ class ExperimentAnalysis(Result):
         yield self.methods
 
 
-def analyse_experiment(folder: str | Path, out: str | Path | None = None) -> ExperimentAnalysis:
+def analyse_experiment(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    exclude: Mapping[str, str] = {},
+) -> ExperimentAnalysis:
     """Returns the statistics of an experiment, written into its folder; `trilat experiment analyse`.
 
     >>> found = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
@@ -199,12 +212,15 @@ def analyse_experiment(folder: str | Path, out: str | Path | None = None) -> Exp
     Args:
         folder: of the experiment.
         out: where tables and figures go; by default its folder `analysis`.
+        exclude: participants or pairs whose data do not count, with the reasons.
 
     Raises:
-        UsageError: there is no experiment, or no trial is done.
+        UsageError: there is no experiment, no trial is done, or nobody is called what is excluded.
     """
     experiment = open_experiment(folder)
-    return ExperimentAnalysis(experiment).write(experiment.folder / FOLDER if out is None else Path(out))
+    return ExperimentAnalysis(experiment, exclude).write(
+        experiment.folder / FOLDER if out is None else Path(out)
+    )
 
 
 class PowerOfExperiment(Result):
@@ -230,7 +246,7 @@ class PowerOfExperiment(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat experiment power --json`."""
         drawn = None if self.simulated is None else self.simulated._asdict()
-        least = {f"{wanted:g}": number for wanted, number in self.least.items()}
+        least = [{"power": wanted, "participants": number} for wanted, number in self.least.items()]
         return {
             "d_z": self.d_z,
             "least": least,
