@@ -194,7 +194,7 @@ def test_ratings_out_of_range_are_refused_by_name() -> None:
 
 
 def test_usability_score_has_the_published_example_and_its_ends() -> None:
-    assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0  # Brooke (1996): 22 times 2.5
+    assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0  # 22 times 2.5: the example of Brooke (1996), from memory
     assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (100.0, 0.0, 50.0)
     with pytest.raises(UsageError, match="answer 4 = 6"):
         sus_score([1, 2, 3, 6, 1, 1, 1, 1, 1, 1])
