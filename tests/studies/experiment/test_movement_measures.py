@@ -193,8 +193,9 @@ def test_ratings_out_of_range_are_refused_by_name() -> None:
         raw_tlx({"mental": 3.0})
 
 
-def test_usability_score_has_the_published_example_and_its_ends() -> None:
-    assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0  # Brooke (1996): 22 times 2.5
+def test_usability_score_has_its_example_and_its_ends() -> None:
+    """Brooke (1996), from memory: contributions of 22 times 2.5."""
+    assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0
     assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (100.0, 0.0, 50.0)
     with pytest.raises(UsageError, match="answer 4 = 6"):
         sus_score([1, 2, 3, 6, 1, 1, 1, 1, 1, 1])

@@ -11,6 +11,7 @@ What the numbers cannot tell is None. Equal rows and seeds give equal numbers.
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -276,13 +277,7 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     frame["condition"] = frames.Categorical(frame["condition"], categories=list(means))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fit = formulas.mixedlm(
-            "measure ~ condition",
-            frame,
-            groups="pair",
-            re_formula="1",
-            vc_formula={"participant": "0 + C(participant)"},
-        ).fit(reml=True)
+        fit = _fit(formulas, frame, measure)
     effects = [_read_effect(fit, name, freedom) for name in list(means)[1:]]
     parts = {"pair": fit.cov_re.iloc[0, 0], "participant": fit.vcomp[0], "residual": fit.scale}
     variances = {name: float(value) for name, value in parts.items()}
@@ -290,14 +285,28 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     return MixedModel(measure, next(iter(means)), effects, freedom, variances, notes)
 
 
+def _fit(formulas: Any, frame: Any, measure: str) -> Any:
+    """Returns the likelier of two fits: by the gradient alone it may end before a variance that is at 0."""
+    parts = {"participant": "0 + C(participant)"}
+    model = formulas.mixedlm("measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts)
+    fits = []
+    for method in ("powell", "lbfgs"):
+        with suppress(np.linalg.LinAlgError):
+            fits.append(model.fit(reml=True, method=method))
+    fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
+    if not fits:
+        raise UsageError(f"{measure}: a mixed model cannot be fitted to it; compare conditions instead")
+    return max(fits, key=lambda fit: float(fit.llf))
+
+
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     pairs: dict[str, str] = {}
     for row in rows:
-        user, pair = str(row["participant"]), str(row.get("pair", ""))
+        user, pair = str(row["participant"]), "" if row.get("pair") is None else str(row["pair"])
         if pairs.setdefault(user, pair) != pair:
             raise UsageError(f"participant {user} is in pairs {pairs[user]} and {pair}: one pair each")
-    if "" in pairs.values():
-        raise UsageError("rows without a pair: a mixed model is of users within pairs")
+    if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
+        raise UsageError("no pair has two participants: a mixed model is of users within pairs")
     return pairs
 
 
@@ -391,9 +400,9 @@ def simulate_power(
         own = generator.normal(0.0, effect_deviation, (number, len(means), 1))
         values = own + generator.normal(0.0, trial_deviation, (number, len(means), trials))
         runs.append(compare_conditions(_list_rows(values, means), "measure"))
-    deviation = math.sqrt(2.0 * (effect_deviation**2 + trial_deviation**2 / trials))
+    deviation = math.sqrt(2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials))
     return [
-        _count_found(each, (means[each[0].second] - means[each[0].first]) / deviation, alpha)
+        _count_found(each, float(means[each[0].second] - means[each[0].first]) / deviation, alpha)
         for each in zip(*runs, strict=True)
     ]
 
