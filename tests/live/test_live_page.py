@@ -11,10 +11,14 @@ from playwright.sync_api import Page, sync_playwright
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from live.page_server import PageOptions, PageServer
+from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.clock import SystemClock
+from trilat_net.scenario import load_scenario
 
 from .browsers import (
     browser_page,
@@ -349,3 +353,18 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
             watching.shows("stopped")
     running.signal(signal.SIGINT)
     running.prints("checking the log")
+
+
+def test_a_browser_gets_in_by_the_token_of_its_link() -> None:
+    """It stands in the fragment, which the page hands to its socket; a wrong one is said."""
+    said: list[str] = []
+    options = PageOptions(host="0.0.0.0", insecure=True)
+    with PageServer(LocalNetwork().join(), SystemClock(), "s1", options, say=said.append) as server:
+        server.view.scenario = load_scenario("paper")
+        until(lambda: said)
+        link = said[0].removeprefix("user m1: ").replace("0.0.0.0", "127.0.0.1")
+        with browser_page(link, gl=False) as page:
+            shows(page, "trilat.hello?.role === 'user' && trilat.hello.as === 'm1'")
+            page.goto(link.replace("as=m1", "as=m2"))
+            shows(page, "document.querySelector('#notice').textContent.includes('no token')")
+            assert page.evaluate("trilat.hello") is None

@@ -9,11 +9,13 @@ import pytest
 
 from live.session_frames import SessionFrames
 from live.session_view import SessionView
+from sites.running_session import RunningSession
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
+from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 FRAME_NS = 33_333_333
@@ -119,3 +121,29 @@ def test_bodies_at_a_peer_are_drawn_as_old_as_its_arm(tmp_path: Path) -> None:
         there = [] if known["tick"] < 0 else log["s"].states[known["tick"]].bodies
         assert known["bodies"] == np.round(there, 5).tolist()
     assert len({str(frame["sites"]["s"]["bodies"]) for frame in frames}) > 20
+
+
+def test_pages_and_programs_know_the_same(tmp_path: Path) -> None:
+    """`states(as_site="m1")` beside a page as m1, at the same moments."""
+    keys = {"duration_s": 1.5, "rate_hz": 500, "link.delay_ms": 150, "link.loss": 0.2}
+    session = Session.whole(load_scenario("paper", keys), tmp_path)
+    compared: list[int] = []
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        view = SessionView(bus, clock, SESSION)
+        pages = SessionFrames(view)
+        with RunningSession(SESSION, Connection(), bus, clock).states(as_site="m1") as find:
+            while not view.ended:
+                view.poll()
+                found = find()
+                if (frame := pages.make()) is not None:
+                    sites = pages.narrow(frame, "m1", ages=True)["sites"]
+                    assert sites["m1"]["tick"] == found["m1"].tick
+                    ticks = {name: sites[name]["tick"] for name in found}
+                    assert ticks == {name: record.tick for name, record in found.items()}
+                    compared.append(len(found))
+                clock.sleep_until(clock.monotonic_ns() + FRAME_NS)
+
+    session.stranger(look)
+    session.run()
+    assert compared.count(3) > 30
