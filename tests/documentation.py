@@ -73,6 +73,7 @@ ELSEWHERE = {
     "docs/bench.md: trilat bench --small": "tests/cli/test_benches.py",
     "docs/code-that-runs.md: trilat verify": "tests/cli/test_code_from_logs.py",
     "docs/code-that-runs.md: log = tn.open_log": "tests/cli/test_code_from_logs.py",
+    "docs/experiments.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/external-arm.md: import trilat_net": "tests/sites/test_external_arm.py",
     "docs/lab.md: trilat": "tests/test_lab.py",
     "docs/lerobot.md: $ pip install 'trilat-net[lerobot]'": "tests/cli/test_log_export.py",

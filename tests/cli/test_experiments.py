@@ -1,0 +1,45 @@
+"""`trilat experiment`: from a protocol to its table, and what is wrong in a sentence."""
+
+import json
+import re
+from pathlib import Path
+
+from .running import trilat
+
+
+def shorten(file: Path) -> None:
+    text = file.read_text(encoding="utf-8")
+    text = re.sub(r"\[conditions\.(delay_100|jitter_300)\]\n[^\[]*", "", text)
+    for key, value in {"participants": 2, "trials": 1, "practice": 0}.items():
+        text = re.sub(rf"^{key} = \d+", f"{key} = {value}", text, flags=re.MULTILINE)
+    file.write_text(text, encoding="utf-8")
+
+
+def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
+    assert "run it with" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
+    assert "12 participants" in trilat("experiment", "check", "reaching.toml", cwd=tmp_path).succeeds()
+    shorten(tmp_path / "reaching.toml")
+    told = trilat("experiment", "run", "reaching.toml", "--jobs", "1", cwd=tmp_path).succeeds()
+    folder = "runs/experiment-reaching-001"
+    assert f"4 trials, into {folder}; it goes on after Ctrl-C by" in told
+    assert "reaching: 4 of 4 trials" in told
+    again = json.loads(trilat("experiment", "run", folder, "--json", cwd=tmp_path).out)
+    assert (again["done"], again["conditions"]) == (4, ["no_delay", "delay_300"])
+    assert "4 of 4" in trilat("experiment", "status", folder, cwd=tmp_path).succeeds()
+    found = trilat("experiment", "analyse", folder, "--exclude", "P2=late", cwd=tmp_path).succeeds()
+    assert "1 more were excluded (P2: late)" in found
+    assert f"{folder}/analysis/methods.txt" in found
+    next((tmp_path / folder / "logs").iterdir()).unlink()
+    assert "is missing" in trilat("experiment", "status", folder, cwd=tmp_path).err
+
+
+def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
+    trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
+    file = tmp_path / "reaching.toml"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace("participants = 12", "participants = 11"), encoding="utf-8")
+    refused = trilat("experiment", "check", "reaching.toml", cwd=tmp_path)
+    assert refused.code == 2
+    assert "the number of participants must be a multiple of 4, is 11" in " ".join(refused.err.split())
+    assert "holds no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
+    assert "reaching.toml: exists" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
