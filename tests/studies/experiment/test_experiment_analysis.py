@@ -12,7 +12,7 @@ from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.experiment_run import begin_experiment
 
-from .experiments import write_protocol
+from .experiments import REACH, write_protocol
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,18 @@ def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -
     assert {row["participant"] for row in found.rows} == {"P1"}
     with pytest.raises(UsageError, match="there is no participant P9: there are P1, P2"):
         tn.analyse_experiment(folder, tmp_path / "other", exclude={"P9": ""})
+
+
+def test_users_within_pairs_have_a_mixed_model(tmp_path: Path) -> None:
+    pytest.importorskip("statsmodels", reason="is in the extra stats")
+    file = write_protocol(tmp_path, '["m1", "m2"]', REACH.replace("6.0", "1.0"))
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("participants = 2", "participants = 6"), encoding="utf-8"
+    )
+    found = tn.analyse_experiment(tn.run_experiment(file, tmp_path / "out", jobs=1).folder)
+    assert {model.measure for model in found.fit_models()} == {"force_mean_n", "force_peak_n"}
+    assert [one.condition for one in next(found.fit_models()).effects] == ["far"]
+    assert "6 participants in 3 pairs" in found.methods
 
 
 def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from .statistics import (
     CONFIDENCE,
     Comparison,
     ConditionMean,
+    MixedModel,
     Row,
     compare_conditions,
     find_least_number,
@@ -155,6 +157,19 @@ class ExperimentAnalysis(Result):
             self.paths.append(path)
         return self
 
+    def fit_models(self) -> Iterator[MixedModel]:
+        """Yields mixed models of the forces of users within pairs, where statsmodels is installed."""
+        if self.unit == "participant" or find_spec("statsmodels") is None:
+            return
+        for measure in ("force_mean", "force_peak"):
+            rows = [
+                {**row, "participant": name, measure + "_n": row[f"{measure}_user{place}_n"]}
+                for row in self.rows
+                for place, name in enumerate(row["pair"].split("-"), 1)
+            ]
+            with suppress(UsageError):  # too few pairs for it
+                yield fit_mixed_model(rows, measure + "_n")
+
     def _list_means(self) -> list[dict[str, Any]]:
         return [{"measure": name, **one._asdict()} for name, means in self.means.items() for one in means]
 
@@ -165,11 +180,9 @@ class ExperimentAnalysis(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat experiment analyse --json`."""
         facts = {"name": self._experiment.plan.protocol.name, "digest": self._experiment.plan.digest}
-        models = {}
-        if find_spec("statsmodels") is not None:
-            models = {name: fit_mixed_model(self.of(name), name)._asdict() for name in self.means}
-            for model in models.values():
-                model["effects"] = [effect._asdict() for effect in model["effects"]]
+        models = {model.measure: model._asdict() for model in self.fit_models()}
+        for model in models.values():
+            model["effects"] = [effect._asdict() for effect in model["effects"]]
         whole = {"conditions": self._list_means(), "comparisons": self.to_rows(), "mixed_models": models}
         return {**facts, **whole, "methods": self.methods}
 
