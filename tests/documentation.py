@@ -75,6 +75,7 @@ ELSEWHERE = {
     "docs/code-that-runs.md: log = tn.open_log": "tests/cli/test_code_from_logs.py",
     "docs/experiments.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/external-arm.md: import trilat_net": "tests/sites/test_external_arm.py",
+    "docs/first-hour.md: trilat live": "tests/live/test_live_page.py",
     "docs/lab.md: trilat": "tests/test_lab.py",
     "docs/lerobot.md: $ pip install 'trilat-net[lerobot]'": "tests/cli/test_log_export.py",
     "docs/lerobot.md: $ pip install ./plugins": "tests/live/test_lerobot.py",

@@ -132,6 +132,7 @@ COMMAND_PAGES = {
     "docs/arms.md",
     "docs/errata.md",
     "docs/fair-comparison.md",
+    "docs/first-hour.md",
     "docs/lab.md",
     "docs/linear.md",
     "docs/links.md",
@@ -189,6 +190,7 @@ def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
 
 PYTHON_PAGES = {
     "docs/certificate.md",
+    "docs/first-hour.md",
     "docs/linear.md",
     "docs/live-hands.md",
     "docs/own-controller.md",

@@ -25,8 +25,11 @@ def test_every_command_has_help_with_example_and_explains_its_options(command: l
         option = re.match(r"[│| ]*(--[a-z-]+)", line)
         if option and "--install" not in line and "--show" not in line:
             assert re.search(r"[a-z]{3,}[ :,]", line.split(option[1], 1)[1], re.IGNORECASE), line
-    if command[-1] in ("demo", "site", "sim", "test", "sweep", "show", "check") and command[0] != "log":
-        assert "--set" in text  # whatever takes a scenario takes overrides
+    if command[-1] in ("demo", "site", "sim", "test", "sweep", "show", "check") and command[0] not in (
+        "log",
+        "experiment",
+    ):
+        assert "--set" in text  # whatever takes a scenario takes overrides; a protocol has its own
 
 
 def test_the_main_help_names_what_to_begin_with() -> None:

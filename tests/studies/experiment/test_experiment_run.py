@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import random
+import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -44,7 +45,9 @@ def test_trial_ends_where_its_task_is_done(done: Experiment) -> None:
     row = done.to_rows()[0]
     log = tn.open_log(done.folder / row["log"])
     target_m = place_slave(log.scenario.arms["s"], log["s"].q[0])
-    target_m[0] += 0.1
+    number = done.plan.trials[0].target
+    angle = 0.5 * np.pi * ((number // 2 + 2 * (number % 2)) % 4)
+    target_m += 0.1 * np.array([np.cos(angle), np.sin(angle)])
     off_m = np.array([np.linalg.norm(log.scenario.arms["s"].end_effector(q) - target_m) for q in log["s"].q])
     ended_s = log["s"].t_s[-1] - 0.1
     inside = off_m <= 0.025
@@ -94,8 +97,8 @@ def test_pairs_and_paths_run_as_well(users: str, task: str, tmp_path: Path) -> N
         assert all(row["completion_s"] == pytest.approx(2.0, abs=0.03) for row in rows)
 
 
-def test_log_that_was_changed_is_named(tmp_path: Path) -> None:
-    again = tn.run_experiment(write_protocol(tmp_path), tmp_path / "out", jobs=1)
+def test_log_that_was_changed_is_named(done: Experiment, tmp_path: Path) -> None:
+    again = tn.open_experiment(shutil.copytree(done.folder, tmp_path / "out"))
     rows = again.to_rows()
     (again.folder / rows[0]["log"]).write_bytes(b"other")
     (again.folder / rows[1]["log"]).unlink()

@@ -53,6 +53,9 @@ def test_every_trial_has_its_place_and_seed() -> None:
     assert len({one.seed for one in plan.trials}) == len({one.file for one in plan.trials}) == 32
     assert sum(one.practice for one in plan.trials) == 8
     assert [one.before for one in plan.trials[:8]] == list(range(8))
+    blocks = [[one.target for one in plan.trials[n : n + 4]] for n in range(0, 32, 4)]
+    assert all(block == list(range(block[0], block[0] + 4)) for block in blocks)
+    assert len({block[0] for block in blocks}) > 4
     assert plan.list_orders()["P1"] == ["near", "far"]
     assert plan.list_orders()["P2"] == ["far", "near"]
 
@@ -99,6 +102,7 @@ def test_all_that_is_wrong_is_named_before_anybody_sits_down(keys: dict[str, Any
         ("name = 3", "Expected `str`, got `int` - at `\\$.name`; the keys of a protocol are name, scenario"),
         ("name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3", "unknown field `trails`"),
         ("name =", "is no TOML"),
+        ("name = 'a'\nscenario = 'paper'\nconditions = {}\nparticipants = ['../x']", "matching regex"),
     ],
 )
 def test_file_that_is_no_protocol_is_refused(text: str, problem: str, tmp_path: Path) -> None:

@@ -51,3 +51,43 @@ def draw_conditions(
         axes.set_ylabel(label or measure)
         style.add_legend(figure, [(f"a {unit}", _USER), ("mean, 95 % interval", _MEAN)])
     return figure
+
+
+def draw_learning(
+    rows: Sequence[Row], measure: str, *, unit: str = "participant", size: FigureSize | None = None
+) -> Figure:
+    """Returns the course of a measure over the trials of a block, a line for each condition.
+
+    Args:
+        rows: tidy rows, as of `statistics`, with the number of each `trial` in its block.
+        measure: its name in the rows.
+        unit: "participant" or "pair".
+        size: of the figure; None for one column of a paper.
+    """
+    form = make_print_size(3.5) if size is None else size
+    with style.styled_figure(form, _HEIGHT_IN) as figure:
+        axes, shown = style.add_panels(figure, 1, 1)[0, 0], []
+        for n, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
+            own = [row for row in rows if row["condition"] == condition]
+            found = [
+                (trial, mean)
+                for trial in sorted({row["trial"] for row in own})
+                for mean in summarise_conditions(
+                    [row for row in own if row["trial"] == trial], measure, unit=unit
+                )
+            ]
+            look = {
+                "color": SITE_COLOURS[n % len(SITE_COLOURS)],
+                "linewidth": 1.2,
+                "marker": "o",
+                "markersize": 3.0,
+            }
+            for trial, mean in found:
+                low, high = mean.interval or (mean.mean, mean.mean)
+                axes.plot([trial, trial], [low, high], **{**look, "marker": "", "alpha": 0.5})
+            axes.plot([trial for trial, _ in found], [mean.mean for _, mean in found], **look)
+            shown.append((condition, look))
+        axes.set_xlabel("trial of the block")
+        axes.set_ylabel(measure)
+        style.add_legend(figure, shown)
+    return figure

@@ -13,14 +13,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ...errors import UsageError
 from ...files import find_version, make_folder, write_whole
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
-from ...scenario.describe import flatten_table
-from .condition_figures import draw_conditions
+from .condition_figures import draw_conditions, draw_learning
 from .experiment_run import Experiment, open_experiment
 from .movement_measures import measure_throughput
 from .statistics import (
@@ -114,9 +114,7 @@ class ExperimentAnalysis(Result):
             for name in protocol.conditions
             if any(row["condition"] == name for row in self.rows)
         }
-        control = dict(
-            flatten_table(json.loads(json.dumps(_plain(scenario.sites[protocol.users[0]].control))))
-        )
+        control = msgspec.to_builtins(scenario.sites[protocol.users[0]].control)
         law = str(control.pop("law"))
         pairs = {"pairs": len(who)} if self.unit == "pair" else {}
         reasons = ", ".join(f"{name}: {why}" if why else name for name, why in self._exclude.items())
@@ -155,6 +153,9 @@ class ExperimentAnalysis(Result):
             path = made / f"{measure}.png"
             draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)
             self.paths.append(path)
+        if len({row["trial"] for row in self.rows}) > 1:
+            self.paths.append(made / "learning.png")
+            draw_learning(self.rows, "completion_s", unit=self.unit).savefig(self.paths[-1], dpi=200)
         return self
 
     def fit_models(self) -> Iterator[MixedModel]:
@@ -298,13 +299,6 @@ def compute_experiment_power(
     return PowerOfExperiment(effect, participants, seed)
 
 
-def _plain(control: Any) -> Mapping[str, Any]:
-    import msgspec
-
-    plain: Mapping[str, Any] = msgspec.to_builtins(control)
-    return plain
-
-
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
@@ -314,17 +308,18 @@ def _span(interval: tuple[float, float] | None) -> str:
 
 
 def _encode_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    stream = io.StringIO()
-    spans = ("interval", "bootstrap")
-    flat = [
-        {
-            key if key not in spans else f"{key}_{end}": (one if key not in spans else one and one[n])
-            for key, one in row.items()
-            for n, end in enumerate(("low", "high") if key in spans else ("",))
-        }
-        for row in rows
-    ]
+    stream, flat = io.StringIO(), [dict(_flatten(row)) for row in rows]
     writer = csv.DictWriter(stream, list(flat[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(flat)
     return stream.getvalue()
+
+
+def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yields the cells of a row; an interval has one for each end."""
+    for key, one in row.items():
+        if key in ("interval", "bootstrap"):
+            low, high = one or (None, None)
+            yield from ((f"{key}_low", low), (f"{key}_high", high))
+        else:
+            yield key, one

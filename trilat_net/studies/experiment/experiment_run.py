@@ -89,17 +89,23 @@ class Experiment(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each trial that is done, in the order of the plan."""
-        done, rows = self.read_entries(), []
-        for planned in self.plan.trials:
-            if (entry := done.get(planned.number)) is None:
-                continue
-            named = {"trial_number": planned.number, "pair" if len(planned.group) > 1 else "participant": ""}
-            named[list(named)[-1]] = "-".join(planned.group)
-            facts = {"condition": planned.condition, "block": planned.block, "trial": planned.trial}
-            kind = {"practice": int(planned.practice), "succeeded": int(entry.succeeded)}
-            log = {"log": f"{LOGS}/{planned.file}", "log_sha256": entry.sha256}
-            rows.append({**named, **facts, **kind, **entry.measures, **log})
-        return rows
+        done, unit = self.read_entries(), "pair" if len(self.plan.protocol.users) > 1 else "participant"
+        return [
+            {
+                "trial_number": planned.number,
+                unit: "-".join(planned.group),
+                "condition": planned.condition,
+                "block": planned.block,
+                "trial": planned.trial,
+                "practice": int(planned.practice),
+                "succeeded": int(entry.succeeded),
+                **entry.measures,
+                "log": f"{LOGS}/{planned.file}",
+                "log_sha256": entry.sha256,
+            }
+            for planned in self.plan.trials
+            if (entry := done.get(planned.number)) is not None
+        ]
 
     def write_tables(self) -> Path:
         """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path."""

@@ -27,6 +27,8 @@ from .tasks import AnyTask, ReachTrial
 
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
+Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
+"""It becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 
 
@@ -56,7 +58,7 @@ class Protocol(Frozen, frozen=True):
     set: dict[str, Any] = field(default_factory=dict)
     title: str = ""
     users: tuple[str, ...] = ("m1",)
-    participants: Count | tuple[str, ...] = 12
+    participants: Count | tuple[Pseudonym, ...] = 12
     design: Literal["williams", "latin", "random", "fixed"] = "williams"
     trials: Count = 10
     practice: Annotated[int, Meta(ge=0, le=1000)] = 0
@@ -86,6 +88,8 @@ class PlannedTrial(NamedTuple):
         trial: its place in the block, from 1; practice comes first.
         practice: whether it does not count.
         before: how many trials the group has made before.
+        target: the number of its target; each block begins at another, which is drawn, so that what the
+            direction of a target does is no learning.
         seed: of what is drawn in it.
     """
 
@@ -96,6 +100,7 @@ class PlannedTrial(NamedTuple):
     trial: int
     practice: bool
     before: int
+    target: int
     seed: int
 
     @property
@@ -257,5 +262,6 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
             condition, number = orders[n % len(orders)][block], number + 1
             drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
             seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
-            before = block * each + trial
-            yield PlannedTrial(number, group, condition, block + 1, trial + 1, practice, before, seed)
+            first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
+            counts = block + 1, trial + 1, practice, block * each + trial, int(first) + trial
+            yield PlannedTrial(number, group, condition, *counts, seed)

@@ -29,11 +29,11 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         raise NotImplementedError
 
     def begin(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Returns what is asked in a trial of a block, by its number from 0.
+        """Returns what is asked in a trial, by the number of its target from 0.
 
         Args:
             start_m: where the slave's end effector is.
-            number: of the trial in its block.
+            number: of the target.
             seed: of the trial.
         """
         raise NotImplementedError

@@ -94,7 +94,7 @@ class SyntheticTrial:
 
     def _goal(self) -> TrialGoal:
         planned = self._planned
-        goal = self._protocol.task.begin(self._start_m, planned.trial - 1, planned.seed)
+        goal = self._protocol.task.begin(self._start_m, planned.target, planned.seed)
         goal.appears_s = self._appears_s
         return goal
 
