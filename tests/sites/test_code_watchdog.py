@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sites.code_watchdog import HICCUP_NS, MOST_NS, SHARE, CodeWatchdog, WatchedCode
+from sites.code_watchdog import CHECKS, FIRST_CHECKS, HICCUP_NS, MOST_NS, SHARE, CodeWatchdog, WatchedCode
 from tests.core.sites import setup
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
@@ -118,3 +118,10 @@ def test_a_law_that_does_not_come_back_is_stopped() -> None:
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
     assert signal.getsignal(signal.SIGALRM) is before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_a_first_call_may_compile_for_a_minute() -> None:
+    watched = WatchedCode("the plant mine:Scene", 1000, fail_of("s", "mine:Scene"), SystemClock())
+    watched.run(0, lambda: [watched.check() for _ in range(FIRST_CHECKS - 1)])
+    with pytest.raises(LawFailed, match="failed at tick 1: it did not come back within 2 s"):
+        watched.run(1, lambda: [watched.check() for _ in range(CHECKS)])
