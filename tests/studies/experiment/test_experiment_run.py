@@ -129,7 +129,7 @@ def test_killed_experiment_goes_on_whole(done: Experiment, kills: int, tmp_path:
     for _ in range(kills):
         running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         with suppress(subprocess.TimeoutExpired):
-            running.wait(timeout=moment.uniform(0.5, 12.0))
+            running.wait(timeout=moment.uniform(0.6, 2.2))
         running.kill()
         running.wait()
     found = tn.open_experiment(folder).run(jobs=1)
