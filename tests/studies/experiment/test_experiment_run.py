@@ -4,6 +4,7 @@ import csv
 import hashlib
 import random
 import shutil
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -125,13 +126,17 @@ def test_killed_experiment_goes_on_whole(done: Experiment, kills: int, tmp_path:
     """SIGKILL at random moments: nothing twice, nothing lost, the same bytes in the end."""
     folder, moment = tmp_path / "out", random.Random(1)
     begin_experiment(write_protocol(tmp_path), folder)
-    words = [sys.executable, "-m", "trilat_net.cli", "experiment", "run", str(folder), "--jobs", "1"]
+    code = "from trilat_net.cli import main; main()"
+    words = [sys.executable, "-c", code, "experiment", "run", str(folder), "--jobs", "1"]
+    ends = []
     for _ in range(kills):
         running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         with suppress(subprocess.TimeoutExpired):
             running.wait(timeout=moment.uniform(0.6, 2.2))
         running.kill()
-        running.wait()
+        ends.append(running.wait())
+    assert set(ends) <= {-signal.SIGKILL, 0}
+    assert -signal.SIGKILL in ends
     found = tn.open_experiment(folder).run(jobs=1)
     numbers = [row["trial_number"] for row in found.to_rows()]
     assert numbers == list(range(1, 9))
