@@ -109,7 +109,7 @@ def test_a_user_is_told_nothing_that_it_cannot_know(tmp_path: Path) -> None:
     assert frames
 
 
-def test_bodies_at_a_peer_are_drawn_as_old_as_its_arm(tmp_path: Path) -> None:
+def test_bodies_of_a_peer_are_as_old_as_its_arm(tmp_path: Path) -> None:
     plant = {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}
     keys = {"sites.s.plant": plant, "duration_s": 1.5, "link.delay_ms": 300}
     session = Session.whole(load_scenario("paper", keys), tmp_path)

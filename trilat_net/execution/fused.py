@@ -212,6 +212,7 @@ class FusedRun:
         ]
         self._taken_ticks = [0] * count
         self._plants = {i: plants[name] for i, name in enumerate(scenario.names) if name in plants}
+        self._torques = {i: self._layouts[i].columns()["tau"] for i in self._plants}
         self._acted, self._moved = dict[int, int](), dict.fromkeys(self._plants, 0)
         self._selected: dict[int, SiteArrays] = {}
         self.ran_s = 0.0
@@ -279,7 +280,7 @@ class FusedRun:
         """Lets the plant of a site move on to the site's next tick; returns the time of the one after, ns."""
         k, plant, own = int(self._progress[i]["tick"]), self._plants[i], self.arrays(i).site[0]
         if k > self._moved[i]:
-            plant.move(k - 1, self.records[i, self._layouts[i].columns()["tau"]].tolist())
+            plant.move(k - 1, self._last_row(i)[self._torques[i]].tolist())
         self._moved[i], n = k, self._layouts[i].joints
         own["q"][:n], own["qd"][:n] = plant.state.q, plant.state.qd
         own["sensed"][:n] = [-torque for torque in plant.state.tau_x] or 0.0
@@ -503,11 +504,11 @@ class FusedRun:
     @property
     def records(self) -> Array:
         """Last record of each site, floats as in `Layout.columns`, a row per site."""
-        rows = [
-            self._sent.rows[n, (int(progress["tick"]) - 1) % self._sent.t_ns.shape[1]]
-            for n, progress in enumerate(self._progress)
-        ]
-        return np.array(rows)
+        return np.array([self._last_row(n) for n in range(len(self._progress))])
+
+    def _last_row(self, n: int) -> Array:
+        row: Array = self._sent.rows[n, (int(self._progress[n]["tick"]) - 1) % self._sent.t_ns.shape[1]]
+        return row
 
 
 def explain_no_repetition(log: Log, *, own_laws: bool = False) -> str:

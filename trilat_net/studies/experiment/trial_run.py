@@ -13,6 +13,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from ...analysis.aligned import AlignedRecords, align_records
+from ...analysis.torque_sources import split_torque
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
 from ...errors import LogError
@@ -27,7 +29,7 @@ from ...scenario.operators.program_hand import HandPlayer, HandSite
 from .movement_measures import mean_force_n, movement_time_s, path_length_m, peak_force_n, sparc
 from .protocol import PlannedTrial, Protocol
 from .synthetic_participant import SyntheticParticipant
-from .tasks import Outcome, TrialGoal, place_slave
+from .tasks import Outcome, TrialGoal
 
 EVERY = 5
 """Of the slave's records one in so many is measured."""
@@ -78,7 +80,7 @@ class SyntheticTrial:
         self._protocol, self._planned, task = protocol, planned, protocol.task
         self.slave = find_slave(scenario)
         spec = scenario.sites[self.slave.site]
-        self._start_m = place_slave(self.slave.arm, self._shared(np.array(spec.q0_rad)))
+        self._start_m = np.array(self.slave.arm.end_effector(spec.q0_rad), dtype=np.float64)
         about = f"trial {planned.number} of {protocol.name}: {', '.join(planned.group)}, condition "
         about += (
             f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
@@ -88,9 +90,6 @@ class SyntheticTrial:
         self._longest_s = self._appears_s + task.longest_s + 1.0 / HAND_HZ
         lasts = replace(scenario, duration_s=self._longest_s + REST_S, seed=planned.seed, about=about)
         self._scenario, self.outcome = lasts, Outcome(False, self._longest_s)
-
-    def _shared(self, q: Array) -> Any:
-        return self.slave.arm.end_effector(q) if self.slave.arm.shares_pose else q
 
     def _goal(self) -> TrialGoal:
         planned = self._planned
@@ -141,8 +140,9 @@ class SyntheticTrial:
     def measure(self, log: Log) -> dict[str, float]:
         """Returns the measures of a trial, units in the names."""
         found, ended_s = self._measure_motion(log), self.outcome.ended_s
+        aligned = align_records(log)
         for place, user in enumerate(self._protocol.users, 1):
-            force = _hand_forces_n(log, user, ended_s)
+            force = _hand_force_n(aligned[user], log.scenario, ended_s)
             which = f"_user{place}" if len(self._protocol.users) > 1 else ""
             found |= {
                 f"force_mean{which}_n": mean_force_n(force),
@@ -180,16 +180,11 @@ class SyntheticTrial:
         }
 
 
-def _hand_forces_n(log: Log, user: str, until_s: float) -> Array:
+def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Array:
     """Returns the force of a participant's hand ON its arm, shape (K, 2) or (K, 3), N."""
-    from ...analysis.aligned import align_records
-    from ...analysis.torque_sources import split_torque
-
-    own = align_records(log)[user]
-    split = split_torque(own, log.scenario)
-    force: Array = np.einsum(
-        "kij,kj->ki", np.linalg.pinv(split.end_effector.J.transpose(0, 2, 1)), split.operator
-    )
+    split = split_torque(own, scenario)
+    inverse = np.linalg.pinv(split.end_effector.J.transpose(0, 2, 1))
+    force: Array = np.einsum("kij,kj->ki", inverse, split.operator)
     return force[own.t_s <= until_s]
 
 
