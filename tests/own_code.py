@@ -113,5 +113,53 @@ class Torn(Arm):
         }[self.how]
 
 
+MOTOR_S = 0.005
+"""A motor's torque follows what is asked so fast, so that no acceleration steps at a tick."""
+
+
+class HeldArm:
+    """The planar arm without gravity, held by a hand that also does things by itself."""
+
+    def __init__(
+        self, facts: PlantContext, M: list[float], B: list[float], K: list[float], unrest_n: float = 0.3
+    ) -> None:
+        arm = facts.scenario.arms[facts.site]
+        self.theta, self.lengths = arm.theta.tolist(), arm.lengths_m
+        self.M, self.B, self.K = (np.reshape(one, (2, 2)) for one in (M, B, K))
+        self.q, self.qd = np.array(facts.q0_rad), np.zeros(2)
+        self.at = self.look()[0]
+        self.unrest_n, self.own, self.tau = unrest_n, np.zeros(2), np.zeros(2)
+        self.random = np.random.default_rng(facts.seed)
+
+    def look(self) -> tuple[Any, Any, Any]:
+        """Where the end effector is, its Jacobian, and the Jacobian's derivative."""
+        (l1, l2), (q1, q12), (w1, w12) = self.lengths, np.cumsum(self.q), np.cumsum(self.qd)
+        s1, c1, s2, c2 = l1 * np.sin(q1), l1 * np.cos(q1), l2 * np.sin(q12), l2 * np.cos(q12)
+        J = np.array([[-s1 - s2, -s2], [c1 + c2, c2]])
+        Jd = np.array([[-c1 * w1 - c2 * w12, -c2 * w12], [-s1 * w1 - s2 * w12, -s2 * w12]])
+        return np.array([c1 + c2, s1 + s2]), J, Jd
+
+    def move(self) -> tuple[Any, Any]:
+        """The acceleration, and the hand's torque ON the arm, in the present state."""
+        at, J, Jd = self.look()
+        bend, swing = self.theta[1] * math.cos(self.q[1]), -self.theta[1] * math.sin(self.q[1])
+        inner = self.theta[2] + bend
+        inertia = np.array([[self.theta[0] + 2.0 * bend, inner], [inner, self.theta[2]]])
+        w1, w2 = self.qd
+        turning = swing * np.array([w2 * (2.0 * w1 + w2), -w1 * w1])
+        force = self.own - self.K @ (at - self.at) - self.B @ (J @ self.qd) - self.M @ (Jd @ self.qd)
+        qdd = np.linalg.solve(inertia + J.T @ self.M @ J, self.tau - turning + J.T @ force)
+        return qdd, J.T @ (force - self.M @ (J @ qdd))
+
+    def step(self, tau: Any, h_s: float) -> Sequence[Any]:
+        self.qd = self.qd + h_s * self.move()[0]
+        self.q = self.q + h_s * self.qd
+        keep = math.exp(-h_s / 0.1)
+        moved = math.sqrt(1.0 - keep * keep) * self.unrest_n * self.random.normal(size=2)
+        self.own = keep * self.own + moved
+        self.tau = tau + math.exp(-h_s / MOTOR_S) * (self.tau - tau)
+        return self.q, self.qd, -self.move()[1]
+
+
 class NoHand:
     """Has no act."""

@@ -54,6 +54,7 @@ COUNTERPARTS = {
     "open_experiment": ["experiment status"],
     "analyse_experiment": ["experiment analyse"],
     "compute_experiment_power": ["experiment power"],
+    "identify_hand": ["identify hand"],
     "create_keys": ["keys new"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],

@@ -75,6 +75,7 @@ SCENARIO_OF = {
     "docs/arms.md": "six_joints",
     "docs/external-arm.md": "two_sites",
     "docs/links.md": "paper",
+    "docs/ports.md": "two_sites",
     "docs/live-hands.md": "play",
     "docs/metrics.md": "free",
     "docs/own-controller.md": "paper",

@@ -73,6 +73,7 @@ if _TYPE_CHECKING:
     from .studies.experiment.experiment_run import new_experiment as new_experiment
     from .studies.experiment.experiment_run import open_experiment as open_experiment
     from .studies.experiment.experiment_run import run_experiment as run_experiment
+    from .studies.hand_impedance import identify_hand as identify_hand
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -105,6 +106,7 @@ _NAMES = {
     "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment compute_experiment_power",
     "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment open_experiment "
     "run_experiment",
+    "trilat_net.studies.hand_impedance": "identify_hand",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

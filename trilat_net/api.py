@@ -255,6 +255,7 @@ def linear(
     roots: int = 6,
     over: Sequence[str] = (),
     ports: bool = True,
+    operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
     """Linearises the loop about its equilibrium: roots, margins, ports; the command is `trilat linear`.
 
@@ -268,18 +269,27 @@ def linear(
         roots: how many roots.
         over: ranges in which to find where stability changes, as in `["control.d=0.1:3"]`.
         ports: whether to analyse the impedances that operators feel, and passivity.
+        operators: files of measured operators, of `trilat identify hand --json`.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
         UsageError: another argument is not valid.
     """
+    from .studies.hand_impedance import read_hands
     from .theory.linear_analysis import analyse_linear_loop
 
     try:
         fixed = None if pose is None else tuple(map(float, pose))
     except (TypeError, ValueError):
         raise UsageError(f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}") from None
-    return analyse_linear_loop(load_scenario(scenario, set), pose=fixed, roots=roots, over=over, ports=ports)
+    return analyse_linear_loop(
+        load_scenario(scenario, set),
+        pose=fixed,
+        roots=roots,
+        over=over,
+        ports=ports,
+        hands=read_hands(operators),
+    )
 
 
 def sweep(

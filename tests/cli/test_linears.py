@@ -1,7 +1,10 @@
 import json
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
+
+from tests.documentation import find_blocks
 
 from .running import trilat
 
@@ -61,3 +64,20 @@ def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
     (tmp_path / "map.png").write_text("precious")
     trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses("map.png", "exists", "--force")
     assert (tmp_path / "map.png").read_text() == "precious"
+
+
+def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
+    """As docs/ports.md has it, with the sines of its page."""
+    (sines,) = (block.text for block in find_blocks("docs/ports.md") if block.language == "toml")
+    shipped = (files("trilat_net") / "scenarios" / "p_d_margin_two.toml").read_text(encoding="utf-8")
+    (tmp_path / "moved.toml").write_text(f"{shipped}\n{sines}", encoding="utf-8")
+    spring = 'sites.m.hands=[{kind="tip_spring",stiffness_n_m=[50,50],damping_n_s_m=[4,4]}]'
+    told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250", "-o", "run.mcap")
+    trilat("sim", "moved.toml", "--duration", "30", *told, cwd=tmp_path)
+    asked = ("identify", "hand", "run.mcap", "--site", "m")
+    assert "coherence" in trilat(*asked, cwd=tmp_path).succeeds()
+    (tmp_path / "m.json").write_text(trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8")
+    held = ("linear", "p_d_margin_two", *AT, "--set", "control.d=1.96", "--operators", "m.json")
+    line = "the measured operators at the masters, any at each: not shown at 0.001-"
+    assert line in trilat(*held, cwd=tmp_path).succeeds()
+    trilat(*held, "--operators", "run.mcap", cwd=tmp_path).refuses("run.mcap: holds no hand")

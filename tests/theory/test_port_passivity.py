@@ -10,7 +10,9 @@ from trilat_net.errors import UsageError
 from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
 from trilat_net.theory.linear_loop import LinearLoop
 from trilat_net.theory.port_passivity import (
+    HandMatrices,
     Passivity,
+    check_against_hands,
     check_passivity,
     clamp_ports,
     find_least_eigenvalue,
@@ -215,3 +217,30 @@ def test_clamps_that_reflect_onto_each_other_are_refused() -> None:
 def test_what_is_no_load_is_refused(site: str, load: PortLoad, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         apply_loads(pair().loop, {site: load})
+
+
+HELD = (np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]))
+"""By the velocities at both ports those of either hand."""
+
+
+def scalar_hand(damping: float) -> HandMatrices:
+    return HandMatrices(np.array([[0.7]]), np.array([[damping]]), np.array([[250.0]]))
+
+
+@pytest.mark.parametrize(("damping", "shown"), [(0.03, False), (0.05, True)])
+def test_hands_that_damp_what_ports_lack_are_stable(damping: float, shown: bool) -> None:
+    """P+d of K = 10, T = 0.2 s and d = 1.96 lacks 0.04 N m s/rad at each port (Nuno et al. 2009)."""
+    Y = build_admittance(pair(d=(1.96, 1.96)).loop)
+    w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, 0.2))
+    hands = [[scalar_hand(damping), scalar_hand(2.0)]] * 2
+    assert (not check_against_hands(Y, w, hands, HELD).below) is shown
+    nobody = check_against_hands(Y, w, hands[:1], HELD[:1])
+    assert nobody.below
+
+
+def test_mass_and_stiffness_of_a_hand_dissipate_nothing() -> None:
+    w = np.geomspace(0.1, 100.0, 20)
+    assert np.allclose(scalar_hand(3.0).dissipate(w), 3.0)
+    swirl = HandMatrices(np.zeros((2, 2)), np.eye(2), np.array([[0.0, 5.0], [-5.0, 0.0]]))
+    least = np.linalg.eigvalsh(swirl.dissipate(w))[:, 0]
+    assert np.allclose(least, 1.0 - 5.0 / w)  # a field of force that turns gives energy, the slower the more

@@ -83,6 +83,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
     "scenario": {"help": "The shipped scenarios and your own."},
     "new": {"help": "A control law, a hand or a plant of your own, with its test."},
+    "identify": {"help": "Finds what holds an arm."},
     "trace": {"help": "Imports delays that other programs measured."},
     "experiment": {"help": "Experiments with participants, from a protocol to its table."},
     "set": {"callback": options.spread(sessions.set_command)},

@@ -156,6 +156,24 @@ def twin_command(
     options.print_drawn(found, picture, "twin_differences:draw_twins", found, as_json=as_json)
 
 
+@options.command("run.mcap --site m1 --json > m1.json")
+def identify_hand_command(
+    file: options.LogsArgument,
+    site: Annotated[
+        str, value("--site", "SITE", "Whose arm it holds.", autocompletion=options.complete_sites)
+    ] = "m1",
+    as_json: options.JsonOption = False,
+) -> None:
+    """Finds mass, damping and stiffness of the hand at an arm, from a run in which sines move that arm.
+
+    The scenario has an operator of kind "multisine" at any site (docs/ports.md, "Measured operators"). What
+    is found, as JSON, is what `trilat linear --operators` takes.
+    """
+    from ..studies.hand_impedance import identify_hand
+
+    terminal.print_result(identify_hand(terminal.open_with_progress(*file), site), as_json=as_json)
+
+
 @options.command("run.mcap")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
@@ -322,6 +340,10 @@ def linear_command(
         list[str] | None, value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
     ] = None,
     ports: Annotated[bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")] = True,
+    operators: Annotated[
+        list[Path] | None,
+        value("--operators", "FILE", "A measured operator, of `identify hand --json`; repeatable."),
+    ] = None,
     picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
     what: Annotated[
         LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
@@ -336,11 +358,18 @@ def linear_command(
     any verdict.
     """
     options.check_picture(picture, force=force)
+    from ..studies.hand_impedance import read_hands
     from ..theory.linear_analysis import analyse_linear_loop
 
     wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
     found = analyse_linear_loop(
-        scenario, overrides or [], pose=_pose(pose), roots=roots, over=over or [], ports=wanted
+        scenario,
+        overrides or [],
+        pose=_pose(pose),
+        roots=roots,
+        over=over or [],
+        ports=wanted,
+        hands=read_hands(operators or []),
     )
     shown = found if ports or as_json else replace(found, ports=None)
     name, of = ("root_map", found) if what is LinearFigure.ROOTS else (f"port_{what}", found.ports)

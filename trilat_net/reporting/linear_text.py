@@ -163,6 +163,10 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     absolute = _describe_absolute_stability(ports)
     lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
+    if ports.measured is not None:
+        bands = ports.measured.below
+        found = f"not shown {_list_bands(bands)}, where they damp too little" if bands else "stable"
+        lines.append(f"  the measured operators at the masters, any at each: {found}")
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].of
         return [*lines, f"  with {clamped} clamped the loop is unstable: it has no steady impedance"]

@@ -41,6 +41,7 @@ from .linear_loop import LinearLoop, linearise_loop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
+from .port_passivity import HandMatrices
 from .site_dynamics import share_own_pose
 
 DEFAULT_ROOTS = 6
@@ -149,6 +150,7 @@ def analyse_linear_loop(
     roots: int = DEFAULT_ROOTS,
     over: Sequence[str] = (),
     ports: bool = False,
+    hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
     """Returns the linear analysis of a scenario.
 
@@ -159,6 +161,7 @@ def analyse_linear_loop(
         roots: how many roots, the rightmost ones.
         over: keys along which stability may change, and their ranges, as in "control.d=0.1:3".
         ports: whether to analyse the ports of the operators.
+        hands: measured operators, of which any may hold any master, see `read_hands`.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
@@ -178,7 +181,7 @@ def analyse_linear_loop(
         EdgeScan(key, low, high, tuple(iterate_linear_edges(scenario, key, low, high, rest)))
         for key, low, high in ranges
     )
-    return replace(found, scans=scans, ports=analyse_ports(scenario, rest) if ports else None)
+    return replace(found, scans=scans, ports=analyse_ports(scenario, rest, hands=hands) if ports else None)
 
 
 def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:

@@ -11,7 +11,7 @@ torque J' F and its velocity is x'. A port is numbered as its coordinate, 1 to 3
 its position's state is called "q" with that number, as a joint's is.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
+from ..analysis.arm_rows import build_arm_rows
 from ..analysis.dominance_history import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.vectors import Array
+from ..errors import UsageError
 from ..results import finite_or_none
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES
@@ -33,7 +35,9 @@ from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_passivity import (
     EIGENVALUE_ROUNDING,
+    HandMatrices,
     Passivity,
+    check_against_hands,
     check_passivity,
     clamp_ports,
     find_best_weights,
@@ -136,6 +140,7 @@ class PortAnalysis(NamedTuple):
         transparency: at each site, with one other site free and clamped.
         clamped_verdict: of the roots with that other site clamped.
         axes: names of the ports' numbers in task space, whose ports are forces along them; {}: joints.
+        measured: with measured hands at the masters, see `check_against_hands`; None if there are none.
     """
 
     scenario: Scenario
@@ -153,6 +158,7 @@ class PortAnalysis(NamedTuple):
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
     axes: Mapping[int, str] = MappingProxyType({})
+    measured: frequency_search.Minima | None = None
 
     @property
     def sites(self) -> tuple[str, ...]:
@@ -187,10 +193,12 @@ def analyse_ports(
     rest: Equilibrium,
     of: str | None = None,
     band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
+    hands: Sequence[HandMatrices] = (),
 ) -> PortAnalysis:
     """Returns the analysis of a scenario's ports at an equilibrium, over a band, Hz.
 
-    The site `of` is free and clamped for the others' transparency; None: the slave, or the last site.
+    The site `of` is free and clamped for the others' transparency; None: the slave, or the last site. Of
+    `hands` any may hold any master.
 
     Raises:
         ScenarioError: the scenario has no linear loop.
@@ -199,8 +207,7 @@ def analyse_ports(
     check_band(band_hz)
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
-    slaves = [name for name, site in scenario.sites.items() if site.role == "slave"]
-    of = of or (*slaves, scenario.names[-1])[0]
+    of = of or next((n for n, one in scenario.sites.items() if one.role == "slave"), scenario.names[-1])
     sites, delay_s = port_response.list_port_sites(loop), port_response.find_longest_delay_s(loop)
     Y = port_response.build_admittance(loop)
     w_rad_s = frequency_search.refine_frequencies(Y, frequency_search.build_frequency_grid(*band_hz, delay_s))
@@ -235,7 +242,35 @@ def analyse_ports(
             port_response.apply_loads(loop, {of: port_response.CLAMPED}), 1
         ).verdict,
         axes=name_ports(conditions),
+        measured=check_against_hands(Y, w_rad_s, *_place_hands(scenario, conditions, rest, loop, hands)),
     )
+
+
+def _place_hands(
+    scenario: Scenario,
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    loop: LinearLoop,
+    hands: Sequence[HandMatrices],
+) -> tuple[list[Sequence[HandMatrices]], list[Array]]:
+    """Returns the hands at each master, and its end effector's velocity by those at the ports."""
+    places: list[Array] = []
+    for site, own in zip(conditions.sites, rest.q, strict=True):
+        if not hands or scenario.sites[site.name].role != "master":
+            continue
+        q, ports = own[np.newaxis, : site.layout.joints], port_response.find_site_ports(loop, site.name)
+        J = build_arm_rows(scenario, site.name).place_end_effector(q, np.zeros_like(q)).J[0]
+        if any(len(one.B) != len(J) for one in hands):
+            raise UsageError(f"{site.name}: its end effector moves along {len(J)} axes, a hand along others")
+        place = np.zeros((len(J), len(loop.inputs)))
+        if site.layout.task:  # its ports are axes
+            for n, port in zip(list_followed_axes(site), ports, strict=True):
+                if n <= len(J):
+                    place[n - 1, port] = 1.0
+        else:
+            place[:, ports] = J
+        places.append(place)
+    return [hands] * len(places), places
 
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
@@ -297,6 +332,7 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
         "beta": ports.beta.tolist(),
         "estimates_true": ports.estimates_true,
         "absolute": _minima_to_json(ports.absolute),
+        "measured_operators": None if ports.measured is None else _minima_to_json(ports.measured),
         "llewellyn": [
             {"sites": list(one.sites), "joint": ports.axes.get(one.joint, one.joint), "clamped": one.clamped}
             | _minima_to_json(one.minima)

@@ -14,6 +14,8 @@ structured singular value, exact for up to three blocks: Packard and Doyle, "The
 value", Automatica 29 (1993).
 """
 
+from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +58,62 @@ class Passivity(NamedTuple):
     def passive(self) -> bool:
         """True if no frequency of the grid has a negative eigenvalue."""
         return not self.minima.below
+
+
+class HandMatrices(NamedTuple):
+    """A hand at the end effector as somebody measured it: F = -(M a + B v + K x), shape (n, n) each.
+
+    Attributes:
+        M: mass, kg.
+        B: damping, N s/m.
+        K: stiffness, N/m.
+    """
+
+    M: Array
+    B: Array
+    K: Array
+
+    def dissipate(self, w_rad_s: Array) -> Complex:
+        """Returns the Hermitian part of its impedance at some frequencies, N s/m, shape (F, n, n)."""
+        w = w_rad_s[:, np.newaxis, np.newaxis]
+        Z: Complex = 1j * w * self.M + self.B - 1j * self.K / w
+        whole: Complex = 0.5 * (Z + np.conj(np.swapaxes(Z, -1, -2)))
+        return whole
+
+
+def check_against_hands(
+    response: PortResponse, w_rad_s: Array, held: Sequence[Sequence[HandMatrices]], places: Sequence[Array]
+) -> Minima | None:
+    """Returns the least eigenvalue of Z + Z^H + 2 D over every choice of hands, N m s/rad or N s/m.
+
+    D is what the hands at the ports dissipate. Where it is negative at no frequency, Z = Y^-1 with the shares
+    D of the hands is passive, and so is each hand without its share: the loop is stable with any of these
+    hands, and with passive environments where nobody holds on. Sufficient, as passivity is. None: no hands.
+
+    Args:
+        response: the admittance Y at the ports.
+        w_rad_s: frequencies, rising, shape (F,).
+        held: the hands that may hold on, for each place.
+        places: for each the matrix from velocities at all ports to that of the end effector, shape (n, p).
+    """
+    if not held:
+        return None
+
+    def least(w: Array) -> Array:
+        Z = np.linalg.inv(response(w)).astype(np.complex128)
+        Z += np.conj(np.swapaxes(Z, -1, -2))
+        shares = [
+            [2.0 * J.T @ one.dissipate(w) @ J for one in hands] for hands, J in zip(held, places, strict=True)
+        ]
+        values = [np.linalg.eigvalsh(Z + sum(chosen))[:, 0] for chosen in product(*shares)]
+        found: Array = np.min(values, axis=0)
+        return found
+
+    def tolerance(w: Array) -> Array:
+        size: Array = EIGENVALUE_ROUNDING * np.linalg.norm(np.linalg.inv(response(w)), axis=(1, 2))
+        return size
+
+    return find_minima(least, w_rad_s, tolerance=tolerance)
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
