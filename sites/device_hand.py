@@ -22,8 +22,8 @@ from trilat_net.scenario.operators.kernel_operators import DeviceSettings
 from .devices import Device, DeviceState, Vector
 
 RETRY_NS = 1_000_000_000
-LEAST_BETWEEN_S = 0.005
-"""A state is judged as a jump by this time since the one before at least: machines hand over late."""
+LEAST_S, MOST_S = 0.005, 0.05
+"""Within these a jump is judged by the time since the state before: machines hand over late."""
 TRIPS_KEPT = 60_000
 
 
@@ -84,7 +84,7 @@ class DeviceHand:
             self._since_ns = 0
         elif self._since_ns and before is not None:
             moved = list(map(operator.sub, state.position_m, before))
-            if math.hypot(*moved) > how.jump_m_s * max(passed_s, LEAST_BETWEEN_S):
+            if math.hypot(*moved) > how.jump_m_s * min(max(passed_s, LEAST_S), MOST_S):
                 self.jumps += 1
             else:
                 steps = (how.scale * sum(map(operator.mul, row, moved)) for row in self._rows)

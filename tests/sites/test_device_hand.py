@@ -10,6 +10,7 @@ import pytest
 
 from sites.devices import DeviceState
 from sites.devices.haply_inverse3 import SILENCE_S
+from tests.documentation import find_blocks
 from trilat_net.core.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
 from trilat_net.execution.verify import verify
@@ -238,6 +239,20 @@ def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
     forces = np.array([math.hypot(*force) for _, force in devices[0].rendered])
     stale = np.flatnonzero((forces == 0.0) & (times > 0.6) & (times < 2.4))
     assert 20 < stale.size < 80
+
+
+def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
+    """The class of docs/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
+    names: dict[str, Any] = {}
+    (code,) = [block.text for block in find_blocks("docs/devices.md") if block.language == "python"]
+    exec(code, names)
+    pushed = names["Pushed"]()
+    session = Session.whole(load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path)
+    session.stranger(lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None))
+    log = session.run()
+    target = log["m1"].hand[log["m1"].hand[:, 2] > 0.0, 3:5]
+    assert target[-1, 0] - target[SETTLED, 0] == pytest.approx(0.05 * (len(target) - SETTLED) / 200, rel=0.1)
+    assert pushed.felt_n[0] < -0.1
 
 
 def test_hand_that_is_not_led_by_its_tip_is_refused(tmp_path: Path) -> None:
