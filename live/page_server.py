@@ -13,6 +13,7 @@ import asyncio
 import logging
 import os
 import socket
+import ssl
 import sys
 import threading
 import webbrowser
@@ -22,6 +23,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -35,6 +37,7 @@ from trilat_net.errors import UsageError, WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
+from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 
 from .page_orders import (
@@ -165,12 +168,27 @@ class PageOptions:
         port: 0: any.
         insecure: true: another address than this machine's is allowed, though nothing is encrypted.
         opens: true: a browser is opened where there is one.
+        tls: the folder of a member's keys, by which page and socket are encrypted; None: they are not.
     """
 
     host: str = "127.0.0.1"
     port: int = 0
     insecure: bool = False
     opens: bool = True
+    tls: Path | None = None
+
+    def make_context(self) -> ssl.SSLContext | None:
+        """Returns the keys by which the page is encrypted, or None.
+
+        Raises:
+            UsageError: they cannot be used.
+        """
+        if self.tls is None:
+            return None
+        read_member_keys(self.tls)  # refuses those that have ended, or that others can read
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(self.tls / CERTIFICATE, self.tls / PRIVATE_KEY)
+        return context
 
     def check(self) -> None:
         """Refuses an address that is taken, and to serve others without being told that it is not safe.
@@ -178,10 +196,11 @@ class PageOptions:
         Raises:
             UsageError: with the reason.
         """
-        if self.host not in LOOPBACK and not self.insecure:
+        if self.make_context() is None and self.host not in LOOPBACK and not self.insecure:
             raise UsageError(
                 f"--host {self.host}: whoever reads the network reads the page's token and could take part; "
-                "say --insecure if that network is yours, or leave out --host and use an SSH tunnel"
+                "give the keys of a member with --tls, say --insecure if that network is yours, or leave out "
+                "--host and use an SSH tunnel"
             )
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -214,7 +233,8 @@ class PageServer:
         say: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._bus, self._clock, self._ends, self._say = bus, clock, ends, say
-        self._host, self._port = options.host, options.port
+        self._host, self._port, self._tls = options.host, options.port, options.make_context()
+        self._scheme = "http" if self._tls is None else "https"
         self._met = 0
         self.view = SessionView(bus, clock, session)
         self._frames = SessionFrames(self.view)
@@ -277,6 +297,7 @@ class PageServer:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         server = await serve(
             *(self._attend, self._host, self._port),
+            ssl=self._tls,
             process_request=self._answer,
             create_connection=type("Counted", (Visitor,), {"refused": self.refused}),
             max_size=MAX_MESSAGE_BYTES,
@@ -299,7 +320,7 @@ class PageServer:
 
     @property
     def _base(self) -> str:
-        return f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}/"
+        return f"{self._scheme}://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}/"
 
     def _tell_links(self) -> None:
         """Tells the links of the other roles at the terminal, once the scenario is known."""
@@ -373,7 +394,7 @@ class PageServer:
         if not self._guarded and name not in LOOPBACK:
             return "foreign host"  # a name of somebody else's that leads here
         origin = request.headers.get("Origin")
-        if origin is not None and origin != f"http://{host}":
+        if origin is not None and origin != f"{self._scheme}://{host}":
             return "foreign origin"
         if urlsplit(request.path).path == "/socket" and self._links.find(query) is None:
             return "no token"

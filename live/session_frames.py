@@ -73,12 +73,17 @@ class ArmFrames:
             "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
             "task": self._model.shares_pose,
             "unit": "m" if self._model.shares_pose else "rad",
-            "hand": None
-            if self._hand is None
-            else {"mode": self._hand.mode, "limit": self._hand.actor.limit},
+            "hand": self._describe_hand(),
             "stops": self._spec.on_stale.action == "glide",
             "law": type(self._spec.control).__struct_config__.tag,
         }
+
+    def _describe_hand(self) -> Json | None:
+        if (hand := self._hand) is None:
+            return None
+        how, rows = hand.device, hand.device.rows(self._model.counts.axes)
+        device = {"rows": rows, "scale": how.scale, "jump_m_s": how.jump_m_s}
+        return {"mode": hand.mode, "limit": hand.actor.limit, "device": device}
 
     def pose(self, q: Array) -> Json:
         """Returns the arm at its joints' coordinates q, shape (n,), rad."""

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ from trilat_net.scenario import Scenario, embedded_names_reader, find_site, pars
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
 
+from .device_hand import DeviceHand
+from .devices import Device
 from .session_ping import PingReport, ping_session
 
 GATHER_NS = 500_000_000
@@ -102,6 +104,48 @@ class RunningSession:
         with connect_to_session(*there, stopped=lambda: False, timeout_s=timeout_s) as bus:
             assert bus is not None  # nothing stops it
             yield bus
+
+    @contextmanager
+    def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
+        """Does as `reach`, and waits until a site runs; yields the scenario as well."""
+        with self.reach(timeout_s=timeout_s) as bus:
+            give_up_ns = self._clock.monotonic_ns() + int(timeout_s * 1e9)
+            while True:
+                with suppress(SessionError) if self._clock.monotonic_ns() < give_up_ns else nullcontext():
+                    info = _find_running(bus, self._clock, self.name, site)
+                    break
+                self._clock.sleep_until(self._clock.monotonic_ns() + 50_000_000)
+            yield bus, parse_embedded(info.scenario, self.name)
+
+    def lead(
+        self,
+        site: str,
+        device: Device,
+        *,
+        stopped: Callable[[], bool] = lambda: False,
+        say: Callable[[str], None] = print,
+        timeout_s: float = REPLY_TIMEOUT_S,
+    ) -> None:
+        """Leads the arm of a site by a device until the session ends, as `trilat hand --device`.
+
+        The live hand of its scenario says how. `stopped` may end it sooner; `timeout_s` is the longest wait
+        until the session runs.
+
+        Raises:
+            SessionError: there is no such session, or it does not begin.
+            UsageError: no device can lead that arm.
+        """
+        with self.reach_site(site, timeout_s) as (bus, scenario):
+            who = type(device).__name__
+            with open_hand(bus, self._clock, self.name, site, scenario, who, repeats=False) as held:
+                live = find_live_hand(scenario.sites[site].hands, is_open=True)
+                if live is None or live.mode != "tip":
+                    raise UsageError(
+                        f"a device leads an end effector: the hand of {site} is not of mode 'tip'"
+                    )
+                led = DeviceHand(held, device, live.device, self._clock)
+                led.run(stopped, lambda text: say(f"{site}: {text}"))
+                say(f"{site}: {led.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
         """Stops arms at once, all or some, while the session goes on; as `trilat stop`."""
@@ -369,22 +413,23 @@ def hand(
         UsageError: nobody can hold that arm, or an endpoint cannot be used.
     """
     connection = secure_connection(resolve_member_connection(None, connect, router), keys, insecure=False)
-    clock = SystemClock()
-    with RunningSession(session, connection).reach(timeout_s=timeout_s) as bus:
-        give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-        while True:
-            try:
-                info = _find_running(bus, clock, session, site)
-                break
-            except SessionError:
-                if clock.monotonic_ns() > give_up_ns:
-                    raise
-            clock.sleep_until(clock.monotonic_ns() + 50_000_000)
-        with open_hand(bus, clock, session, site, parse_embedded(info.scenario, session), source) as port:
-            yield port
+    with (
+        RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
+        open_hand(bus, SystemClock(), session, site, scenario, source) as port,
+    ):
+        yield port
 
 
-def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenario, source: str = "") -> Hand:
+def open_hand(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    site: str,
+    scenario: Scenario,
+    source: str = "",
+    *,
+    repeats: bool = True,
+) -> Hand:
     """Returns a hand at a site of a scenario, on a bus that reaches it.
 
     Raises:
@@ -399,7 +444,7 @@ def open_hand(bus: Bus, clock: Clock, session: str, site: str, scenario: Scenari
             f"nobody can take hold of {site}: the scenario has no operator of kind 'live' there{others}"
         )
     place = scenario.arms[site].end_effector if live.mode != "joint" else tuple
-    return Hand(bus, clock, session, site, live.actor, place, source)
+    return Hand(bus, clock, session, site, live.actor, place, source, repeats=repeats)
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 from recorder import backfill, record_process, session_recording
 from recorder.play import player
 from sites import change_server, code_watchdog, external_arm, retransmit_buffer, site_process
+from sites.devices import haply_inverse3, spacemouse
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
@@ -73,6 +74,10 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("design.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
+    ("devices.md", "silent for 150 ms", 150, 1e3 * haply_inverse3.SILENCE_S),
+    ("devices.md", "nothing for 0.1 s", 0.1, spacemouse.STILL_NS / 1e9),
+    ("devices.md", "the force grows within 100 ms", 100, live_hand.GRIP_NS / 1e6),
+    ("devices.md", "older than 100 ms", 100, arm_client.FRESH_NS / 1e6),
     ("external-arm.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
     ("external-arm.md", "silent for 0.03 s", 0.03, external_arm.HELD_SILENCE_NS / 1e9),
     ("external-arm.md", "more than 20 ticks", 20, session_life.HELD_OVERRUN_TICKS),

@@ -73,6 +73,7 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 
 SCENARIO_OF = {
     "docs/arms.md": "six_joints",
+    "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
     "docs/links.md": "paper",
     "docs/ports.md": "two_sites",

@@ -9,6 +9,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,6 +18,8 @@ import pytest
 import trilat_net
 from sites.running_session import open_hand
 from tests.log_editing import recorded
+from tests.net.waiting import until
+from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.net.arm_client import SwitchClient
@@ -103,6 +106,47 @@ def test_a_device_rests_where_hand_and_user_balance(
     assert "(0.0, 20.0) mm" in capsys.readouterr().out
     assert arm.force == pytest.approx((0.0, 6.0), abs=1e-3)
     assert arm.moves == 3000
+
+
+def device_of(name: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Any:
+    """The device by which an example leads m1 of `play`."""
+    led: dict[str, Any] = {}
+    session = SimpleNamespace(lead=lambda site, device: led.update({site: device}))
+    monkeypatch.setattr(trilat_net, "session", lambda name, connect: {("play", None): session}[name, connect])
+    monkeypatch.setattr(sys, "argv", [name, "play", "m1", *options])
+    runpy.run_path(str(LOOK.with_name(name)), run_name="__main__")
+    return led["m1"]
+
+
+def test_force_of_the_haply_example_is_smooth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of 1 N is a sixth of it at once, and whole after 50 ms."""
+    with (
+        HaplyService() as service,
+        device_of("haply_hand.py", monkeypatch, "--address", service.address) as device,
+    ):
+        for _ in range(50):
+            device.read()
+            device.render((0.0, 0.0, 1.0))
+        until(lambda: len(service.asked) == 50)
+        up = [force[2] for force in service.forces]
+    assert up[0] == pytest.approx(1.0 / 6.0)
+    assert max(np.diff(up)) < 0.2
+    assert up[-1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_spacemouse_example_moves_along_one_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    cap = CapReports()
+    with device_of("spacemouse_hand.py", monkeypatch, "--device", cap.path) as device:
+        for _ in range(20):
+            cap.push(100, -300, 20)
+            state = device.read()
+        assert state.position_m[1] > 0.0
+        assert (state.position_m[0], state.position_m[2]) == (0.0, 0.0)
+
+
+def test_scenario_for_headsets_holds_together() -> None:
+    log = trilat_net.simulate(LOOK.with_name("headset.toml"), duration_s=0.5)
+    assert log.scenario.open_hands == ("m1", "m2")
 
 
 def test_a_gamepad_says_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,10 @@ from typing import Any as _Any
 
 if _TYPE_CHECKING:
     from sites.demo_session import run as run
+    from sites.devices import Device as Device
+    from sites.devices import DeviceState as DeviceState
+    from sites.devices.haply_inverse3 import HaplyInverse3 as HaplyInverse3
+    from sites.devices.spacemouse import SpaceMouse as SpaceMouse
     from sites.doctor import doctor as doctor
     from sites.network_benchmark import ping_benchmark as ping_benchmark
     from sites.running_session import hand as hand
@@ -81,6 +85,9 @@ if _TYPE_CHECKING:
 
 _NAMES = {
     "sites.demo_session": "run",
+    "sites.devices": "Device DeviceState",
+    "sites.devices.haply_inverse3": "HaplyInverse3",
+    "sites.devices.spacemouse": "SpaceMouse",
     "sites.doctor": "doctor",
     "sites.network_benchmark": "ping_benchmark",
     "sites.running_session": "hand session start",

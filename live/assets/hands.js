@@ -4,6 +4,8 @@
 const EVERY_MS = 1000 / 60;
 const STILL_MS = 50;
 const REACH_PX = 34;
+const RUMBLE_MS = 100;
+const RUMBLE_N = 0.5; // below that the wall is not felt
 
 export class Hands {
   constructor(arms, hello, send, page, stop) {
@@ -143,6 +145,17 @@ export class Hands {
     card.hold.to = this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to);
   }
 
+  rumble(card, pad) { // of the wall at the arm that it holds, ten times a second, each a little longer than that
+    const force = Math.hypot(...this.page.frame.sites[card.name].wall);
+    const now = performance.now();
+    if (force < RUMBLE_N || now - (card.hold.rumbled ?? 0) < RUMBLE_MS) return;
+    card.hold.rumbled = now;
+    const strength = Math.min(1, force / card.about.hand.limit);
+    const motor = pad.vibrationActuator ?? pad.hapticActuators?.[0];
+    if (motor?.playEffect) motor.playEffect("dual-rumble", { duration: 1.2 * RUMBLE_MS, strongMagnitude: strength, weakMagnitude: strength }).catch(() => {});
+    else motor?.pulse?.(strength, 1.2 * RUMBLE_MS);
+  }
+
   gamepads() { // asked for only once there is one; the trigger or the first button takes hold of the chosen arm, or of the n-th by the n-th pad; "select" stops every arm
     if (!this.padded) return;
     const pads = (navigator.getGamepads?.() || []).filter(Boolean);
@@ -159,6 +172,7 @@ export class Hands {
       const live = (axis) => (Math.abs(pad.axes[axis] || 0) > 0.12 ? pad.axes[axis] : 0);
       const step = (0.6 * card.about.reach * EVERY_MS) / 1000;
       this.shift(card, step * live(0), -step * live(1));
+      this.rumble(card, pad);
     });
   }
 }

@@ -5,6 +5,7 @@ import { Hands } from "./hands.js";
 import { Network, describeLink } from "./network.js";
 import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
+import { Headset } from "./xr.js";
 
 const $ = (id) => document.getElementById(id);
 const page = { hello: null, frame: null, takesPart: null, sent: 0, frames: 0, energies: [] };
@@ -58,7 +59,8 @@ function begin(hello) {
   const network = hello.as ? null : new Network(hello, send, page); // what a site does not know is not on its user's page
   const plots = hello.as ? null : new Plots($("plots"), hello, page);
   const shares = hello.as ? null : new Shares($("shares"), $("share-rows"), hello, send, page);
-  parts = { arms, hands, names, network, plots, shares };
+  const headset = new Headset(arms, hands, page, send, stop, document.querySelector("header"));
+  parts = { arms, hands, names, network, plots, shares, headset };
   page.parts = parts;
 }
 

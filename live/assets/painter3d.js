@@ -6,7 +6,7 @@ const Y = new THREE.Vector3(0, 1, 0);
 const FIELD = 24; // degrees, of the camera
 const vector = ([x, y, z = 0]) => new THREE.Vector3(x, y, z);
 
-class ArmScene {
+export class ArmScene {
   constructor(card, shadows) {
     this.card = card;
     const { about } = card;

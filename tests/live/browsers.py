@@ -52,13 +52,14 @@ def _descends(pid: int) -> bool:
 
 
 @contextmanager
-def browser_page(url: str, *, gl: bool = True, **options: Any) -> Iterator[Page]:
+def browser_page(url: str, *, gl: bool = True, script: str = "", **options: Any) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = launch(playwright, gl=gl)
         try:
             page = browser.new_page(**options)
             problems: list[str] = []
             page.on("pageerror", lambda error: problems.append(str(error)))
+            page.add_init_script(script or "0")
             page.goto(url)
             yield page
             assert problems == []

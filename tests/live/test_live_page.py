@@ -196,6 +196,43 @@ def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
     running.prints("checking the log")
 
 
+MOTORS = """
+window.rumbles = [];
+pad.vibrationActuator = { playEffect: (kind, how) => {
+  rumbles.push({ kind, ...how, at: performance.now(), wall: Math.hypot(...trilat.frame.sites.s.wall) });
+  return Promise.resolve("complete");
+} };
+"""
+
+
+@pytest.mark.long
+def test_a_gamepad_rumbles_as_its_arm_meets_the_wall(stage: Stage) -> None:
+    """Ten times a second at most, as strong as the wall pushes; not before, and not once it is let go."""
+    running = live(stage, "play", "--set", "rate_hz=250")
+    with browser_page(page_address(running), gl=False) as page:
+        shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[2].graspable")
+        page.evaluate(PAD)
+        page.evaluate(MOTORS)
+        page.evaluate("dispatchEvent(new Event('gamepadconnected'))")
+        page.keyboard.press("3")
+        page.evaluate("pad.buttons[0].pressed = true")
+        shows(page, "trilat.frame.holds.includes('s')")
+        assert page.evaluate("rumbles") == []
+        page.evaluate("pad.axes[0] = 1.0")
+        shows(page, "rumbles.length > 5")
+        page.evaluate("Object.assign(pad.axes, [0, 0]); pad.buttons[0].pressed = false")
+        shows(page, "trilat.frame.sites.s.grip === 0 && !trilat.frame.holds.length")
+        rumbles = page.evaluate("rumbles")
+        shows(page, "trilat.frame.n > 30")
+        assert page.evaluate("rumbles.length") == len(rumbles)
+    assert min(np.diff([one["at"] for one in rumbles])) >= 100.0
+    for one in rumbles:
+        assert one["kind"] == "dual-rumble"
+        assert one["strongMagnitude"] == pytest.approx(min(1.0, one["wall"] / 40.0))
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("killed", ["browser", "server"])
 def test_an_arm_in_grip_is_free_after_its_page_dies(killed: str, stage: Stage) -> None:

@@ -2,9 +2,10 @@
 
 import contextlib
 import json
+import ssl
 from collections.abc import Iterator
 from contextlib import closing
-from http.client import HTTPConnection
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
 from socket import SHUT_WR, create_connection, create_server
 from urllib.parse import urlsplit
@@ -12,6 +13,7 @@ from urllib.parse import urlsplit
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
 from live.page_server import MOST_EXCESS, PageOptions, PageServer
@@ -21,6 +23,7 @@ from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import SystemClock
+from trilat_net.net.member_keys import create_keys
 from trilat_net.net.requests import ChangeReply, ChangeRequest, HandMessage
 from trilat_net.net.wire import decode, encode
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -127,6 +130,37 @@ def test_another_address_than_loopback_demands_insecure_and_a_token(network: Loc
         with socket(server) as page:
             assert "hello" in hears(page)
         assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
+
+
+def test_page_by_keys_is_encrypted_and_its_links_say_so(network: LocalNetwork, tmp_path: Path) -> None:
+    """Page and socket, by the certificate of a member; beyond loopback nobody need say insecure."""
+    (keys,) = create_keys(tmp_path / "keys", ["operator"])
+    options = PageOptions(host="0.0.0.0", tls=keys)
+    options.check()
+    with PageServer(network.join(), SystemClock(), "s1", options) as server:
+        assert server.address.startswith("https://0.0.0.0:")
+        trusted = ssl.create_default_context(cafile=keys / "authority.pem")
+        at, _, token = server.address.replace("0.0.0.0", "127.0.0.1").partition("#")
+        page = HTTPSConnection(urlsplit(at).netloc, context=trusted, timeout=5)
+        page.request("GET", "/")
+        assert b"trilat live" in page.getresponse().read()
+        wss = at.replace("https", "wss") + f"socket?{token}"
+        with connect(wss, ssl=trusted, origin=Origin(at.rstrip("/"))) as client:
+            assert "hello" in hears(client)
+        with pytest.raises(InvalidStatus, match="403"), connect(wss, ssl=trusted, origin=Origin("http://a")):
+            pass
+        with pytest.raises(ssl.SSLCertVerificationError):
+            HTTPSConnection(urlsplit(at).netloc, context=ssl.create_default_context()).connect()
+        with pytest.raises((OSError, HTTPException)):
+            get(server, "/")  # without encryption
+
+
+def test_keys_that_cannot_be_used_are_found_before_anything_begins(tmp_path: Path) -> None:
+    create_keys(tmp_path / "keys", ["operator"])
+    with pytest.raises(UsageError, match="name the folder of one member"):
+        PageOptions(tls=tmp_path / "keys").check()
+    with pytest.raises(UsageError, match="no keys of `trilat keys new`"):
+        PageOptions(tls=tmp_path).check()
 
 
 @pytest.mark.parametrize(

@@ -84,26 +84,36 @@ def site_command(
     raise typer.Exit(run_site(chosen, name, how, terminal.print_line))
 
 
-@options.command("m2 --scenario my_run.toml")
+@options.command("m2 --scenario my_run.toml", "m1 --session play --device haply_inverse3")
 def hand_command(
+    context: typer.Context,
     name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
-    scenario: Annotated[str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)],
+    scenario: Annotated[
+        str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
+    ] = "",
     session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
     join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the site, s.")] = 60.0,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
+    device: Annotated[str | None, value("--device", "NAME[=ADDRESS]")] = None,
     *,
     reach: options.Reach,
 ) -> None:
-    """Runs the hand of your own at a site in a process of its own: kind = "own", process = true.
+    """Runs a hand at a site: a class of your own in a process of its own, or a device that you hold.
 
-    It sees what the site sees, and decides; the site lets each decision act after the hand's delay_ms.
+    The class (kind = "own", process = true) sees what the site sees, and decides; the site lets each decision
+    act after the hand's delay_ms. A device (kind = "live") leads the arm of a session that runs already.
 
     Options:
         name: Name of the site in the scenario.
-        scenario: The scenario that the site runs: a shipped name, or path of a TOML file.
+        scenario: Of a class: the scenario that the site runs: a shipped name, or path of a TOML file.
+        device: haply_inverse3 or spacemouse; the scenario of the session says how it leads the arm.
     """
+    if device is not None:
+        if extra := {"--scenario", "--duration", "--seed", "--set"} & set(options.given_options(context)):
+            raise UsageError(f"--device leads an arm of a session that runs: leave out {min(extra)}")
+        return _lead_by_device(device, name, session, reach, join_timeout)
     from sites.hand_process import run_hand
 
     from ..net.connection import default_endpoints
@@ -117,6 +127,21 @@ def hand_command(
     connection = options.MemberOptions(None, *reach).resolve((), [places[name]]).require(OPERATOR)
     with Interrupt() as interrupt:
         run_hand(chosen, name, identity, connection, interrupt, terminal.print_line, join_timeout)
+    if interrupt.requested():
+        raise typer.Exit(interrupt.exit_code)
+    return None
+
+
+def _lead_by_device(
+    device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
+) -> None:
+    from sites.devices import open_device
+    from sites.running_session import RunningSession
+
+    running = RunningSession(options.check_session_name(session or ""), reach.resolve())
+    opened, say = open_device(device), terminal.print_line
+    with Interrupt() as interrupt:
+        running.lead(name, opened, stopped=interrupt.requested, say=say, timeout_s=timeout_s)
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)
 

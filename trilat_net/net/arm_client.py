@@ -249,6 +249,7 @@ class Hand(SiteClient):
         operator: the live hand of the scenario, as the core has it.
         place: returns where the arm is by its joint angles, in the coordinates of the target.
         source: who this is, for people.
+        repeats: whether a thread repeats its last message; without it, a program that hangs lets go.
     """
 
     def __init__(
@@ -260,14 +261,16 @@ class Hand(SiteClient):
         operator: TorqueSource,
         place: Callable[[Sequence[float]], Sequence[float]],
         source: str = "",
+        *,
+        repeats: bool = True,
     ) -> None:
         super().__init__(bus, clock, session, site)
         self._operator, self._place, self._source = operator, place, source
         self._sender = make_hand_sender(bus, clock, session, site)
         self._message: HandMessage | None = None
         self._lock, self._ended = threading.Lock(), threading.Event()
-        self._heart = threading.Thread(target=self._beat, daemon=True)
-        self._heart.start()
+        if repeats:
+            threading.Thread(target=self._beat, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
         """Lets go, and waits until the site has heard it; the connection is its owner's."""

@@ -26,6 +26,13 @@ FARTHEST = 100.0
 """Largest norm of a live hand's target, m or rad; what is further is no arm's."""
 STRONGEST = 10.0
 """Largest force of one that is taken, in parts of its limit; up to that it is limited."""
+DIRECTIONS = {
+    "right": (1.0, 0.0, 0.0), "left": (-1.0, 0.0, 0.0), "ahead": (0.0, 1.0, 0.0),
+    "back": (0.0, -1.0, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
+}  # fmt: skip
+"""Of whoever holds a device: x to the right, y ahead, z up."""
+FRAMES = {2: ("right", "up"), 3: ("ahead", "left", "up")}
+"""Where the axes of an arm point, by their number, if its scenario does not say it."""
 _AXES_WORDS = {
     "stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
@@ -201,6 +208,33 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return TorqueSource(TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table)
 
 
+class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
+    """How a device in somebody's hand leads an arm, and what it renders of the arm's reaction.
+
+    Attributes:
+        frame: where each axis of the arm points, for whoever holds the device: "right", "left", "ahead",
+            "back", "up" or "down"; left out: right and up in the plane, ahead, left and up in space.
+        scale: motion of the target over motion of the device.
+        clutch: the button that leads the arm while it is pressed; pressed first, it takes hold.
+        release: the button that lets go.
+        force_scale: force on the device over the reaction of the arm.
+        force_limit_n: the largest force on the device, N.
+        jump_m_s: a device that is faster has jumped, m/s; a jump moves nothing.
+    """
+
+    frame: Annotated[tuple[str, ...], Meta(max_length=3)] = ()
+    scale: fields.Positive = 1.0
+    clutch: str = "a"
+    release: str = "b"
+    force_scale: fields.NotNegative = 1.0
+    force_limit_n: fields.Positive = 2.0
+    jump_m_s: fields.Positive = 5.0
+
+    def rows(self, axes: int) -> list[tuple[float, ...]]:
+        """Returns the axes of an arm, each as a direction of whoever holds the device."""
+        return [DIRECTIONS[word] for word in self.frame or FRAMES[axes]]
+
+
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """An operator who takes hold while a live session runs, with a mouse, a device or a program.
 
@@ -219,9 +253,13 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         damping_nm_s_rad: of "joint", per joint, N m s/rad.
         torque_limit_nm: of "joint", the largest norm of its torques, N m.
         speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
+        device: of "tip", how a device leads it (`trilat hand --device`, a controller in virtual reality).
     """
 
-    words: ClassVar[Mapping[str, str]] = _AXES_WORDS
+    words: ClassVar[Mapping[str, str]] = {
+        **_AXES_WORDS,
+        "device": "a table of " + ", ".join(fields.field_names(DeviceSettings)),
+    }
     is_open: ClassVar[bool] = True
     """True: whoever comes may take hold."""
 
@@ -234,9 +272,10 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     damping_nm_s_rad: fields.NotNegativeJoints = (3.0,)
     torque_limit_nm: fields.Positive = 20.0
     speed_limit_rad_s: fields.Positive = 4.0
+    device: DeviceSettings = DeviceSettings()
 
     @classmethod
-    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:  # noqa: ARG003 - as all kinds
+    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
         """Leaves out what another mode has; refuses what the author wrote of that."""
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
@@ -249,6 +288,12 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                     path=f"{path}.{key}",
                 )
             del table[key]
+        device, axes = table.get("device"), holding.counts.axes
+        if isinstance(device, dict) and isinstance(frame := device.get("frame"), list):
+            lines = {tuple(map(abs, DIRECTIONS.get(str(word), ()))) for word in frame}
+            if not len(frame) == axes == len(lines - {()}):
+                words = f"one of {', '.join(DIRECTIONS)} for each of {axes} axes, and no two of one line"
+                raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
     def rules(self, rate_hz: int, counts: fields.VectorCounts) -> HandRules:
         """Returns what somebody who holds an arm of such vectors may do."""
@@ -268,7 +313,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 LIVE_KEYS = {
-    "tip": ("stiffness_n_m", "damping_n_s_m", "force_limit_n", "speed_limit_m_s"),
+    "tip": ("stiffness_n_m", "damping_n_s_m", "force_limit_n", "speed_limit_m_s", "device"),
     "joint": ("stiffness_nm_rad", "damping_nm_s_rad", "torque_limit_nm", "speed_limit_rad_s"),
     "force": ("force_limit_n",),
 }
