@@ -229,8 +229,7 @@ class SessionFrames:
         """
         own = frame["sites"][site]
         shown = self._view.find_shown(site, own["tick"], own["used"])
-        names = (name for name in frame["sites"] if name != site)
-        known = {name: self._find_known(site, name, shown.get(name, -1)) for name in names}
+        known = {name: self._find_known(site, name, tick) for name, tick in shown.items()}
         if ages:
             rates = {name: self._view.sites[name].window.rate_hz for name in known}
             for name, peer in known.items():

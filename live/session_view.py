@@ -37,7 +37,7 @@ from trilat_net.scenario import (
     scheduled_link_tables,
 )
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
-from trilat_net.scenario.sample_uses import PictureDelay, find_picture_delay
+from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
@@ -130,7 +130,7 @@ class SessionView:
         self.energy: RunningEnergy | None = None
         self.events: Tail[Event] = Tail(EVENTS_KEPT)
         self.dropped: Counter[str] = Counter()
-        self._pictures: dict[str, PictureDelay | None] = {}
+        self._pictures: dict[str, PictureDelay] = {}
         self._planned: list[tuple[int, str, dict[str, Any]]] = []
         self._changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
@@ -191,11 +191,11 @@ class SessionView:
             tick: of the site.
             used: the peers' samples that it has in use then, which its user sees without a view of their own.
         """
-        if self.scenario is not None and site not in self._pictures:
-            self._pictures[site] = find_picture_delay(self.scenario, site)
-        if (picture := self._pictures.get(site)) is None:
-            return used
-        return {peer: self.sites[peer].window.find_last(shown) for peer, shown in picture.at(tick).items()}
+        assert self.scenario is not None
+        if site not in self._pictures:
+            self._pictures[site] = PictureDelay(self.scenario, site)
+        shown = self._pictures[site].at(tick, used)
+        return {peer: min(last, self.sites[peer].window.newest) for peer, last in shown.items()}
 
     def _meet(self) -> None:
         for info in self._query.poll():

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console
 
-from sites.monitor import AGES, HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
+from sites.monitor import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net.bus import Bus
@@ -22,7 +22,7 @@ from trilat_net.process import Interrupt
 from trilat_net.scenario import embedded_names_reader, find_site
 
 from .page_orders import OrderDesk
-from .session_view import SessionView, SiteView
+from .session_view import SessionView
 
 POLL_NS = 20_000_000
 STOP_KEYS = frozenset(" sS")
@@ -104,29 +104,20 @@ class SessionWatch:
 
     def rows(self) -> list[SiteRow]:
         """Returns the row of each site; of a peer of the site that is watched, what its user is shown."""
-        view, scenario = self.view, self.view.scenario
-        own = view.sites.get(self._as_site)
-        record = None if own is None else own.record
-        if self._as_site and record is None:
-            return []
-        shown = {} if record is None else view.find_shown(self._as_site, record.tick, record.used)
-        return [
-            describe_site(scenario, name, site.record, site.stats, silent=view.silent(site))
-            if record is None or name not in shown
-            else _describe_shown(name, site, shown[name], record.t_ns)
+        view, scenario, own = self.view, self.view.scenario, self._as_site
+        every = {
+            name: describe_site(scenario, name, site.record, site.stats, silent=view.silent(site))
             for name, site in view.sites.items()
-            if scenario is not None
-        ]
-
-
-def _describe_shown(name: str, site: SiteView, tick: int, now_ns: int) -> SiteRow:
-    """Returns the row of a peer as it was at a tick."""
-    row = dict.fromkeys(HEADS, "") | {"site": name}
-    if not site.window.knows(tick):
-        return row
-    t_ns, q = tick * NS_PER_S // site.window.rate_hz, site.window.rows(tick, tick).q[0]
-    age = f"shown after {(now_ns - t_ns) / 1e6:.0f} ms"
-    return row | {"time": f"{t_ns / NS_PER_S:.1f} s", "angles": describe_angles(q.tolist()), AGES: age}
+            if scenario is not None and own in ("", name)
+        }
+        record = view.sites[own].record if own in every else None
+        for peer, tick in view.find_shown(own, record.tick, record.used).items() if record else ():
+            window, row = view.sites[peer].window, dict.fromkeys(HEADS, "") | {"site": peer}
+            if window.knows(tick):
+                row["time"] = f"{tick / window.rate_hz:.3f} s"
+                row["angles"] = describe_angles(window.rows(tick, tick).q[0].tolist())
+            every[peer] = row
+        return list(every.values())
 
 
 @contextmanager

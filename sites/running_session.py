@@ -32,7 +32,7 @@ from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
-from trilat_net.scenario.sample_uses import PictureDelay, find_picture_delay
+from trilat_net.scenario.sample_uses import PictureDelay
 
 from .session_ping import PingReport, ping_session
 
@@ -228,7 +228,7 @@ class RunningSession:
         with self.reach("") as bus:
             ring = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
             kept: dict[str, deque[State]] = {}
-            pictures: dict[str, PictureDelay | None] = {}
+            pictures: dict[str, PictureDelay] = {}
 
             def find() -> dict[str, State]:
                 for record in read_records(ring):
@@ -237,15 +237,12 @@ class RunningSession:
                 if not as_site or as_site not in newest:
                     return {} if as_site else newest
                 if as_site not in pictures:
-                    info = find_site_info(
-                        bus, self._clock, self.name, as_site, embedded_names_reader(self.name)
-                    )
-                    scenario = parse_embedded(info.scenario, self.name)
-                    pictures[as_site] = find_picture_delay(scenario, as_site)
-                own, picture = newest[as_site], pictures[as_site]
-                ticks = own.used if picture is None else picture.at(own.tick)
-                back = {peer: reversed(kept.get(peer, deque())) for peer in ticks}
-                seen = {at: next((r for r in back[at] if r.tick == k), None) for at, k in ticks.items()}
+                    info = _find_running(bus, self._clock, self.name, as_site)
+                    pictures[as_site] = PictureDelay(parse_embedded(info.scenario, self.name), as_site)
+                own = newest[as_site]
+                shown = pictures[as_site].at(own.tick, own.used)
+                back = {peer: reversed(kept.get(peer, deque())) for peer in shown}
+                seen = {at: next((r for r in back[at] if r.tick == k), None) for at, k in shown.items()}
                 return {as_site: own, **{peer: one for peer, one in seen.items() if one is not None}}
 
             yield find

@@ -97,7 +97,7 @@ def test_a_peer_stays_until_its_missing_record_has_come(tmp_path: Path) -> None:
         if known["age_ms"] is not None:
             assert known["age_ms"] == pytest.approx(own["tick"] - known["tick"])
     assert min(behind) == 0
-    assert max(behind) > 100
+    assert max(behind) > 50
     assert behind[-1] == 0
 
 

@@ -38,7 +38,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.operators.kernel_operators import find_live_hand
-from ..scenario.sample_uses import find_picture_delay
+from ..scenario.sample_uses import PictureDelay
 from .accounting import LAST, SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
@@ -398,17 +398,12 @@ class Log(Result, Mapping[str, SiteLog]):
     def shown(self, site: str) -> dict[str, Ints]:
         """Returns the tick of each peer that a site's user was shown at its records, -1 before the first.
 
-        That is the sample in use; with `[sites.NAME.view]`, of the peer's records the last one up to the tick
-        that had come over the view by then.
+        That is the sample in use; with `[sites.NAME.view]` the newest that had come over the view by then.
         """
-        part, picture = self[site], find_picture_delay(self.scenario, site)
-        if picture is None:
-            return part.used
-        shown = [list(picture.at(tick).values()) for tick in range(part.last_tick + 1)]
-        columns = np.array(shown, dtype=np.int64).reshape(-1, len(part.peers))[part.tick].T
-        made = (np.append(-1, self[peer].tick) for peer in part.peers)
-        places = zip(part.peers, made, columns, strict=True)
-        return {peer: ticks[np.searchsorted(ticks, column, "right") - 1] for peer, ticks, column in places}
+        part = self[site]
+        every = PictureDelay(self.scenario, site).list_all(part.last_tick + 1)
+        shown = {peer: np.minimum(ticks[part.tick], self[peer].last_tick) for peer, ticks in every.items()}
+        return {**part.used, **shown}
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published, in order."""

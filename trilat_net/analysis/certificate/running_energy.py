@@ -109,11 +109,6 @@ class RecordWindow:
         """True if there is a record of a tick."""
         return self.first <= tick <= self.newest and bool(self._known[tick - self.first])
 
-    def find_last(self, tick: int) -> int:
-        """Returns the last tick up to one of which there is a record, -1 without any."""
-        there = np.flatnonzero(self._known[: max(0, tick + 1 - self.first)])
-        return self.first + int(there[-1]) if len(there) else -1
-
     def rows(self, first: int, last: int) -> AlignedRecords:
         """Returns the records of ticks in the window, both ends included; a missing one is interpolated."""
         part = slice(first - self.first, last + 1 - self.first)
