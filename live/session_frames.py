@@ -3,7 +3,8 @@
 Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next frame
 is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people by the transpose of
 the Jacobian, which near a singular pose gives the least force that explains the torque. A frame as one site
-knows the session shows of a peer nothing but the pose of the sample that the site's newest record has in use.
+knows the session shows of a peer nothing but its pose at one tick: that of the sample that the site's newest
+record has in use, or which the picture of the site's user has come to (`SessionView.find_shown`).
 """
 
 from contextlib import suppress
@@ -224,7 +225,7 @@ class SessionFrames:
         return {**about, **hidden} if about["running"] else about
 
     def narrow(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame as one site knows the session: its own arm now, its peers as it has them in use.
+        """Returns a frame as one site knows the session: its own arm now, its peers as shown to its user.
 
         Args:
             frame: the newest that `make` has returned.
@@ -232,7 +233,8 @@ class SessionFrames:
             ages: true: each peer has the age of what is shown, ms.
         """
         own = frame["sites"][site]
-        known = {name: self._find_known(own, site, name) for name in frame["sites"] if name != site}
+        shown = self._view.find_shown(site, own["tick"], own["used"])
+        known = {name: self._find_known(site, name, tick) for name, tick in shown.items()}
         if ages:
             rates = {name: self._view.sites[name].window.rate_hz for name in known}
             for name, peer in known.items():
@@ -248,14 +250,14 @@ class SessionFrames:
             "ended": frame["ended"],
         }
 
-    def _find_known(self, own: Json, site: str, peer: str) -> Json:
-        """Returns a peer at the sample in use; while its record is not there, the one that was found last."""
+    def _find_known(self, site: str, peer: str, tick: int) -> Json:
+        """Returns a peer at a tick; while its record is not there, as it was found last."""
         known = self._known.get((site, peer)) or self._arms[peer].at_start()
-        used, other = own["used"].get(peer, -1), self._view.sites[peer]
-        if used != known["tick"] and other.window.knows(used):
-            q = other.window.rows(used, used).q[0]
-            bodies = _rounded(np.array(other.bodies.get(used, [])))
-            known = {**self._arms[peer].pose(q), "tick": used, "bodies": bodies}
+        other = self._view.sites[peer]
+        if tick != known["tick"] and other.window.knows(tick):
+            q = other.window.rows(tick, tick).q[0]
+            bodies = _rounded(np.array(other.bodies.get(tick, [])))
+            known = {**self._arms[peer].pose(q), "tick": tick, "bodies": bodies}
         self._known[site, peer] = known
         return known
 

@@ -6,6 +6,7 @@ for no records from before it, and for all events, which say what was changed.
 """
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -36,6 +37,7 @@ from trilat_net.scenario import (
     scheduled_link_tables,
 )
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
+from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
@@ -128,6 +130,7 @@ class SessionView:
         self.energy: RunningEnergy | None = None
         self.events: Tail[Event] = Tail(EVENTS_KEPT)
         self.dropped: Counter[str] = Counter()
+        self._pictures: dict[str, PictureDelay] = {}
         self._planned: list[tuple[int, str, dict[str, Any]]] = []
         self._changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
@@ -179,6 +182,20 @@ class SessionView:
         """Returns V at the ticks of which all records have come since the last call; None without any."""
         complete = {name: site.complete for name, site in self.sites.items()}
         return None if self.energy is None else self.energy.advance(complete)
+
+    def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
+        """Returns the tick of each peer that a site's user is shown at a tick that never goes back.
+
+        Args:
+            site: the site.
+            tick: of the site.
+            used: the peers' samples that it has in use then, which its user sees without a view of their own.
+        """
+        assert self.scenario is not None
+        if site not in self._pictures:
+            self._pictures[site] = PictureDelay(self.scenario, site)
+        shown = self._pictures[site].at(tick, used)
+        return {peer: min(last, self.sites[peer].window.newest) for peer, last in shown.items()}
 
     def _meet(self) -> None:
         for info in self._query.poll():

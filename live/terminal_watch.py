@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console
 
-from sites.monitor import SessionDisplay, SiteRow, describe_site
+from sites.monitor import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net.bus import Bus
@@ -19,7 +19,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import connect_to_session
 from trilat_net.process import Interrupt
-from trilat_net.scenario import embedded_names_reader
+from trilat_net.scenario import embedded_names_reader, find_site
 
 from .page_orders import OrderDesk
 from .session_view import SessionView
@@ -68,16 +68,18 @@ def watch_session(
 
 
 class SessionWatch:
-    """What is shown of a session; `update` takes in what has come."""
+    """What is shown of a session, or of it to the user of one site; `update` takes in what has come."""
 
-    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+    def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
         self.view = SessionView(bus, clock, session)
-        self._V = ""
+        self._V, self._as_site = "", as_site
 
     def update(self) -> None:
         """Takes in what has come, and computes V as far as all records are there."""
         view = self.view
         view.poll()
+        if self._as_site and view.scenario is not None:
+            find_site(view.scenario, self._as_site)
         if (course := view.advance_energy()) is not None:
             self._V = f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, people and walls gave "
             self._V += f"{course.supplied[-1]:.4g} J"
@@ -87,33 +89,43 @@ class SessionWatch:
     @property
     def title(self) -> str:
         """The session, and its V."""
-        state = self._V if self.view.running else "waits for its members"
+        shown = f"as {self._as_site} knows it" if self._as_site else self._V
+        state = shown if self.view.running else "waits for its members"
         return f"session {self.view.session}" + (f"; {state}" if state else "")
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
         """The sites that hold, are stopped or in fault, each with its alarm, while they run."""
         view = self.view
-        running = {name: site for name, site in view.sites.items() if not view.silent(site)}
+        known = {name: site for name, site in view.sites.items() if self._as_site in ("", name)}
+        running = {name: site for name, site in known.items() if not view.silent(site)}
         found = ((name, site.find_alarm(view.session, name)) for name, site in running.items())
         return [(name, alarm) for name, alarm in found if alarm is not None]
 
     def rows(self) -> list[SiteRow]:
-        """Returns the row of each site."""
-        view, scenario = self.view, self.view.scenario
-        return [
-            describe_site(scenario, name, site.record, site.stats, silent=view.silent(site))
+        """Returns the row of each site; of a peer of the site that is watched, what its user is shown."""
+        view, scenario, own = self.view, self.view.scenario, self._as_site
+        every = {
+            name: describe_site(scenario, name, site.record, site.stats, silent=view.silent(site))
             for name, site in view.sites.items()
-            if scenario is not None
-        ]
+            if scenario is not None and own in ("", name)
+        }
+        record = view.sites[own].record if own in every else None
+        for peer, tick in view.find_shown(own, record.tick, record.used).items() if record else ():
+            window, row = view.sites[peer].window, dict.fromkeys(HEADS, "") | {"site": peer}
+            if window.knows(tick):
+                row["time"] = f"{tick / window.rate_hz:.3f} s"
+                row["angles"] = describe_angles(window.rows(tick, tick).q[0].tolist())
+            every[peer] = row
+        return list(every.values())
 
 
 @contextmanager
 def show_in_terminal(
-    clock: Clock, session: str, console: Console, bus: Bus
+    clock: Clock, session: str, as_site: str, console: Console, bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
     """The `SessionOnlooker` of a terminal."""
-    watch, desk = SessionWatch(bus, clock, session), OrderDesk(bus, clock, session)
+    watch, desk = SessionWatch(bus, clock, session, as_site), OrderDesk(bus, clock, session)
     with _read_keys() as read_keys, SessionDisplay(console, clock) as display:
         if read_keys is not None:
             display.say("S or space: stop every arm")

@@ -61,7 +61,7 @@ def describe_site(
         row |= {
             "time": f"{record.t_ns / NS_PER_S:.1f} s",
             "mode": record.mode,
-            "angles": " ".join(f"{q:+.3f}" for q in record.q) + " rad",
+            "angles": describe_angles(record.q),
             "|e|": f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}",
             "torque": f"{max(map(abs, record.tau)):.2f} N m",
             "held": "" if hand is None else "yes" if hand.source else "fades" if hand.grip else "free",
@@ -69,11 +69,16 @@ def describe_site(
     return row | {"mode": "silent"} if silent else row
 
 
+def describe_angles(q: Sequence[float]) -> str:
+    """Returns joint angles as a row has them."""
+    return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
+
+
 def describe_row(row: SiteRow) -> str:
     """Returns a site in a line of text."""
-    parts = [f"{row['site']} {row['time']} {row['mode']}", row["angles"]]
-    parts += [f"|e| {row['|e|']}", f"torque {row['torque']}", f"age {row[AGES]}"]
-    return "; ".join([*parts, *([f"hand {row['held']}"] if row["held"] else []), f"late {row['late']}"])
+    words = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
+    parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
+    return "; ".join([*parts, *(f"{word} {row[key]}" for word, key in words.items() if row[key])])
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:

@@ -32,6 +32,7 @@ from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
+from trilat_net.scenario.sample_uses import PictureDelay
 
 from .device_hand import DeviceHand
 from .devices import Device
@@ -260,9 +261,10 @@ class RunningSession:
     def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
         """Listens to all sites; yields a function that returns a record of each, by name.
 
-        That is the newest one; with `as_site` what that site knows: its own newest record, and of each peer
-        the one whose sample it has in use, delayed as its links are. There is none of a peer whose sample was
-        made before this listened, or more than `STATES_KEPT` ticks ago.
+        That is the newest one; with `as_site` what that site's user is shown: its own newest record, and of
+        each peer the one whose sample it has in use, delayed as its links are, or the one that its picture
+        shows (`[sites.NAME.view]`). There is none of a peer whose sample was made before this listened, or
+        more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
@@ -270,6 +272,7 @@ class RunningSession:
         with self.reach("") as bus:
             ring = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
             kept: dict[str, deque[State]] = {}
+            pictures: dict[str, PictureDelay] = {}
 
             def find() -> dict[str, State]:
                 for record in read_records(ring):
@@ -277,9 +280,13 @@ class RunningSession:
                 newest = {site: records[-1] for site, records in kept.items()}
                 if not as_site or as_site not in newest:
                     return {} if as_site else newest
+                if as_site not in pictures:
+                    info = _find_running(bus, self._clock, self.name, as_site)
+                    pictures[as_site] = PictureDelay(parse_embedded(info.scenario, self.name), as_site)
                 own = newest[as_site]
-                back = {peer: reversed(kept.get(peer, deque())) for peer in own.used}
-                seen = {at: next((r for r in back[at] if r.tick == k), None) for at, k in own.used.items()}
+                shown = pictures[as_site].at(own.tick, own.used)
+                back = {peer: reversed(kept.get(peer, deque())) for peer in shown}
+                seen = {at: next((r for r in back[at] if r.tick == k), None) for at, k in shown.items()}
                 return {as_site: own, **{peer: one for peer, one in seen.items() if one is not None}}
 
             yield find

@@ -14,11 +14,9 @@ from scipy import stats
 
 import trilat_net
 from tests.analysis.ages_in_use import in_order, newest_wins
-from trilat_net.analysis import link_summary as module
 from trilat_net.analysis.link_summary import (
     bin_ages,
     compute_statistics,
-    first_ticks,
     predict_delivery,
     summarise_links,
 )
@@ -27,6 +25,8 @@ from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import first_tick_at
 from trilat_net.errors import LogError
 from trilat_net.scenario import load_scenario, parse_scenario
+from trilat_net.scenario import sample_uses as module
+from trilat_net.scenario.sample_uses import first_ticks
 
 from . import logs
 

@@ -57,6 +57,7 @@ overrides = st.fixed_dictionaries(
     {},
     optional={
         "link": links(),
+        "sites.m1.view": links(without=("measured",)),
         "links": st.dictionaries(st.sampled_from(EVERY), links(), max_size=3),
         "control": laws,
         "sites.s.control": laws,

@@ -13,21 +13,19 @@ arrived nor as missing.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..core.channel import LOST, schedule_deliveries
-from ..core.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
-from ..core.link import AHEAD_LIMIT_NS, link_dtype
-from ..core.site_setup import LinkSetup
+from ..core.channel import LOST
+from ..core.delay import DelayKind
+from ..core.link import AHEAD_LIMIT_NS
 from ..core.ticks import NS_PER_S
-from ..core.vectors import Array, Row
+from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
+from ..scenario.sample_uses import LinkSchedule, first_ticks
 from .aligned import Bools
 from .timeline import StatedModel, list_changes, list_stated_models
-
-_BLOCK = 8192
 
 
 class PredictedDelivery(NamedTuple):
@@ -64,11 +62,6 @@ class PredictedDelivery(NamedTuple):
         return np.where(self.lost, LOST, ticks)
 
 
-def first_ticks(due_ns: Ints, rate_hz: int) -> Ints:
-    """Returns the first ticks at or after times, ns; `core.ticks.first_tick_at` for arrays."""
-    return -(-due_ns * rate_hz // NS_PER_S)
-
-
 def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
     """Returns the predicted delivery of the first `count` samples of a link, peer -> site.
 
@@ -79,45 +72,13 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
     index = log[site].peers.index(peer)
     commands = (command for batch in log.commands(site).values() for command in batch)
     ordered = [one.model for one in commands if one.peer == index and one.model is not None]
-    models, points = _list_models(setup, ordered)
-    due_ns, copies = _schedule(setup, models, points, count)
-    alone = models.copy()
-    alone["duplicate"], alone["in_order"], alone["playout_us"] = 0.0, 0, 0
-    drawn_ns = due_ns if np.array_equal(alone, models) else _schedule(setup, alone, points, count)[0]
+    whole, alone = LinkSchedule(setup, ordered), LinkSchedule(setup, ordered)
+    alone.models["duplicate"], alone.models["in_order"], alone.models["playout_us"] = 0.0, 0, 0
+    models, due_ns = whole.models, whole.draw(count)
+    drawn_ns = due_ns if np.array_equal(alone.models, models) else alone.draw(count)
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
-    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, copies)
-
-
-def _schedule(setup: LinkSetup, models: NDArray[np.void], points: Ints, count: int) -> tuple[Ints, int]:
-    """Returns when each sample is due, and the number of copies; by a row of the core's link."""
-    row: Row = np.zeros(1, link_dtype(0))[0]
-    row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(models)
-    row.used, row.foreseen = -1, -1
-    row.outage_first, row.outage_count = len(points) - len(setup.outages), len(setup.outages)
-    due_ns = np.empty(count, dtype=np.int64)
-    dues = np.empty(_BLOCK, dtype=np.int64)
-    for start in range(0, count, _BLOCK):
-        end = min(start + _BLOCK, count)
-        schedule_deliveries(end - 1, row, models, dues, points)
-        due_ns[start:end] = dues[: end - start]
-    return due_ns, int(row.copies)
-
-
-def _list_models(setup: LinkSetup, ordered: list[LinkModel]) -> tuple[NDArray[np.void], Ints]:
-    """Returns a link's models in the order of their first stamps, and its points: traces, then outages.
-
-    Ordered changes hold from a time at which no sample had been decided, so all can stand there at once.
-    """
-    points: list[tuple[int, int]] = []
-    placed = []
-    for model, trace in zip(setup.models, setup.traces, strict=True):
-        if trace is not None:
-            model = model._replace(trace_first=len(points), trace_count=len(trace))
-            points += [(int(t_us), int(delay_us)) for t_us, delay_us in trace]
-        placed.append(model)
-    models = np.array(sorted([*placed, *ordered], key=lambda model: model.from_ns), LINK_MODEL_DTYPE)
-    return models, np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
+    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, whole.copies)
 
 
 class Arrivals(NamedTuple):

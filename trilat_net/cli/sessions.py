@@ -250,6 +250,9 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
 def watch_command(
     session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
+    as_site: Annotated[
+        str, value("--as", "SITE", "Show what this site's user is shown, and nothing else.")
+    ] = "",
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
@@ -261,7 +264,7 @@ def watch_command(
     from live.terminal_watch import show_in_terminal, watch_session
 
     name, clock = options.check_session_name(session), SystemClock()
-    show = partial(show_in_terminal, clock, name, terminal.out)
+    show = partial(show_in_terminal, clock, name, as_site, terminal.out)
     raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
 
 

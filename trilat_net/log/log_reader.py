@@ -38,6 +38,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.operators.kernel_operators import find_live_hand
+from ..scenario.sample_uses import PictureDelay
 from .accounting import LAST, SessionAccounts
 from .data_tables import (
     EVENTS_TABLE,
@@ -53,6 +54,7 @@ from .data_tables import (
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import identify_session, merge_parts
+from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:
@@ -392,6 +394,16 @@ class Log(Result, Mapping[str, SiteLog]):
             }
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
+
+    def shown(self, site: str) -> dict[str, Ints]:
+        """Returns the tick of each peer that a site's user was shown at its records, -1 before the first.
+
+        That is the sample in use; with `[sites.NAME.view]` the newest that had come over the view by then.
+        """
+        part = self[site]
+        every = PictureDelay(self.scenario, site).list_all(part.last_tick + 1)
+        shown = {peer: np.minimum(ticks[part.tick], self[peer].last_tick) for peer, ticks in every.items()}
+        return {**part.used, **shown}
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published, in order."""

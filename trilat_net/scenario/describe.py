@@ -112,6 +112,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
         + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
         *(links if len(set(words.values())) > 1 else [f"every link: {next(iter(words.values()))}"]),
+        *(f"view of {name}: {one.view.describe()}" for name, one in scenario.sites.items() if one.view),
         f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),

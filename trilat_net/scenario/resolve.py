@@ -119,6 +119,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
             raise ScenarioError("is missing: whom does this site follow?", path=f"dominance.{name}")
         rows[name] = resolve_dominance_row(written[name], list(sites), name, f"dominance.{name}")
     links = resolve_links(tables, list(sites), folder)
+    _resolve_views(sites, folder)
     resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
     return {
         "duration_s": 20.0,
@@ -386,14 +387,30 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
     for name in every:
         path = f"links.{name}"
         link = resolve_link(written.get(name, {}), default, path)
-        if link["model"] == "trace":
-            shared = "file" in default and "file" not in written.get(name, {})
-            link = _read_trace_file(link, name, "link" if shared else path, folder)
-        for field in msgspec.structs.fields(DELAY_MODELS[link["model"]]):
-            if field.required and field.name not in link:
-                raise ScenarioError("is missing; give it here or in [link]", path=f"{path}.{field.name}")
-        links[name] = link
+        shared = "file" in default and "file" not in written.get(name, {})
+        links[name] = _complete_link(link, name, path, folder, "link" if shared else path)
     return links
+
+
+def _resolve_views(sites: TomlTable, folder: Path | None) -> None:
+    for name, site in sites.items():
+        if "view" in site:
+            path = f"sites.{name}.view"
+            link = resolve_link(site["view"], {}, path)
+            site["view"] = _complete_link(link, f"view of {name}", path, folder)
+
+
+def _complete_link(
+    link: TomlTable, name: str, path: str, folder: Path | None, trace_path: str = ""
+) -> TomlTable:
+    """Returns a resolved link with the trace that its file has; refuses one that lacks a key."""
+    if link["model"] == "trace":
+        link = _read_trace_file(link, name, trace_path or path, folder)
+    for field in msgspec.structs.fields(DELAY_MODELS[link["model"]]):
+        if field.required and field.name not in link:
+            where = "; give it here or in [link]" if trace_path else ""
+            raise ScenarioError(f"is missing{where}", path=f"{path}.{field.name}")
+    return link
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:

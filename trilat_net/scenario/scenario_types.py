@@ -130,6 +130,8 @@ class SiteSpec(Frozen, frozen=True):
         task: what it follows: joints, or its end effector.
         plant: "simulated"; "external": an arm outside of the program, whose state is measured; or a class of
             one's own that moves the arm.
+        view: delay, loss and order of the picture by which the site's user sees its peers, as of a link;
+            None: the user sees the samples in use. It enters no formula.
     """
 
     role: Literal["master", "slave"]
@@ -144,6 +146,7 @@ class SiteSpec(Frozen, frozen=True):
     hands: tuple[Operator, ...] = ()
     environment: tuple[Environment, ...] = ()
     plant: Literal["simulated", "external"] | OwnPlant = "simulated"
+    view: Link | None = None
 
 
 SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale, "task": Task}
@@ -214,7 +217,7 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     "environment": ((), []),
     "plant": ("simulated",),
     "sends": ({},),
-    **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad"), (None,)),
+    **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)),
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")

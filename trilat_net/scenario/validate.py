@@ -202,9 +202,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         _check_own_hand(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     _check_received(scenario)
-    for name, link in scenario.links.items():
-        if found := link.find_problem():
-            raise ScenarioError(found.problem, path=f"links.{name}.{found.key}")
+    _check_links(scenario)
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
         check_change(change, f"timeline[{n}]")
@@ -244,6 +242,16 @@ def _check_joint_space(scenario: Scenario) -> None:
                 "choose adaptive",
                 path=f"sites.{name}.control.law",
             )
+
+
+def _check_links(scenario: Scenario) -> None:
+    links = {f"links.{name}": link for name, link in scenario.links.items()}
+    views = {f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view}
+    for path, link in {**links, **views}.items():
+        if found := link.find_problem():
+            raise ScenarioError(found.problem, path=f"{path}.{found.key}")
+        if path in views and link.measured:
+            raise ScenarioError("is 'measured', and no network carries a picture", path=f"{path}.model")
 
 
 def _check_damping(scenario: Scenario) -> None:

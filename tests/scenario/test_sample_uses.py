@@ -1,0 +1,80 @@
+"""What a site's user is shown of its peers: a link beside the haptic one, by scenario, seed and ticks."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from trilat_net.core.philox import link_key
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.sample_uses import PictureDelay, draw_uses
+
+MODELS = {
+    "constant": {"delay_ms": 130.0},
+    "lossy gamma": {"model": "gamma", "delay_ms": 90.0, "deviation_ms": 40.0, "loss": 0.3, "loss_burst": 5.0},
+    "in order": {"model": "uniform", "delay_ms": 90.0, "half_width_ms": 80.0, "order": "in_order"},
+    "played out": {
+        "model": "ar1",
+        "delay_ms": 40.0,
+        "deviation_ms": 9.0,
+        "correlation": 0.9,
+        "playout_ms": 60.0,
+    },
+}
+
+
+@pytest.mark.parametrize("view", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("peer_hz", [1000, 400])
+def test_a_picture_is_delayed_as_a_link_is(view: dict[str, Any], peer_hz: int) -> None:
+    scenario = load_scenario("paper", {"sites.m1.view": view, "sites.s.rate_hz": peer_hz})
+    picture, model = PictureDelay(scenario, "m1"), scenario.sites["m1"].view
+    assert model is not None
+    used = draw_uses(model, link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
+    assert [picture.at(tick, {})["s"] for tick in range(2000)] == used.tolist()
+
+
+def test_who_looks_late_is_shown_the_same() -> None:
+    scenario = load_scenario("paper", {"sites.m1.view": MODELS["lossy gamma"], "rate_hz": 50})
+    from_first, late = (PictureDelay(scenario, "m1") for _ in range(2))
+    shown = [from_first.at(tick, {}) for tick in range(3000)]
+    assert [late.at(tick, {}) for tick in range(2800, 3000)] == shown[2800:]
+
+
+def test_nothing_is_shown_of_an_outage() -> None:
+    view = {"delay_ms": 100.0, "outages_s": [[0.5, 1.0]]}
+    picture = PictureDelay(load_scenario("paper", {"sites.m1.view": view}), "m1")
+    shown = np.array([picture.at(tick, {})["s"] for tick in range(1500)])
+    assert shown[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
+
+
+def test_a_picture_has_no_influence_on_the_run() -> None:
+    """Every record stays, and the log tells what was shown."""
+    keys = {"duration_s": 1.0, "rate_hz": 200}
+    plain = tn.simulate("paper", keys)
+    delayed = tn.simulate("paper", {**keys, "sites.m1.view.delay_ms": 250.0})
+    for site in plain.sites:
+        for name in ("q", "q_des", "tau", "theta_hat"):
+            assert np.array_equal(getattr(plain[site], name), getattr(delayed[site], name))
+    assert {peer: ticks.tolist() for peer, ticks in plain.shown("m1").items()} == {
+        peer: ticks.tolist() for peer, ticks in plain["m1"].used.items()
+    }
+    assert delayed.shown("m1")["s"].tolist() == [max(-1, tick - 50) for tick in range(200)]
+    assert delayed.shown("m2")["s"].tolist() == plain["m2"].used["s"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("view", "path"),
+    [
+        ({"model": "measured"}, "sites.m1.view.model"),
+        ({"model": "gamma", "delay_ms": 20.0}, "sites.m1.view.deviation_ms"),
+        ({"delay": 20.0}, "sites.m1.view.delay"),
+        ({"model": "gamma", "delay_ms": 9000.0, "deviation_ms": 900.0}, "sites.m1.view.model"),
+        (20.0, "sites.m1.view"),
+    ],
+)
+def test_a_view_that_is_no_link_is_refused(view: Any, path: str) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        load_scenario("paper", {"sites.m1.view": view})
+    assert refused.value.path == path
