@@ -174,8 +174,7 @@ def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     if not rests.any():
         return rests
     last = np.maximum.accumulate(np.where(rests, tick, np.iinfo(np.int64).min // 2))
-    found: Bools = tick - last <= RESUMING_S * rate_hz
-    return found
+    return tick - last <= RESUMING_S * rate_hz
 
 
 def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:

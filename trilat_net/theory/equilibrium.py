@@ -246,8 +246,7 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
     inner = W.T @ D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
-    kept: Array = V @ np.linalg.solve(inner, W.T @ D @ deviation)
-    return kept
+    return V @ np.linalg.solve(inner, W.T @ D @ deviation)
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:

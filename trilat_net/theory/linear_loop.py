@@ -50,8 +50,7 @@ class SiteJacobian(NamedTuple):
     def sent(self) -> Array:
         """What peers get by the site's own states, shape (3 m, states): x, its velocity, the torque."""
         rates = self.rates
-        whole: Array = np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
-        return whole
+        return np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
 
 
 class DelayedTerm(NamedTuple):

@@ -79,8 +79,7 @@ class SiteConstants(NamedTuple):
 
     def robust_torque(self, r: Array) -> Array:
         """Returns the torque that opposes r besides Kp r, shape (K, n), N m."""
-        torque: Array = self.rho * r / np.sqrt(r**2 + self.width**2)
-        return torque
+        return self.rho * r / np.sqrt(r**2 + self.width**2)
 
     @property
     def unknown_friction(self) -> Array:

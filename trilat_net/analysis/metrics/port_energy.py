@@ -163,8 +163,7 @@ def _delay_torque(
     if gains.law is Law.ADAPTIVE:
         v, a = follows.reference(every, -off, -off_rate)
         torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
-        added: Array = torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
-        return added
+        return torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
     pull = axes * np.array(gains.K) * off + Kd * off_rate
     if np.any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
         used = records.used[other.site]

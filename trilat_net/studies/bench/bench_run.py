@@ -142,8 +142,7 @@ def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
 def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
     """Returns the torque of the operators ON an arm, without the friction of its joints, shape (K, n)."""
     dampers = (one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment))
-    torque: Array = sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
-    return torque
+    return sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:

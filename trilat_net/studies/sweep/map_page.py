@@ -158,8 +158,7 @@ def _extended(rows: Array, places: Array) -> Array:
         rows[i] + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
         for i, j, at, near, far in ((0, 1, 0, 1, 2), (-1, -2, -1, -2, -3))
     )
-    extended: Array = np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
-    return extended
+    return np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
 
 
 def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
