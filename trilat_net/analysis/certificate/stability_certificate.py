@@ -207,7 +207,32 @@ class Certificate(Result):
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
-        return certificate_to_json(self)
+        verdict, end, balance = self.verdict, self.end, self.balance
+        return {
+            "passed": self.passed,
+            "stability": self.stability.value,
+            "reasons": list(self.reasons),
+            "verdict": verdict.finding.name.lower(),
+            "text": verdict.text,
+            "rise": _rise_to_json(verdict.rise),
+            "tolerance_j": verdict.tolerance,
+            "closed_groups": [list(group) for group in self.groups],
+            "premises": [premise._asdict() for premise in self.premises],
+            "growth": {
+                "motion": end.behaviour.name.lower(),
+                "text": end.text,
+                "where": end.where or None,
+                "error_rate_per_s": finite_or_none(end.error.rate_per_s),
+                "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
+                "end_error_rad": end.end_error_rad,
+                "end_speed_rad_s": end.end_speed_rad_s,
+            },
+            "evidence": self.evidence.to_json(),
+            "roots": None if self.roots is None else self.roots._asdict(),
+            "observed": None if self.observed is None else self.observed.to_json(),
+            "twins": None if self.twins is None else self.twins.to_json(),
+            "functional": None if balance is None else _functional_to_json(self, balance),
+        }
 
     def to_rows(self) -> list[JsonObject]:
         """Returns a row per premise."""
@@ -387,36 +412,6 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
         from_s = float(balance.t_s[half + lowest])
         found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
     return found
-
-
-def certificate_to_json(certificate: Certificate) -> JsonObject:
-    """Returns a certificate, ready for JSON."""
-    verdict, end, balance = certificate.verdict, certificate.end, certificate.balance
-    return {
-        "passed": certificate.passed,
-        "stability": certificate.stability.value,
-        "reasons": list(certificate.reasons),
-        "verdict": verdict.finding.name.lower(),
-        "text": verdict.text,
-        "rise": _rise_to_json(verdict.rise),
-        "tolerance_j": verdict.tolerance,
-        "closed_groups": [list(group) for group in certificate.groups],
-        "premises": [premise._asdict() for premise in certificate.premises],
-        "growth": {
-            "motion": end.behaviour.name.lower(),
-            "text": end.text,
-            "where": end.where or None,
-            "error_rate_per_s": finite_or_none(end.error.rate_per_s),
-            "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
-            "end_error_rad": end.end_error_rad,
-            "end_speed_rad_s": end.end_speed_rad_s,
-        },
-        "evidence": certificate.evidence.to_json(),
-        "roots": None if certificate.roots is None else certificate.roots._asdict(),
-        "observed": None if certificate.observed is None else certificate.observed.to_json(),
-        "twins": None if certificate.twins is None else certificate.twins.to_json(),
-        "functional": None if balance is None else _functional_to_json(certificate, balance),
-    }
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
