@@ -395,12 +395,8 @@ class MapLine(NamedTuple):
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
         """Returns where it crosses a column, from below."""
-        places = zip(y.values, self.spare[:, column].tolist(), strict=True)
-        return [
-            low + (high - low) * a / (a - b)
-            for (low, a), (high, b) in pairwise(places)
-            if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)
-        ]
+        at, spare = y.values, self.spare[:, column].tolist()
+        return [at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1]) for n in _changes(spare)]
 
 
 ZERO_EXPONENT = "exponent = 0"
