@@ -169,13 +169,6 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
     axis.set_minor_formatter(NullFormatter())
 
 
-def set_time_axis(log: Log, row: Sequence[Axes]) -> None:
-    """Gives panels their time axis: the whole run, in every figure."""
-    for axes in row:
-        axes.set_xlabel("time (s)")
-        axes.set_xlim(0.0, recorded_end_s(log))
-
-
 def name_joints(log: Log) -> list[str]:
     """Returns the titles of the joints: numbers, and names if all arms are chains with the same ones."""
     arms = [log.scenario.arms[site] for site in log.sites]
@@ -407,7 +400,9 @@ class TimeFigure:
 
         With `links`, only changes of links are marked; the title stands above the legend.
         """
-        set_time_axis(self.log, lowest)
+        for axes in lowest:
+            axes.set_xlabel("time (s)")
+            axes.set_xlim(0.0, recorded_end_s(self.log))
         add_legend(self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {}))
         marked = [(n, c) for n, c in self._changes if c.change.link or not links]
         words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]

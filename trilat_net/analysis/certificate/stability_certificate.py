@@ -264,7 +264,9 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
     premises = check_premises(run)
     verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if known is not None:
-        verdict = judge_functional(known, premises)
+        verdicts = (judge(known, premises) for judge in JUDGEMENTS)
+        verdict = next(verdict for verdict in verdicts if verdict is not None)
+        verdict = verdict if known.groups else verdict._replace(tolerance=known.tolerance)
     if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
     end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
@@ -276,13 +278,6 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
     alike = np.allclose(known.balance.beta, 1.0)
     ones = None if alike else compute_energy_balance(known.energies, ones=True)
     return replace(found, balance=known.balance, ones=ones, energies=known.energies)
-
-
-def judge_functional(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict on V: of the first of the `JUDGEMENTS` that applies."""
-    verdicts = (judge(run, premises) for judge in JUDGEMENTS)
-    found = next(verdict for verdict in verdicts if verdict is not None)
-    return found if run.groups else found._replace(tolerance=run.tolerance)
 
 
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
@@ -330,11 +325,9 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
 
 def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """There is no unique beta."""
-    return (
-        StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
-        if run.groups
-        else None
-    )
+    if not run.groups:
+        return None
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
 
 
 def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:

@@ -19,7 +19,6 @@ from ...core.task_space import PLACE
 from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
-from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
@@ -158,22 +157,9 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    return _measure(RunView(log))
-
-
-def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
-    found: dict[str, dict[str, MetricValues]] = {
-        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
-    }
-    for one in wanted:
-        for place, values in found[one.of].items():
-            values.update(one.measure(view, place))
-    return found
-
-
-def _measure(view: RunView) -> LogMetrics:
-    log, scenario = view.log, view.scenario
+    view, scenario = RunView(log), log.scenario
     found = _measure_places(view, list_measures())
+    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
     return LogMetrics(
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
         found["run"][""],
@@ -185,8 +171,18 @@ def _measure(view: RunView) -> LogMetrics:
         static_windows.estimate_stiffness(view),
         estimate_impedances(view),
         TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
-        _find_joint_names(scenario),
+        names.pop() if len(names) == 1 else (),
     )
+
+
+def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
+    found: dict[str, dict[str, MetricValues]] = {
+        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
+    }
+    for one in wanted:
+        for place, values in found[one.of].items():
+            values.update(one.measure(view, place))
+    return found
 
 
 def find_quantity(key: str) -> Quantity:
@@ -212,12 +208,6 @@ def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         key: find_whole(one, {place: values[key] for place, values in found[one.of].items()})
         for key, one in asked.items()
     }
-
-
-def _find_joint_names(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the names that the files of the arms give their joints; () if not all name them alike."""
-    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
-    return names.pop() if len(names) == 1 else ()
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
