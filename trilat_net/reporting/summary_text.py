@@ -183,7 +183,7 @@ def compose_verification(found: LogCheckReport) -> Iterator[Block]:
 def compose_log_check(found: LogCheckResult) -> Iterator[Block]:
     """Yields a line per check, and the places where it failed."""
     for finding in found.findings:
-        mark = "[green]ok[/green]  " if finding.passed else "[red]FAIL[/red]"
+        mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
