@@ -269,9 +269,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
 _DPI = 300
 
 
-def write_map(
-    chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN, name: str = "map"
-) -> list[Path]:
+def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
     """Writes a map into a folder that exists, and returns the paths.
 
     Raises:
@@ -279,7 +277,7 @@ def write_map(
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
+    paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
     for path in paths[:-1]:
         style.write_figure(figure, path, _DPI)
     write_whole(paths[-1], build_map_page(chart, paths[0].name))

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...analysis.arm_rows import PlacedArm
 from ...core.vectors import Array
 from ...errors import ScenarioError, UsageError
 from ...fields import is_number
@@ -321,12 +322,8 @@ def _least_inertia(arm: ArmModel) -> float:
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    theta = arm.theta
-    ends = [
-        [[theta[0] + 2.0 * c * theta[1], theta[2] + c * theta[1]], [theta[2] + c * theta[1], theta[2]]]
-        for c in (-1.0, 1.0)
-    ]
-    return float(np.linalg.eigvalsh(np.array(ends)).min())
+    ends = PlacedArm(0.0, arm.lengths_m, np.array([[0.0, 0.0], [0.0, np.pi]]))
+    return float(np.linalg.eigvalsh(ends.inertia_matrix(arm.theta).T).min())
 
 
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:
