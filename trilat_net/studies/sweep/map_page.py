@@ -134,7 +134,10 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
         norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
         palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
         axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
-    _hatch(axes, x, y, _undecided(plane, panel))
+    for i, row in enumerate(_undecided(plane, panel)):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
     for line in lines:
         _draw_line(axes, plane, line)
 
@@ -166,13 +169,6 @@ def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
     if plane.judged_by_twins:
         return (panel.runs > 0) & np.isnan(panel.exponents_per_s)
     return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
-
-
-def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
-    for i, row in enumerate(where):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
 
 
 def _bounds(side: PlaneAxis) -> Array:
