@@ -4,11 +4,6 @@ Invariant: the equations are written anew in plain NumPy and share nothing with 
 roots and runs check each other; the simulation only supplies the pose at which a run settles.
 
 Definitions, equations and sources are in docs/linear.md and docs/ports.md.
-
-    from trilat_net.theory import analyse_linear_loop
-
-    result = analyse_linear_loop("free")
-    result.verdict, result.continuous.rightmost.s, result.margin.words
 """
 
 from .equilibrium import find_equilibrium
