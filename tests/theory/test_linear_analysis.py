@@ -20,8 +20,8 @@ from trilat_net.reporting.linear_text import (
     tabulate_roots,
 )
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import LinearAnalysis, analyse_linear_loop
-from trilat_net.theory.linear_analysis import find_end_pose_roots
+from trilat_net.theory import analyse_linear_loop
+from trilat_net.theory.linear_analysis import LinearAnalysis, find_end_pose_roots
 
 POSE = (-0.1729, 0.0874)
 

@@ -7,27 +7,7 @@ Definitions, equations and sources are in docs/linear.md and docs/ports.md.
 """
 
 from .equilibrium import find_equilibrium
-from .linear_analysis import LinearAnalysis, analyse_linear_loop
-from .linear_edge import (
-    GrowthColumn,
-    LinearEdge,
-    compute_growth_column,
-    find_root_crossings,
-    iterate_linear_edges,
-)
-from .linear_loop import DelayedTerm, LinearLoop
-from .operating_point import Equilibrium
+from .linear_analysis import analyse_linear_loop
+from .linear_edge import iterate_linear_edges
 
-__all__ = [
-    "DelayedTerm",
-    "Equilibrium",
-    "GrowthColumn",
-    "LinearAnalysis",
-    "LinearEdge",
-    "LinearLoop",
-    "analyse_linear_loop",
-    "compute_growth_column",
-    "find_equilibrium",
-    "find_root_crossings",
-    "iterate_linear_edges",
-]
+__all__ = ["analyse_linear_loop", "find_equilibrium", "iterate_linear_edges"]

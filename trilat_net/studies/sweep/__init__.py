@@ -1,16 +1,7 @@
 """Stability maps: one scenario over a plane of its keys, in virtual time, on all cores; docs/sweep.md."""
 
-from .sweep_plan import SweepPlan, plan_sweep
-from .sweep_results import SweepResults, read_results
-from .sweep_run import FinishedSweep, open_sweep_folder, prepare_sweep_folder, run_sweep
+from .sweep_plan import plan_sweep
+from .sweep_results import read_results
+from .sweep_run import FinishedSweep, prepare_sweep_folder, run_sweep
 
-__all__ = [
-    "FinishedSweep",
-    "SweepPlan",
-    "SweepResults",
-    "open_sweep_folder",
-    "plan_sweep",
-    "prepare_sweep_folder",
-    "read_results",
-    "run_sweep",
-]
+__all__ = ["FinishedSweep", "plan_sweep", "prepare_sweep_folder", "read_results", "run_sweep"]

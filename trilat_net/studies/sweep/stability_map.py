@@ -33,7 +33,7 @@ from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
-from ...theory import GrowthColumn, compute_growth_column
+from ...theory.linear_edge import GrowthColumn, compute_growth_column
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .sweep_cell import CellClass
 from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
