@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.dominance import find_reach
 from ..core.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
@@ -418,14 +419,12 @@ def _count_sign_changes(values: Array) -> int:
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Returns the groups of sites that shares connect, at any time and in either direction."""
-    joined = (scenario.alpha > 0.0) | np.eye(len(scenario.names), dtype=bool)
+    joined = scenario.alpha.copy()
     for change in scenario.timeline:
         for peer, share in (change.shares if change.dominance else {}).items():
-            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] |= share > 0.0
-    joined = joined | joined.T
-    for _ in range(len(joined).bit_length()):
-        joined = joined @ joined
-    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in joined}]
+            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] += share
+    reach = find_reach(joined + joined.T)
+    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}]
 
 
 def _find_disagreement(

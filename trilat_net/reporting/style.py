@@ -46,7 +46,6 @@ FAINT = "#8c8c8c"
 LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
 """The line of what is desired, true, stated or allowed."""
 
-REPORT_WIDTH_IN = REPORT_SIZE.width_in
 REPORT_DPI = REPORT_SIZE.dpi
 _LEAST_RANGE = 1e-9
 """Of values; less is rounding."""
@@ -101,7 +100,7 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
         yield new_figure(height_in, form.width_in)
 
 
-def new_figure(height_in: float, width_in: float = REPORT_WIDTH_IN) -> Figure:
+def new_figure(height_in: float, width_in: float) -> Figure:
     """Returns an empty figure of a size in inches."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
 

@@ -96,10 +96,7 @@ class LinearLoop(NamedTuple):
     @property
     def static_matrix(self) -> Array:
         """A + sum_k A_k: the effect of a constant deviation."""
-        total = self.A.copy()
-        for term in self.delayed:
-            total += term.A
-        return total
+        return sum((term.A for term in self.delayed), self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:

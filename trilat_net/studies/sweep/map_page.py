@@ -77,8 +77,7 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[MapLine]], form
     rows = -(-len(plane.panels) // columns)
     each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
     barred = plane.judged_by_twins or plane.seeds > 1
-    with style.figure_style(form):
-        figure = style.new_figure(0.95 + rows * each_in, form.width_in)
+    with style.styled_figure(form, 0.95 + rows * each_in) as figure:
         grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
         for axes in grid[len(plane.panels) :]:
             axes.set_axis_off()
