@@ -34,11 +34,11 @@ from trilat_net.reporting.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 lap("start")
 log = open_log(sys.argv[1])
 lap("opening")
-metrics_to_json(compute_log_metrics(log))
+compute_log_metrics(log).to_dict()
 lap("metrics")
 certify(log)
 lap("certificate")

@@ -5,7 +5,7 @@ import pytest
 
 import trilat_net
 from tests.task_arms import planar_task
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, metrics_to_json
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
@@ -83,6 +83,6 @@ def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
     assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)
     assert pair.pushed_nm == pytest.approx(-log["s"].wrench[-500:, 0].mean(), rel=1e-2)
     assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(-pair.pushed_nm, rel=1e-2)
-    entry = next(one for one in metrics_to_json(metrics)["force_sharing"] if one["axis"] == "x")
+    entry = next(one for one in metrics.to_dict()["force_sharing"] if one["axis"] == "x")
     assert entry["felt_n"] == pair.felt_nm
     assert "felt_nm" not in entry

@@ -8,7 +8,7 @@ import pytest
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.reporting.certificate_text import describe_certificate, list_energies
 from trilat_net.reporting.figures.certificate_energy import draw_functional
 
@@ -27,7 +27,7 @@ LOGS = {
 @pytest.mark.parametrize("name", LOGS)
 def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None:
     found = certify(LOGS[name]())
-    read = json.loads(json.dumps(certificate_to_json(found), allow_nan=False))
+    read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert read["text"] == found.verdict.text
     assert read["passed"] is found.passed
     assert (read["functional"] is None) == (found.balance is None)
@@ -37,7 +37,7 @@ def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None
 
 def test_the_numbers_add_up() -> None:
     """V at the end is V at the start, less what was taken, plus what was given, to the residual."""
-    f = certificate_to_json(certify(LOGS["jitter"]()))["functional"]
+    f = certify(LOGS["jitter"]()).to_dict()["functional"]
     end = f["v_first_j"] - sum(f["taken_j"].values()) + sum(f["given_j"].values())
     assert end == pytest.approx(f["v_last_j"], abs=f["residual_max_j"])
     assert sum(f["parts_last_j"].values()) == pytest.approx(f["v_last_j"])

@@ -20,8 +20,8 @@ from trilat_net.reporting.linear_text import (
     tabulate_roots,
 )
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import LinearAnalysis, analyse_linear_loop
-from trilat_net.theory.linear_analysis import find_end_pose_roots, linear_to_json
+from trilat_net.theory import analyse_linear_loop
+from trilat_net.theory.linear_analysis import LinearAnalysis, find_end_pose_roots
 
 POSE = (-0.1729, 0.0874)
 
@@ -64,7 +64,7 @@ def test_sampled_roots_stand_beside_where_they_differ(calm: LinearAnalysis, digi
 
 
 def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
-    told = linear_to_json(calm)
+    told = calm.to_dict()
     assert told["verdict"] == "stable"
     first, *_ = told["continuous"]["roots"]
     assert tabulate_roots(calm).rows[0][:2] == (f"{first['re_per_s']:.4g}", f"{first['im_rad_s']:.4g}")
@@ -95,7 +95,7 @@ def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
     )
     assert any("ticks and delays decide" in note for note in found.notes)
     assert tabulate_roots(found).rows[0][0] == "0.1802"
-    told = linear_to_json(found)
+    told = found.to_dict()
     assert told["as_computed"]["span_s"] == 0.1
     assert told["as_computed"]["deviation_per_s"] is told["continuous"]["span_s"] is None
 

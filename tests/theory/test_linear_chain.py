@@ -29,12 +29,12 @@ from trilat_net.reporting.linear_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 from trilat_net.studies.sweep.stability_map import evaluate_criterion
-from trilat_net.theory import LinearLoop, find_equilibrium, iterate_linear_edges
+from trilat_net.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import predict_equilibrium
 from trilat_net.theory.floquet import compute_sampled_spectrum
-from trilat_net.theory.linear_loop import linearise_loop
+from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
 from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.theory.port_response import build_admittance

@@ -13,13 +13,13 @@ from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.reporting.linear_text import describe_ports
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-from trilat_net.theory import Equilibrium, analyse_linear_loop, find_equilibrium, iterate_linear_edges
+from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part
 from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import find_mean_pose
 from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.theory.port_response import build_admittance
 

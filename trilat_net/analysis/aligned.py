@@ -119,21 +119,21 @@ class AlignedRecords(NamedTuple):
         """True if both ends of a period are recorded, shape (K - 1,)."""
         return self.known[:-1] & self.known[1:]
 
-    def held_torque(self, limit_nm: Array | float, *, digital: bool) -> Array:
-        """Returns the torque that the controller holds over every period, shape (K - 1, n), N m.
-
-        tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit.
-        """
-        tau = self.tau
-        u = tau[:-1].copy()
-        if not digital:
-            u[1:] = np.clip(1.5 * tau[1:-1] - 0.5 * tau[:-2], -limit_nm, limit_nm)
-        return u
-
     def known_at_end(self, length_s: float) -> Bools:
         """Returns the recorded rows of the last seconds, shape (K,)."""
         rows: Bools = self.known & (self.t_s > self.t_s[-1] - length_s)
         return rows
+
+
+def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
+    """Returns the torque that a controller holds from every tick to the next, shape (K, n), N m.
+
+    tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit.
+    """
+    held = tau.copy()
+    if not digital:
+        held[1:] = np.clip(1.5 * tau[1:] - 0.5 * tau[:-1], -limit_nm, limit_nm)
+    return held
 
 
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
@@ -174,8 +174,7 @@ def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     if not rests.any():
         return rests
     last = np.maximum.accumulate(np.where(rests, tick, np.iinfo(np.int64).min // 2))
-    found: Bools = tick - last <= RESUMING_S * rate_hz
-    return found
+    return tick - last <= RESUMING_S * rate_hz
 
 
 def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:

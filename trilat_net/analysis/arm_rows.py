@@ -356,8 +356,7 @@ class ChainArmRows(NamedTuple):
     def friction(self, speed: Array) -> Array:
         """Returns the torque that friction takes at joint speeds, shape (K, n), N m."""
         x = speed / COULOMB_SPEED
-        torque: Array = self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
-        return torque
+        return self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
         """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that never pull."""
@@ -366,8 +365,7 @@ class ChainArmRows(NamedTuple):
         over = np.maximum(q - self._column("upper"), 0.0)
         up = np.where(under > 0.0, np.maximum(stiffness * under - damping * qd, 0.0), 0.0)
         down = np.where(over > 0.0, np.maximum(stiffness * over + damping * qd, 0.0), 0.0)
-        torque: Array = up - down
-        return torque
+        return up - down
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in space, in the base's frame."""

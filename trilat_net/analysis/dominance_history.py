@@ -53,8 +53,13 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
         LogError: a record names a change that is none.
     """
     planned = evaluate_ramps(*list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz)
-    lost = find_lost_peers(log, site, t_s)
-    return _share_out(planned, ~lost) if lost.any() else planned
+    there = ~find_lost_peers(log, site, t_s)
+    if there.all():
+        return planned
+    alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
+    whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
+    rate = (rate * whole - alpha * whole_rate) / whole**2
+    return DominanceHistory(alpha / whole, rate, before / before.sum(axis=1, keepdims=True))
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
@@ -125,13 +130,6 @@ def list_losses(log: Log) -> list[str]:
             for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
                 found.append(f"{site} without {peer} {times[first]:.4g} to {times[last]:.4g} s")
     return found
-
-
-def _share_out(planned: DominanceHistory, there: NDArray[np.bool_]) -> DominanceHistory:
-    alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
-    whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
-    rate = (rate * whole - alpha * whole_rate) / whole**2
-    return DominanceHistory(alpha / whole, rate, before / before.sum(axis=1, keepdims=True))
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:

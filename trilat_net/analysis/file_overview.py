@@ -315,8 +315,17 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
     sites = {name: _describe_site(log, name, twin) for name in log.sites}
     settled = [site["settle_s"] for site in sites.values()]
     largest = [site["max_error_end_rad"] for site in sites.values() if site["max_error_end_rad"] is not None]
+    scenario = log.scenario
+    keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
+    delays_ms = {name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()}
     return {
-        "scenario": _describe_scenario(log),
+        "scenario": {
+            **{key: getattr(scenario, key) for key in keys},
+            "sites": list(scenario.names),
+            "delay_ms": delays_ms,
+            "dominance": scenario.dominance,
+            "assumed": list(scenario.assumed),
+        },
         "session": {**log.session, "complete": log.complete},
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),
         "settle_s": settling_time_of_all_s(settled),
@@ -331,18 +340,6 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             | {"site": one.site, "taken_at_tick": one.taken_at_tick}
             for one in list_changes(log)
         ],
-    }
-
-
-def _describe_scenario(log: Log) -> JsonObject:
-    scenario = log.scenario
-    keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
-    return {
-        **{key: getattr(scenario, key) for key in keys},
-        "sites": list(scenario.names),
-        "delay_ms": {name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()},
-        "dominance": scenario.dominance,
-        "assumed": list(scenario.assumed),
     }
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.dominance import find_reach
 from ..core.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
@@ -241,7 +242,11 @@ def classify_log_end(log: Log) -> RunEnd:
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     """Returns the end of a run from its trace."""
-    sites = _split_buckets(scenario, trace.buckets)
+    joints = [max(arm.counts.joints, arm.counts.shared) for arm in scenario.arms.values()]
+    sites = [  # by kind and joint, shape (K, 3, n): |e|, |qd| and q
+        site.reshape(len(site), 3, -1)[:, :, :n] if len(site) else np.zeros((0, 3, n))
+        for n, site in zip(joints, trace.buckets, strict=True)
+    ]
     count = max(min(map(len, sites)) - 1, 0)
     kept = np.flatnonzero(np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0))
     span_s, t_s = count / BUCKETS_PER_S, kept / BUCKETS_PER_S
@@ -265,15 +270,6 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
         return end._replace(reasons=reasons)
     why = f"an operator acts until {acted_s:.4g} s, within the judged part"
     return end._replace(operator_acts=True, reasons=(why,)) if acts else end
-
-
-def _split_buckets(scenario: Scenario, buckets: Sequence[Array]) -> list[Array]:
-    """Returns the buckets of each site by kind and joint, shape (K, 3, n): |e|, |qd| and q."""
-    joints = [max(arm.counts.joints, arm.counts.shared) for arm in scenario.arms.values()]
-    return [
-        site.reshape(len(site), 3, -1)[:, :, :n] if len(site) else np.zeros((0, 3, n))
-        for n, site in zip(joints, buckets, strict=True)
-    ]
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
@@ -423,14 +419,12 @@ def _count_sign_changes(values: Array) -> int:
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Returns the groups of sites that shares connect, at any time and in either direction."""
-    joined = (scenario.alpha > 0.0) | np.eye(len(scenario.names), dtype=bool)
+    joined = scenario.alpha.copy()
     for change in scenario.timeline:
         for peer, share in (change.shares if change.dominance else {}).items():
-            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] |= share > 0.0
-    joined = joined | joined.T
-    for _ in range(len(joined).bit_length()):
-        joined = joined @ joined
-    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in joined}]
+            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] += share
+    reach = find_reach(joined + joined.T)
+    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}]
 
 
 def _find_disagreement(

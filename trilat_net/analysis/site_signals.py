@@ -109,11 +109,6 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
     return tick, part.t_s[ours], joint_angles(part)[ours] - joint_angles(other)[theirs]
 
 
-def true_parameters(log: Log, site: str) -> Array:
-    """Returns the true parameters of the arm of a site, shape (P,): theta of Eq. (24), or ten a link."""
-    return log.scenario.arms[site].theta
-
-
 class DecimatedTrace(NamedTuple):
     """C columns over P ticks, ready to be drawn; a row of NaN stands in every gap that can be seen."""
 

@@ -291,7 +291,9 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
     end = int(rows[-1]) if len(rows) else 0  # the last interval may be of one tick
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     pushes, left = [], []
-    for place, group in enumerate(_find_joints_by_group(scenario)):
+    firsts = np.cumsum([0, *(scenario.layout(name).joints for name in scenario.names)]).tolist()
+    for place, sites in enumerate(find_coupled_sites(scenario)):
+        group = [joint for site in sites for joint in range(firsts[site], firsts[site + 1])]
         amplitudes = [measure_amplitude(path, group) for path in twins.paths]
         for path, amplitude in zip(twins.paths, amplitudes, strict=True):
             if np.isfinite(amplitude[first:end]).any():
@@ -309,15 +311,6 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
         random=scenario.links_random,
         twins=twins,
     )
-
-
-def _find_joints_by_group(scenario: Scenario) -> list[list[int]]:
-    counts = [scenario.layout(name).joints for name in scenario.names]
-    first = np.cumsum([0, *counts]).tolist()
-    return [
-        [joint for site in group for joint in range(first[site], first[site + 1])]
-        for group in find_coupled_sites(scenario)
-    ]
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:

@@ -14,7 +14,7 @@ from ..analysis.certificate.stability_certificate import Certificate, StabilityF
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
-from .result_text import Block, MarkedText, TextTable
+from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
 """Smaller shares of the largest energy are not listed."""
@@ -28,18 +28,12 @@ _SOURCE_NAMES = {
 
 
 _HOLDS = {True: "holds", False: "fails", None: "not told"}
-CERTIFICATE_MARKS = {
-    "ok": "[green]ok  [/green]",
-    "FAIL": "[red]FAIL[/red]",
-    "open": "[yellow]open[/yellow]",
-    "note": "note",
-}
 
 
 def compose_certificate(found: Certificate) -> Iterator[Block]:
     """Yields the judgement with what it rests on, the premises, and the energies."""
     for line in describe_certificate(found):
-        yield MarkedText(CERTIFICATE_MARKS[line.mark], line.text)
+        yield MarkedText(MARKS[line.mark], line.text)
     observed = found.observed
     premises = [*found.premises, *(() if observed is None else observed.premises)]
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]

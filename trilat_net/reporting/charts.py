@@ -153,7 +153,7 @@ class Charts:
         arm = max(log.scenario.arms.values(), key=lambda each: each.counts)
         for index, (name, unit) in enumerate(arm.parameters):
             series = [columns[index] for columns in tables.values() if index < len(columns)]
-            every = [site_signals.true_parameters(log, site) for site in log.sites]
+            every = [log.scenario.arms[site].theta for site in log.sites]
             truths = [float(theta[index]) for theta in every if index < len(theta)]
             lines: list[JsonObject] = [{"value": truth, "colour": n} for n, truth in enumerate(truths)]
             if len(set(truths)) == 1:

@@ -22,8 +22,8 @@ from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..scenario.imported_code import allowed_code
 from ..theory.linear_analysis import certify_run
-from .certificate_text import CERTIFICATE_MARKS, CertificateLine, describe_certificate
-from .result_text import Block, MarkedText, TextTable
+from .certificate_text import CertificateLine, describe_certificate
+from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines
 
 
@@ -42,11 +42,10 @@ class Conclusion(CheckReport):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
-        yield MarkedText(CERTIFICATE_MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
+        yield MarkedText(MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
         for line in self.findings:
-            bad = "[red]FAIL[/red]" if line.judged else "[yellow]open[/yellow]"
-            mark = "[green]ok[/green]  " if line.passed else bad
-            yield MarkedText(mark, f"{line.check}: {line.text}")
+            mark = "ok" if line.passed else "FAIL" if line.judged else "open"
+            yield MarkedText(MARKS[mark], f"{line.check}: {line.text}")
         yield self.table
         yield from self.notes
         yield from (f"  {path}" for path in self.paths if path != self.page)

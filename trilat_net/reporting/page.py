@@ -16,7 +16,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from ..analysis.certificate.stability_certificate import Certificate, certificate_to_json
+from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.file_overview import summarise_run
 from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
@@ -98,7 +98,7 @@ def write_report(
     facts = summarise_run(log, twin)
     section = verdict = ""
     if certificate is not None:
-        facts["certificate"] = certificate_to_json(certificate)
+        facts["certificate"] = certificate.to_dict()
         section = _render_certificate(certificate)
         mark, text = describe_certificate(certificate)[0]
         kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))

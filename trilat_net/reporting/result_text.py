@@ -21,7 +21,8 @@ from .terminal_output import MAX_LETTERS, sanitize
 if TYPE_CHECKING:
     from rich.table import Table
 
-MARKS = {"ok": "[green]ok[/green]  ", "warn": "[yellow]warn[/yellow]", "fail": "[red]fail[/red]"}
+_COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "FAIL": "red"}
+MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {"note": "note"}
 """Of findings, by their state."""
 NO_STYLES: Mapping[str, str] = MappingProxyType({})
 

@@ -46,7 +46,6 @@ FAINT = "#8c8c8c"
 LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
 """The line of what is desired, true, stated or allowed."""
 
-REPORT_WIDTH_IN = REPORT_SIZE.width_in
 REPORT_DPI = REPORT_SIZE.dpi
 _LEAST_RANGE = 1e-9
 """Of values; less is rounding."""
@@ -101,7 +100,7 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
         yield new_figure(height_in, form.width_in)
 
 
-def new_figure(height_in: float, width_in: float = REPORT_WIDTH_IN) -> Figure:
+def new_figure(height_in: float, width_in: float) -> Figure:
     """Returns an empty figure of a size in inches."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
@@ -167,13 +166,6 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(LogLocator(subs=range(1, 10)))
     axis.set_minor_formatter(NullFormatter())
-
-
-def set_time_axis(log: Log, row: Sequence[Axes]) -> None:
-    """Gives panels their time axis: the whole run, in every figure."""
-    for axes in row:
-        axes.set_xlabel("time (s)")
-        axes.set_xlim(0.0, recorded_end_s(log))
 
 
 def name_joints(log: Log) -> list[str]:
@@ -407,7 +399,9 @@ class TimeFigure:
 
         With `links`, only changes of links are marked; the title stands above the legend.
         """
-        set_time_axis(self.log, lowest)
+        for axes in lowest:
+            axes.set_xlabel("time (s)")
+            axes.set_xlim(0.0, recorded_end_s(self.log))
         add_legend(self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {}))
         marked = [(n, c) for n, c in self._changes if c.change.link or not links]
         words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]

@@ -12,7 +12,7 @@ from typing import Any
 from ..analysis import link_summary
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
 from ..execution.log_checks import LogCheckReport
-from ..execution.rerun import LinkEffect, LogAndRerun, Rerun
+from ..execution.rerun import Rerun
 from ..execution.rerun_execution import describe_rerun_changes
 from ..log.log_reader import Log
 from ..log.recover import Recovery
@@ -66,7 +66,17 @@ def format_outside_lines(log: Log) -> list[str]:
 
 def format_link_lines(log: Log) -> list[str]:
     """Returns a line per link that is not stated as constant without loss, or was not so."""
-    return _first([format_link_line(use) for use in link_summary.summarise_links(log) if not use.plain])
+    lines = []
+    for use in (use for use in link_summary.summarise_links(log) if not use.plain):
+        measured = any(state.link.measured for state in use.stated)
+        parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
+        if use.one_way_us is not None and measured:
+            parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
+        parts.append("no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}")
+        if use.counts is not None:
+            parts.append(_losses(use, use.counts))
+        lines.append("; ".join(parts))
+    return _first(lines)
 
 
 def format_change_lines(log: Log) -> list[str]:
@@ -106,18 +116,6 @@ def format_clock_lines(log: Log) -> list[str]:
             if use is not None and not use.shared:
                 lines.append(f"clock of {peer} seen by {site}: {format_clock(use)}")
     return _first(lines)
-
-
-def format_link_line(use: link_summary.LinkSummary) -> str:
-    """Returns the summary of a link in a line."""
-    measured = any(state.link.measured for state in use.stated)
-    parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
-    if use.one_way_us is not None and measured:
-        parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
-    parts.append("no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}")
-    if use.counts is not None:
-        parts.append(_losses(use, use.counts))
-    return "; ".join(parts)
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
@@ -183,7 +181,7 @@ def compose_verification(found: LogCheckReport) -> Iterator[Block]:
 def compose_log_check(found: LogCheckResult) -> Iterator[Block]:
     """Yields a line per check, and the places where it failed."""
     for finding in found.findings:
-        mark = "[green]ok[/green]  " if finding.passed else "[red]FAIL[/red]"
+        mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
@@ -218,23 +216,16 @@ def compose_rerun(again: Rerun) -> Iterator[Block]:
     yield f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}"
     for line in describe_rerun_changes(asked) or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
-    yield _tabulate_sites(again)
-    yield from _describe_effects(again)
-    yield from (f"note: {note}" for note in again.notes)
-
-
-def _tabulate_sites(again: Rerun) -> TextTable:
     headers = ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here")
     rows = []
     for effect in again.sites.values():
-        figures = (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm)
-        cells = [cell for pair in figures for cell in _cells(pair)]
+        cells = []
+        for pair in (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm):
+            cells += ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
         rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
-    return TextTable(("site", *headers), rows, align="lr")
-
-
-def _cells(pair: LogAndRerun | None) -> list[str]:
-    return ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
+    yield TextTable(("site", *headers), rows, align="lr")
+    yield from _describe_effects(again)
+    yield from (f"note: {note}" for note in again.notes)
 
 
 def _describe_effects(again: Rerun) -> list[str]:
@@ -255,20 +246,18 @@ def _describe_effects(again: Rerun) -> list[str]:
             )
         if effect.diverged_at_s is not None:
             lines.append(f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there")
-    return lines + [_link_line(link) for link in again.links.values() if link.differs]
+    for link in (link for link in again.links.values() if link.differs):
+        before, after = (
+            f"{mean:.4g} ms old on average, {most:.4g} ms at most"
+            for mean, most in zip(link.age_mean_ms, link.age_max_ms, strict=True)
+        )
+        lines.append(f"link {link.link}: samples in use were {before}; are {after}")
+    return lines
 
 
 def _values(before: object, after: object) -> tuple[str, str]:
     short = tuple(f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after))
     return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
-
-
-def _link_line(link: LinkEffect) -> str:
-    mean, largest = link.age_mean_ms, link.age_max_ms
-    before, after = (
-        f"{a:.4g} ms old on average, {b:.4g} ms at most" for a, b in zip(mean, largest, strict=True)
-    )
-    return f"link {link.link}: samples in use were {before}; are {after}"
 
 
 def compose_doctor(found: Result) -> Iterator[Block]:
@@ -293,7 +282,14 @@ def compose_ping(found: Result) -> Iterator[Block]:
     yield TextTable(headers, rows, align="llrrrrrl")
     if links:
         yield "between the sites, in the last tenth of a second of each:"
-        yield _tabulate_links(links)
+        rows = []
+        for link in links:
+            delays_us = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
+            shown = ["none" if delay_us < 0 else str(delay_us) for delay_us in delays_us]
+            offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
+            rows.append([link["from"], link["to"], *shown, *offset])
+        heads = ("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us")
+        yield TextTable(heads, rows, align="llr")
 
 
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -315,16 +311,6 @@ def compose_topic_delays(found: Result) -> Iterator[Block]:
     if least < 0.0:
         yield "delays below 0: the clock there is ahead of the one here"
     yield "between two machines these contain the offset of their clocks"
-
-
-def _tabulate_links(links: list[dict[str, Any]]) -> TextTable:
-    rows = []
-    for link in links:
-        times = [link["delay_us"], link["delay_max_us"], link["rtt_us"]]
-        numbers = ["none" if time < 0 else str(time) for time in times]
-        offset = [f"{link['offset_us'] / 1e6:.6f}", str(link["bound_us"])]
-        rows.append([link["from"], link["to"], *numbers, *offset])
-    return TextTable(("from", "to", "delay p50", "max", "rtt min", "offset s", "+- us"), rows, align="llr")
 
 
 def _clock(member: dict[str, Any]) -> str:

@@ -158,7 +158,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), np.float64)
         self._begin(self._base)
         self.task.begin(np.random.default_rng(0), self._look())
-        self.observation_space: Any = self._describe_observation()
+        bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
+        boxes: dict[str, Any] = {}
+        for name, one in self._observe(self._look()).items():
+            most = bounds.get(name, FAR)
+            boxes[name] = spaces.Box(-most, most, one.shape, np.float64)
+        self.observation_space: Any = spaces.Dict(boxes)
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns an experiment in which the user has a live hand and no other operator holds that arm."""
@@ -206,15 +211,6 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             site: dict(zip(self.scenario.bodies_m(site), at, strict=True)) for site, at in poses.items()
         }
         return Scene(self._k / self._tick_rate_hz, q, places, view, bodies)
-
-    def _describe_observation(self) -> spaces.Dict:
-        bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
-        return spaces.Dict(
-            {
-                name: spaces.Box(-bounds.get(name, FAR), bounds.get(name, FAR), one.shape, np.float64)
-                for name, one in self._observe(self._look()).items()
-            }
-        )
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
         view = scene.view

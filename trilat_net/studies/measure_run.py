@@ -87,13 +87,6 @@ def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) 
     return RecordBatch(t_ns, q, qd, e, tau, tau_x, used)
 
 
-def _pack_records(axes: Sequence[float], records: Sequence[TickRecord]) -> RecordBatch:
-    rows = [(one.q, one.qd, one.q_des, one.tau, one.tau_x, one.x) for one in records]
-    t_ns = np.array([one.t_ns for one in records], dtype=np.int64)
-    used = np.array([one.used for one in records], dtype=np.int64)
-    return _make_batch(axes, t_ns, used, *map(np.array, zip(*rows, strict=True)))
-
-
 def run_in_batches(
     scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
 ) -> tuple[float | None, int]:
@@ -107,9 +100,13 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        if pending[name]:
-            take[name](_pack_records(scenario.arms[name].axes, pending[name]))
-            pending[name].clear()
+        if records := pending[name]:
+            rows = [(one.q, one.qd, one.q_des, one.tau, one.tau_x, one.x) for one in records]
+            t_ns = np.array([one.t_ns for one in records], dtype=np.int64)
+            used = np.array([one.used for one in records], dtype=np.int64)
+            vectors = map(np.array, zip(*rows, strict=True))
+            take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+            records.clear()
 
     with process.pause_gc():
         for site, _, output in virtual.execute_virtual(scenario):

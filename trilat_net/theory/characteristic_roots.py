@@ -368,8 +368,7 @@ def _eliminate_states(matrix: Array, E: Array) -> Array:
     given = np.flatnonzero(E == 0.0)
     kept = np.setdiff1d(np.arange(len(matrix)), given)
     ours = np.linalg.solve(matrix[np.ix_(given, given)], matrix[np.ix_(given, kept)])
-    reduced: Array = matrix[np.ix_(kept, kept)] - matrix[np.ix_(kept, given)] @ ours
-    return reduced
+    return matrix[np.ix_(kept, kept)] - matrix[np.ix_(kept, given)] @ ours
 
 
 def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> bool:
@@ -408,13 +407,11 @@ def chebyshev_nodes(order: int) -> Array:
 def chebyshev_interpolation(order: int, x: Array) -> Array:
     """Returns the matrix from values at the nodes to the polynomial's values at x, shape (K, M + 1)."""
     at_nodes = chebvander(chebyshev_nodes(order), order)
-    weights: Array = np.linalg.solve(at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
-    return weights
+    return np.linalg.solve(at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
 
 
 def chebyshev_differentiation(order: int) -> Array:
     """Returns the matrix from values at the nodes to the polynomial's derivatives there."""
     nodes = chebyshev_nodes(order)
     slopes = chebvander(nodes, order - 1) @ chebder(np.eye(order + 1))
-    matrix: Array = np.linalg.solve(chebvander(nodes, order).T, slopes.T).T.astype(np.float64)
-    return matrix
+    return np.linalg.solve(chebvander(nodes, order).T, slopes.T).T.astype(np.float64)

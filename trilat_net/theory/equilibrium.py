@@ -240,14 +240,11 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
     if not count:
         return None
     W, V = left[:, -count:], right[-count:].T
-    D = np.eye(len(values))
-    for term in loop.delayed:
-        D += term.delay_s * term.A
+    D = sum((term.delay_s * term.A for term in loop.delayed), np.eye(len(values)))
     inner = W.T @ D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
-    kept: Array = V @ np.linalg.solve(inner, W.T @ D @ deviation)
-    return kept
+    return V @ np.linalg.solve(inner, W.T @ D @ deviation)
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:

@@ -120,9 +120,44 @@ class LinearAnalysis(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat linear --json`."""
-        ports = None if self.ports is None else ports_to_json(self.ports)
-        edges = {scan.key: [one._asdict() for one in scan.edges] for scan in self.scans}
-        return {**linear_to_json(self), "ports": ports, "edges": edges}
+        names, conditions, rest = self.scenario.names, self.conditions, self.rest
+        layouts = [site.layout for site in conditions.sites]
+        learns = [not isinstance(site.own, NumericLaw) for site in conditions.sites]
+        q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
+        theta_hat = [
+            own[: layout.parameters * one].tolist()
+            for own, layout, one in zip(rest.theta_hat, layouts, learns, strict=True)
+        ]
+        poses = dict(zip(names, (pose.tolist() for pose in self.end_effectors), strict=True))
+        return {
+            "scenario": self.scenario.name,
+            "scenario_sha256": self.scenario.sha256,
+            "verdict": self.verdict,
+            "rest": {
+                "how": rest.how,
+                "residual": rest.residual,
+                "q_rad": dict(zip(names, q, strict=True)),
+                "theta_hat": dict(zip(names, theta_hat, strict=True)),
+                **({"x": poses} if layouts[0].task else {}),
+            },
+            "delay_in_use_ms": {
+                f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
+                for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
+            },
+            "continuous": _spectrum_to_json(self.continuous),
+            "as_computed": None if self.sampled is None else _spectrum_to_json(self.sampled),
+            "margin": {
+                "words": self.margin.words,
+                "stable": [{"from_s": one.low_s, "to_s": one.high_s} for one in self.margin.intervals],
+                "crossings": [
+                    {"delay_s": one.delay_s, "omega_rad_s": one.omega_rad_s, "pairs_to_the_right": one.pairs}
+                    for one in self.margin.crossings
+                ],
+            },
+            "notes": list(self.notes),
+            "ports": None if self.ports is None else ports_to_json(self.ports),
+            "edges": {scan.key: [one._asdict() for one in scan.edges] for scan in self.scans},
+        }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per root: of the continuous loop, and as computed tick by tick."""
@@ -182,46 +217,6 @@ def analyse_linear_loop(
         for key, low, high in ranges
     )
     return replace(found, scans=scans, ports=analyse_ports(scenario, rest, hands=hands) if ports else None)
-
-
-def linear_to_json(analysis: LinearAnalysis) -> dict[str, Any]:
-    """Returns an analysis as plain values."""
-    names, conditions, rest = analysis.scenario.names, analysis.conditions, analysis.rest
-    layouts = [site.layout for site in conditions.sites]
-    learns = [not isinstance(site.own, NumericLaw) for site in conditions.sites]
-    q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
-    theta_hat = [
-        own[: layout.parameters * one].tolist()
-        for own, layout, one in zip(rest.theta_hat, layouts, learns, strict=True)
-    ]
-    poses = dict(zip(names, (pose.tolist() for pose in analysis.end_effectors), strict=True))
-    return {
-        "scenario": analysis.scenario.name,
-        "scenario_sha256": analysis.scenario.sha256,
-        "verdict": analysis.verdict,
-        "rest": {
-            "how": rest.how,
-            "residual": rest.residual,
-            "q_rad": dict(zip(names, q, strict=True)),
-            "theta_hat": dict(zip(names, theta_hat, strict=True)),
-            **({"x": poses} if layouts[0].task else {}),
-        },
-        "delay_in_use_ms": {
-            f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
-            for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
-        },
-        "continuous": _spectrum_to_json(analysis.continuous),
-        "as_computed": None if analysis.sampled is None else _spectrum_to_json(analysis.sampled),
-        "margin": {
-            "words": analysis.margin.words,
-            "stable": [{"from_s": one.low_s, "to_s": one.high_s} for one in analysis.margin.intervals],
-            "crossings": [
-                {"delay_s": one.delay_s, "omega_rad_s": one.omega_rad_s, "pairs_to_the_right": one.pairs}
-                for one in analysis.margin.crossings
-            ],
-        },
-        "notes": list(analysis.notes),
-    }
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:

@@ -50,8 +50,7 @@ class SiteJacobian(NamedTuple):
     def sent(self) -> Array:
         """What peers get by the site's own states, shape (3 m, states): x, its velocity, the torque."""
         rates = self.rates
-        whole: Array = np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
-        return whole
+        return np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
 
 
 class DelayedTerm(NamedTuple):
@@ -97,10 +96,7 @@ class LinearLoop(NamedTuple):
     @property
     def static_matrix(self) -> Array:
         """A + sum_k A_k: the effect of a constant deviation."""
-        total = self.A.copy()
-        for term in self.delayed:
-            total += term.A
-        return total
+        return sum((term.A for term in self.delayed), self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:

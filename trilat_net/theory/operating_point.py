@@ -146,7 +146,6 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
     pairs = conditions.pairs
     if conditions.has_forms:
         pairs = [(i, j) for i in range(len(alpha)) for j in range(len(alpha)) if i != j]
-    if conditions.has_forms:
         notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
     links = {}
     for i, j in pairs:

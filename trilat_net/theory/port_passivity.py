@@ -77,8 +77,7 @@ class HandMatrices(NamedTuple):
         """Returns the Hermitian part of its impedance at some frequencies, N s/m, shape (F, n, n)."""
         w = w_rad_s[:, np.newaxis, np.newaxis]
         Z: Complex = 1j * w * self.M + self.B - 1j * self.K / w
-        whole: Complex = 0.5 * (Z + np.conj(np.swapaxes(Z, -1, -2)))
-        return whole
+        return 0.5 * (Z + np.conj(np.swapaxes(Z, -1, -2)))
 
 
 def check_against_hands(
@@ -122,8 +121,7 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
     Y has shape (F, p, p); the weights of the ports are positive, shape (p,) or (F, p).
     """
     root = np.sqrt(weights)
-    scaled: Complex = root[..., :, np.newaxis] * Y / root[..., np.newaxis, :]
-    return scaled
+    return root[..., :, np.newaxis] * Y / root[..., np.newaxis, :]
 
 
 def find_least_eigenvalue(Y: Complex) -> Array:
@@ -195,8 +193,7 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
     if not clamped:
         return kept
     across = np.linalg.solve(Y[:, clamped][:, :, clamped], Y[:, clamped][:, :, keep])
-    left: Complex = kept - Y[:, keep][:, :, clamped] @ across
-    return left
+    return kept - Y[:, keep][:, :, clamped] @ across
 
 
 class BestWeights(NamedTuple):

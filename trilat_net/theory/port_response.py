@@ -156,7 +156,7 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
     return max((term.delay_s for term in loop.delayed), default=0.0)
 
 
-def find_pole_at_zero(loop: LinearLoop, output: LoopOutput | None = None) -> PoleAtZero:
+def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     """Returns the pole of the response at zero, by Cauchy's integral along a small circle about it.
 
     Common poses at which the arms can rest, and estimates without excitation, are roots of the loop at
@@ -164,7 +164,7 @@ def find_pole_at_zero(loop: LinearLoop, output: LoopOutput | None = None) -> Pol
     1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count as at zero.
     """
     turn = np.exp(2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS)[:, np.newaxis, np.newaxis]
-    values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * turn[:, 0, 0], output)
+    values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * turn[:, 0, 0])
     parts = [(values * turn**power).mean(axis=0).real for power in range(1, _HIGHEST_POWER + 1)]
     size = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
     powers = [power for power, part in enumerate(parts, 1) if np.abs(part).max(initial=0.0) > size]

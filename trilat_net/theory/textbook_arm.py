@@ -186,8 +186,7 @@ class PlacedChain:
         """Returns the position of the end effector in the base, shape (3, ...), m."""
         last = self._links[-1]
         tip = np.multiply.outer(np.array(self._chain.tip_m), np.ones(self._q.shape[1:]))
-        position: Numbers = last.place_m + multiply_columns(last.R_base, tip)
-        return position
+        return last.place_m + multiply_columns(last.R_base, tip)
 
     def end_effector_orientation(self) -> Numbers:
         """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 import trilat_net
 from trilat_net.analysis.certificate.stability_certificate import (
     FALSE_RECORDS_TEXT,
-    certificate_to_json,
     certify,
 )
 from trilat_net.errors import ScenarioError
@@ -58,7 +57,7 @@ def test_every_run_is_certified(name: str, picks: dict[str, int], duration_s: fl
     except ScenarioError:
         return
     found = certify(trilat_net.simulate(scenario))
-    told = json.loads(json.dumps(certificate_to_json(found), allow_nan=False))
+    told = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert FALSE_RECORDS_TEXT not in told["text"] or "tells which" in told["text"]
     assert all(line.text and "nan" not in line.text.split() for line in describe_certificate(found))
     assert found.passed is (describe_certificate(found)[0].mark == "ok")

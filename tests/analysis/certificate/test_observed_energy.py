@@ -12,7 +12,7 @@ import pytest
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
 from tests.unit_arm import hand, unit_scenario
 from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies
-from trilat_net.analysis.certificate.stability_certificate import certificate_to_json, certify
+from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
@@ -111,7 +111,7 @@ def test_the_certificate_says_it_in_words_and_in_json() -> None:
     found = certify(clamped(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(found)}
     assert lines[found.observed.text] == "ok"
-    told = certificate_to_json(found)["observed"]
+    told = found.to_dict()["observed"]
     assert told["finding"] == "passive"
     assert {one["name"] for one in told["premises"]} == {"books", "torque", "sampling"}
     assert np.isfinite([one["amount_j"] for one in told["least"]]).all()

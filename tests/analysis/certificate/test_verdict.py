@@ -18,7 +18,6 @@ from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
     EndPoseRoots,
     StabilityFinding,
-    certificate_to_json,
     certify,
     find_growth,
 )
@@ -251,7 +250,7 @@ def found(data: bytes, **options: float) -> Certificate:
 def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
     certificate = found(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
-    facts = certificate_to_json(certificate)["evidence"]
+    facts = certificate.to_dict()["evidence"]
     assert facts == {
         "coverage": 1.0,
         "functional_coverage": 1.0,

@@ -25,7 +25,6 @@ from trilat_net.analysis.metrics.log_metrics import (
     compare_metrics,
     comparison_to_json,
     compute_log_metrics,
-    metrics_to_json,
 )
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.log.log_reader import Log
@@ -38,7 +37,7 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 def told(log: Log) -> dict[str, Any]:
     """The facts of a log, checked for what holds of all."""
     measured = compute_log_metrics(log)
-    found: dict[str, Any] = json.loads(json.dumps(metrics_to_json(measured), allow_nan=False))
+    found: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
     assert set(found["sites"]) == set(log.sites)
     assert len(found["links"]) == len(log.sites) * (len(log.sites) - 1)
     unknown = found["unknown"]

@@ -9,9 +9,9 @@ import pytest
 from tests.cli.running import trilat
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
-from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, run_sweep
+from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.sweep_cell import classify_end
-from trilat_net.studies.sweep.sweep_results import build_reproduce_command
+from trilat_net.studies.sweep.sweep_results import SweepResults, build_reproduce_command
 
 from .quick import SHORT, asked
 

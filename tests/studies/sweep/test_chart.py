@@ -25,7 +25,7 @@ from trilat_net.studies.sweep.stability_map import (
 )
 from trilat_net.studies.sweep.sweep_plan import format_override, format_override_value, plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.theory import GrowthColumn, compute_growth_column, iterate_linear_edges
+from trilat_net.theory.linear_edge import GrowthColumn, compute_growth_column, iterate_linear_edges
 
 from .maps import KEYS, rows
 

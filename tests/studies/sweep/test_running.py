@@ -6,11 +6,16 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.studies.sweep import open_sweep_folder, prepare_sweep_folder, run_sweep, sweep_cell
+from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import RESULTS_FILE, describe_sweep_plan, summarize_sweep
-from trilat_net.studies.sweep.sweep_run import DurationEstimate, estimate_sweep, refuse_oversized_sweep
+from trilat_net.studies.sweep.sweep_run import (
+    DurationEstimate,
+    estimate_sweep,
+    open_sweep_folder,
+    refuse_oversized_sweep,
+)
 
 from .quick import DELAYS, Judge, asked
 

@@ -11,12 +11,13 @@ import pytest
 
 from trilat_net.errors import UsageError
 from trilat_net.studies.intervals import wilson_interval
-from trilat_net.studies.sweep import SweepResults, prepare_sweep_folder, read_results, run_sweep, sweep_cell
+from trilat_net.studies.sweep import prepare_sweep_folder, read_results, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
 from trilat_net.studies.sweep.sweep_results import (
     GRID_POINTS_FILE,
     GridPoint,
+    SweepResults,
     build_result_rows,
     collect_grid_points,
     encode_results,

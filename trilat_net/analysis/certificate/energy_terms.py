@@ -25,7 +25,7 @@ from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario
-from ..aligned import AlignedRecords, Bools, DelayedPeer
+from ..aligned import AlignedRecords, Bools, DelayedPeer, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
 from ..following import Following, follow_rows
@@ -79,8 +79,7 @@ class SiteConstants(NamedTuple):
 
     def robust_torque(self, r: Array) -> Array:
         """Returns the torque that opposes r besides Kp r, shape (K, n), N m."""
-        torque: Array = self.rho * r / np.sqrt(r**2 + self.width**2)
-        return torque
+        return self.rho * r / np.sqrt(r**2 + self.width**2)
 
     @property
     def unknown_friction(self) -> Array:
@@ -512,7 +511,7 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     there. It is no part of the balance: what that leaves without this is unexplained.
     """
     at, c, ends = site.records, site.constants, site.ends
-    u = at.held_torque(c.tau_limit, digital=site.scheme is Scheme.DIGITAL)
+    u = hold_torque(at.tau, c.tau_limit, digital=site.scheme is Scheme.DIGITAL)[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
     off_law = u - 0.5 * (at.tau[:-1] + tau_right)
     amount = at.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)

@@ -17,6 +17,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...results import JsonObject
 from ...scenario.imported_code import ImportedLaw
+from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premises import Premise
 
@@ -156,12 +157,8 @@ def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
     count = len(part) - int(part.mode[-1] == "diverged")
     records = _read_law_records(log, name, law, count)
     booked: LawEnergies = law.energies(records)
-    digital = setup.scheme is Scheme.DIGITAL
-    held = records.tau.copy()
-    if not digital:
-        limit = np.array(setup.tau_limit_nm)
-        held[1:] = np.clip(1.5 * held[1:] - 0.5 * held[:-1], -limit, limit)
-    given = -sum_work(held, records.q)
+    limit_nm, digital = np.array(setup.tau_limit_nm), setup.scheme is Scheme.DIGITAL
+    given = -sum_work(hold_torque(records.tau, limit_nm, digital=digital), records.q)
     if setup.theta_known:  # holding the arm is no work of the law
         potential = build_arm_rows(log.scenario, name).potential_energy(records.q)
         given += booked.gravity * (potential - potential[0])

@@ -207,7 +207,32 @@ class Certificate(Result):
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
-        return certificate_to_json(self)
+        verdict, end, balance = self.verdict, self.end, self.balance
+        return {
+            "passed": self.passed,
+            "stability": self.stability.value,
+            "reasons": list(self.reasons),
+            "verdict": verdict.finding.name.lower(),
+            "text": verdict.text,
+            "rise": _rise_to_json(verdict.rise),
+            "tolerance_j": verdict.tolerance,
+            "closed_groups": [list(group) for group in self.groups],
+            "premises": [premise._asdict() for premise in self.premises],
+            "growth": {
+                "motion": end.behaviour.name.lower(),
+                "text": end.text,
+                "where": end.where or None,
+                "error_rate_per_s": finite_or_none(end.error.rate_per_s),
+                "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
+                "end_error_rad": end.end_error_rad,
+                "end_speed_rad_s": end.end_speed_rad_s,
+            },
+            "evidence": self.evidence.to_json(),
+            "roots": None if self.roots is None else self.roots._asdict(),
+            "observed": None if self.observed is None else self.observed.to_json(),
+            "twins": None if self.twins is None else self.twins.to_json(),
+            "functional": None if balance is None else _functional_to_json(self, balance),
+        }
 
     def to_rows(self) -> list[JsonObject]:
         """Returns a row per premise."""
@@ -239,7 +264,9 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
     premises = check_premises(run)
     verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
     if known is not None:
-        verdict = judge_functional(known, premises)
+        verdicts = (judge(known, premises) for judge in JUDGEMENTS)
+        verdict = next(verdict for verdict in verdicts if verdict is not None)
+        verdict = verdict if known.groups else verdict._replace(tolerance=known.tolerance)
     if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
     end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
@@ -251,13 +278,6 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
     alike = np.allclose(known.balance.beta, 1.0)
     ones = None if alike else compute_energy_balance(known.energies, ones=True)
     return replace(found, balance=known.balance, ones=ones, energies=known.energies)
-
-
-def judge_functional(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    """Returns the verdict on V: of the first of the `JUDGEMENTS` that applies."""
-    verdicts = (judge(run, premises) for judge in JUDGEMENTS)
-    found = next(verdict for verdict in verdicts if verdict is not None)
-    return found if run.groups else found._replace(tolerance=run.tolerance)
 
 
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
@@ -305,11 +325,9 @@ def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
 
 def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """There is no unique beta."""
-    return (
-        StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
-        if run.groups
-        else None
-    )
+    if not run.groups:
+        return None
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
 
 
 def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
@@ -387,36 +405,6 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
         from_s = float(balance.t_s[half + lowest])
         found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
     return found
-
-
-def certificate_to_json(certificate: Certificate) -> JsonObject:
-    """Returns a certificate, ready for JSON."""
-    verdict, end, balance = certificate.verdict, certificate.end, certificate.balance
-    return {
-        "passed": certificate.passed,
-        "stability": certificate.stability.value,
-        "reasons": list(certificate.reasons),
-        "verdict": verdict.finding.name.lower(),
-        "text": verdict.text,
-        "rise": _rise_to_json(verdict.rise),
-        "tolerance_j": verdict.tolerance,
-        "closed_groups": [list(group) for group in certificate.groups],
-        "premises": [premise._asdict() for premise in certificate.premises],
-        "growth": {
-            "motion": end.behaviour.name.lower(),
-            "text": end.text,
-            "where": end.where or None,
-            "error_rate_per_s": finite_or_none(end.error.rate_per_s),
-            "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
-            "end_error_rad": end.end_error_rad,
-            "end_speed_rad_s": end.end_speed_rad_s,
-        },
-        "evidence": certificate.evidence.to_json(),
-        "roots": None if certificate.roots is None else certificate.roots._asdict(),
-        "observed": None if certificate.observed is None else certificate.observed.to_json(),
-        "twins": None if certificate.twins is None else certificate.twins.to_json(),
-        "functional": None if balance is None else _functional_to_json(certificate, balance),
-    }
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:

@@ -19,7 +19,6 @@ from ...core.task_space import PLACE
 from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
-from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
@@ -34,6 +33,9 @@ for _found in pkgutil.iter_modules(import_module(__package__).__path__):
 
 _ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
 """Units along an axis in place of those of a joint."""
+
+METRICS_JSON_VERSION = 1
+"""Of this layout: keys may be added under it, none is taken away or changes its meaning."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -86,7 +88,29 @@ class LogMetrics(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat metrics --json`."""
-        return metrics_to_json(self)
+        places = {"sites": self.sites, "links": self.links, "walls": self.walls}
+        windows = self.static_windows.value
+        named = {f"{kind}.{name}.": one for kind, found in places.items() for name, one in found.items()}
+        metrics_by_path = {"run.": self.run, **named, "": {"windows_at_rest": self.static_windows}}
+        content: dict[str, Any] = {
+            "version": METRICS_JSON_VERSION,
+            "log": self.log,
+            "scenario": self.scenario,
+            "driver": self.driver,
+            "complete": self.complete,
+            "run": _values(self.run),
+            **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
+            "parameters": {site: estimates.to_json() for site, estimates in self.estimates.items()},
+            "windows_at_rest": None if windows is None else int(windows),
+            **_details_to_json(self),
+            "unknown": {
+                path + key: one.why
+                for path, found in metrics_by_path.items()
+                for key, one in found.items()
+                if one.value is None
+            },
+        }
+        return {key: _finite(value) for key, value in content.items()}
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per quantity and place."""
@@ -133,22 +157,9 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    return _measure(RunView(log))
-
-
-def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
-    found: dict[str, dict[str, MetricValues]] = {
-        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
-    }
-    for one in wanted:
-        for place, values in found[one.of].items():
-            values.update(one.measure(view, place))
-    return found
-
-
-def _measure(view: RunView) -> LogMetrics:
-    log, scenario = view.log, view.scenario
+    view, scenario = RunView(log), log.scenario
     found = _measure_places(view, list_measures())
+    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
     return LogMetrics(
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
         found["run"][""],
@@ -160,8 +171,18 @@ def _measure(view: RunView) -> LogMetrics:
         static_windows.estimate_stiffness(view),
         estimate_impedances(view),
         TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
-        _find_joint_names(scenario),
+        names.pop() if len(names) == 1 else (),
     )
+
+
+def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
+    found: dict[str, dict[str, MetricValues]] = {
+        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
+    }
+    for one in wanted:
+        for place, values in found[one.of].items():
+            values.update(one.measure(view, place))
+    return found
 
 
 def find_quantity(key: str) -> Quantity:
@@ -187,43 +208,6 @@ def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         key: find_whole(one, {place: values[key] for place, values in found[one.of].items()})
         for key, one in asked.items()
     }
-
-
-def _find_joint_names(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the names that the files of the arms give their joints; () if not all name them alike."""
-    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
-    return names.pop() if len(names) == 1 else ()
-
-
-METRICS_JSON_VERSION = 1
-"""Of this layout: keys may be added under it, none is taken away or changes its meaning."""
-
-
-def metrics_to_json(metrics: LogMetrics) -> dict[str, Any]:
-    """Returns the metrics of a log, ready for JSON."""
-    places = {"sites": metrics.sites, "links": metrics.links, "walls": metrics.walls}
-    windows = metrics.static_windows.value
-    named = {f"{kind}.{name}.": one for kind, found in places.items() for name, one in found.items()}
-    metrics_by_path = {"run.": metrics.run, **named, "": {"windows_at_rest": metrics.static_windows}}
-    content: dict[str, Any] = {
-        "version": METRICS_JSON_VERSION,
-        "log": metrics.log,
-        "scenario": metrics.scenario,
-        "driver": metrics.driver,
-        "complete": metrics.complete,
-        "run": _values(metrics.run),
-        **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
-        "parameters": {site: estimates.to_json() for site, estimates in metrics.estimates.items()},
-        "windows_at_rest": None if windows is None else int(windows),
-        **_details_to_json(metrics),
-        "unknown": {
-            path + key: one.why
-            for path, found in metrics_by_path.items()
-            for key, one in found.items()
-            if one.value is None
-        },
-    }
-    return {key: _finite(value) for key, value in content.items()}
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
 from ...scenario import Scenario
-from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, view_delayed_peer
+from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque, view_delayed_peer
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import follow_rows
 from ..run_view import RunView
@@ -43,7 +43,7 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     if spec.plant != "simulated":
         return 0.5 * (records.tau[:-1] + records.tau[1:])
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
-    return records.held_torque(np.asarray(spec.limits.tau_limit_nm), digital=digital)
+    return hold_torque(records.tau, np.asarray(spec.limits.tau_limit_nm), digital=digital)[:-1]
 
 
 def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
@@ -163,8 +163,7 @@ def _delay_torque(
     if gains.law is Law.ADAPTIVE:
         v, a = follows.reference(every, -off, -off_rate)
         torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
-        added: Array = torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
-        return added
+        return torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
     pull = axes * np.array(gains.K) * off + Kd * off_rate
     if np.any(gains.k_f):  # it reflects the torque on the peer: as it came, less the one at the same time
         used = records.used[other.site]

@@ -148,8 +148,7 @@ def cumulative_percent(values: Array, limits: Array) -> Array:
     """Returns the percentage of values that are at most as large as each limit; NaN without values."""
     if not len(values):
         return np.full(len(limits), np.nan)
-    percent: Array = 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
-    return percent
+    return 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
 
 
 def stated_delay_line(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
@@ -208,8 +207,7 @@ def loop_time_bin_edges(log: Log) -> Array:
     )
     decades = np.log10(max(largest, 10) * 1.1)
     count = int(np.ceil(decades * _BINS_PER_DECADE))
-    edges: Array = np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
-    return edges
+    return np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
 
 
 def bin_loop_times(times_us: Ints, edges: Array) -> Ints:

@@ -53,7 +53,13 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
         return style.empty_figure(certificate.verdict.text, form)
     with style.time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
         rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
-        _draw_functional_of_sites(log, certificate, balance, rows[0])
+        _draw(balance, rows[0], balance.V, **_TOTAL)
+        if (ones := certificate.ones) is not None:
+            _draw(ones, rows[0], ones.V, **_ONES)
+        for site, values in balance.sites.items():
+            _draw(balance, rows[0], values, **style.site_line(log, site, 1.0))
+        rows[0].set_ylim(bottom=0.0)
+        rows[0].set_ylabel(r"V and its $\beta_i V_i$ (J)")
         for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
             _draw(balance, rows[1], values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
         rows[1].set_ylabel("parts of V (J)")
@@ -68,8 +74,8 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
         if rise is not None:
             rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
             rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
-        ones = [] if certificate.ones is None else [("V with the paper's ones", _ONES)]
-        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *ones])
+        by_ones = [] if ones is None else [("V with the paper's ones", _ONES)]
+        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *by_ones])
     return plot.figure
 
 
@@ -125,17 +131,6 @@ def _draw_observed(log: Log, form: FigureSize) -> Figure:
 
 def _draw(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
     style.plot_decimated(axes, np.arange(len(balance.t_s)), balance.t_s, values, **options)
-
-
-def _draw_functional_of_sites(log: Log, certificate: Certificate, balance: EnergyBalance, axes: Axes) -> None:
-    ones = certificate.ones
-    _draw(balance, axes, balance.V, **_TOTAL)
-    if ones is not None:
-        _draw(ones, axes, ones.V, **_ONES)
-    for site, values in balance.sites.items():
-        _draw(balance, axes, values, **style.site_line(log, site, 1.0))
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
 
 
 def _add_panel_legend(axes: Axes, form: FigureSize) -> None:

@@ -316,7 +316,7 @@ def _draw_estimate(
     plot: style.TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
 ) -> None:
     """Draws the estimates of one parameter, and its true value once if all sites share it."""
-    truths = {site: float(site_signals.true_parameters(plot.log, site)[index]) for site in sites}
+    truths = {site: float(plot.log.scenario.arms[site].theta[index]) for site in sites}
     for site in sites:
         plot.trace(axes, site, site_signals.parameter_estimates(plot.log[site])[:, index], width)
     if len(set(truths.values())) == 1:

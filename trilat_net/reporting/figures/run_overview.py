@@ -70,8 +70,12 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             for site, values in columns.items():
                 plot.trace(axes, site, style.positive(values) if panel.log_scale else values)
             plot.mark(axes, log.sites)
+        last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
+        when = "not settled" if last is None else f"settled at {last:.1f} s"
+        words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
+        title = "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))
         entries = style.site_legend_entries(log, log.sites)
-        plot.finish(panels[3:] if form.narrow else panels[2:], entries, title=_describe(log, form))
+        plot.finish(panels[3:] if form.narrow else panels[2:], entries, title=title)
     return plot.figure
 
 
@@ -135,10 +139,3 @@ def _scale(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
     elif most > 0.0:
         least = max(float(known[known > 0.0].min()), most * 10.0**-_DECADES)
         axes.set(yscale="log", ylim=(0.7 * least, 1.5 * most))
-
-
-def _describe(log: Log, form: FigureSize) -> str:
-    last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
-    when = "not settled" if last is None else f"settled at {last:.1f} s"
-    words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
-    return "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))

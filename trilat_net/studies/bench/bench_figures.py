@@ -48,8 +48,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
         scale = LogNorm(max(least, 1e-6), max(most, 2e-6))
     height = sum(_HEAD_IN / 2 + _ROW_IN * len(field) for field in fields.values()) + _HEAD_IN
     form = make_print_size(_WIDTH_IN)
-    with style.figure_style(form):
-        figure = style.new_figure(height, form.width_in)
+    with style.styled_figure(form, height) as figure:
         ratios = [len(field) for field in fields.values()]
         grid = style.add_panels(figure, len(tasks), 1, sharex=True, height_ratios=ratios)[:, 0]
         for axes, (task, field) in zip(grid, fields.items(), strict=True):

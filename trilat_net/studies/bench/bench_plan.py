@@ -282,12 +282,6 @@ def choose_round_trip(mean_ms: float) -> int:
     return longer[0] if longer else TUNED_ROUND_TRIPS_MS[-1]
 
 
-def list_candidates(search: CandidateSearch) -> list[int]:
-    """Returns the places of the candidates that are stable at the pose, those with the least error first."""
-    settled = [n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED]
-    return sorted(settled, key=lambda n: search.scores[n].error_rad or 0.0)
-
-
 def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, place: int) -> bool:
     """Returns whether a candidate, as it is, is stable at the pose if delays are longer by the margin."""
     base = load_tuning_task(form, round_trip_ms)
@@ -331,10 +325,11 @@ def tune_laws(
 
 
 def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    law, candidates = search.space.law, list_candidates(search)
-    passed = 0
-    while passed < len(candidates) and not _has_margin(form, round_trip_ms, search, candidates[passed]):
-        passed += 1
+    law, scores = search.space.law, search.scores
+    settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
+    candidates = sorted(settled, key=lambda n: scores[n].error_rad or 0.0)
+    kept = (n for n, at in enumerate(candidates) if _has_margin(form, round_trip_ms, search, at))
+    passed = next(kept, len(candidates))
     place = candidates[passed] if passed < len(candidates) else None
     return TunedGains(
         form=form,
@@ -344,8 +339,8 @@ def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
         settled=len(candidates),
         tried=len(search.tried),
         passed=passed,
-        error_rad=None if place is None else search.scores[place].error_rad,
-        effort_nm=None if place is None else search.scores[place].effort_nm,
+        error_rad=None if place is None else scores[place].error_rad,
+        effort_nm=None if place is None else scores[place].effort_nm,
         fingerprint=fingerprint_tuning(form, law, round_trip_ms),
     )
 

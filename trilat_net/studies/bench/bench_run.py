@@ -95,7 +95,9 @@ def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
 def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
     """Returns a run that lasts for its slowest time constants; not stable is what twice as long is, too."""
     length_s = judged.scenario.duration_s
-    wanted_s = TIME_CONSTANTS * _find_time_constant_s(judged)
+    rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
+    rates += [one.rate_per_s for one in judged.twins.pushes if one.factor > 0.0]
+    wanted_s = TIME_CONSTANTS * max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
     if judged.stability is Stability.OPEN or wanted_s < LONGEST_S:
         wanted_s = min(wanted_s, LONGEST_S)
         if length_s < wanted_s and judged.end.diverged_at_s is None:
@@ -104,13 +106,6 @@ def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
     if judged.stability is Stability.NOT_STABLE and judged.end.diverged_at_s is None:
         return _run(judged.scenario, 2.0 * length_s, twins)
     return judged
-
-
-def _find_time_constant_s(judged: _JudgedRun) -> float:
-    """Returns the slowest time constant that a run and its twins show, s; 0 where nothing falls."""
-    rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
-    rates += [one.rate_per_s for one in judged.twins.pushes if one.factor > 0.0]
-    return max((-1.0 / rate for rate in rates if rate < 0.0), default=0.0)
 
 
 def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
@@ -142,8 +137,7 @@ def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
 def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
     """Returns the torque of the operators ON an arm, without the friction of its joints, shape (K, n)."""
     dampers = (one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment))
-    torque: Array = sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
-    return torque
+    return sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:

@@ -54,9 +54,7 @@ class ConfirmedCell(NamedTuple):
         return self.virtual is self.live
 
 
-def choose_cells_near_edges(
-    rows: Sequence[ResultRow], axes: Sequence[str], count: int, longest_s: float = MAX_SESSION_S
-) -> list[ResultRow]:
+def choose_cells_near_edges(rows: Sequence[ResultRow], axes: Sequence[str], count: int) -> list[ResultRow]:
     """Returns cells next to edges, as many on the stable side as on the other.
 
     How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
@@ -67,7 +65,6 @@ def choose_cells_near_edges(
         rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
         axes: the keys of the axes.
         count: how many on each side.
-        longest_s: cells that ran longer are passed over, s.
 
     Raises:
         UsageError: there is no edge, or no cell next to one that ran short enough.
@@ -83,11 +80,11 @@ def choose_cells_near_edges(
         brief = [
             place
             for place in away
-            if CellClass(places[place]["verdict"]).stable is side and places[place]["ran_s"] <= longest_s
+            if CellClass(places[place]["verdict"]).stable is side and places[place]["ran_s"] <= MAX_SESSION_S
         ]
         if not brief:
             word = "stable" if side else "other"
-            raise UsageError(f"every cell on the {word} side of an edge ran longer than {longest_s:g} s")
+            raise UsageError(f"every cell on the {word} side of an edge ran longer than {MAX_SESSION_S:g} s")
         farthest = sorted(away[place] for place in brief)[min(count, len(brief)) - 1]
         near = [place for place in brief if away[place] <= farthest]
         near.sort(key=lambda place: (*map(str, place[2:]), *place[:2]))
@@ -96,11 +93,11 @@ def choose_cells_near_edges(
     return chosen
 
 
-def confirm_cell(row: ResultRow, run: SessionRunner, longest_s: float = MAX_SESSION_S) -> ConfirmedCell:
+def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
     """Runs a cell over a network and compares verdicts."""
     virtual = CellClass(row["verdict"])
     extra_s = _BEYOND_S if row["diverged_s"] is not None else 0.0
-    lasts_s = min(row["ran_s"] + extra_s, longest_s + _BEYOND_S)
+    lasts_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _BEYOND_S)
     scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=lasts_s)
     file, problems = run(scenario, f"cell-{row['cell']}")
     log = file if file.exists() else None

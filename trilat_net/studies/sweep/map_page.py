@@ -77,8 +77,7 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[MapLine]], form
     rows = -(-len(plane.panels) // columns)
     each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
     barred = plane.judged_by_twins or plane.seeds > 1
-    with style.figure_style(form):
-        figure = style.new_figure(0.95 + rows * each_in, form.width_in)
+    with style.styled_figure(form, 0.95 + rows * each_in) as figure:
         grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
         for axes in grid[len(plane.panels) :]:
             axes.set_axis_off()
@@ -134,7 +133,10 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
         norm = BoundaryNorm(np.arange(len(CELL_CLASSES) + 1) - 0.5, len(CELL_CLASSES))
         palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
         axes.pcolormesh(x, y, classes, cmap=palette, norm=norm, rasterized=True)
-    _hatch(axes, x, y, _undecided(plane, panel))
+    for i, row in enumerate(_undecided(plane, panel)):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
     for line in lines:
         _draw_line(axes, plane, line)
 
@@ -158,8 +160,7 @@ def _extended(rows: Array, places: Array) -> Array:
         rows[i] + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
         for i, j, at, near, far in ((0, 1, 0, 1, 2), (-1, -2, -1, -2, -3))
     )
-    extended: Array = np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
-    return extended
+    return np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
 
 
 def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
@@ -167,13 +168,6 @@ def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
     if plane.judged_by_twins:
         return (panel.runs > 0) & np.isnan(panel.exponents_per_s)
     return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
-
-
-def _hatch(axes: Axes, x: Array, y: Array, where: Any) -> None:
-    for i, row in enumerate(where):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            axes.fill_between([x[start], x[end]], y[i], y[i + 1], zorder=1.5, **_HATCHED)
 
 
 def _bounds(side: PlaneAxis) -> Array:
@@ -270,9 +264,7 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
 _DPI = 300
 
 
-def write_map(
-    chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN, name: str = "map"
-) -> list[Path]:
+def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
     """Writes a map into a folder that exists, and returns the paths.
 
     Raises:
@@ -280,7 +272,7 @@ def write_map(
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
+    paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
     for path in paths[:-1]:
         style.write_figure(figure, path, _DPI)
     write_whole(paths[-1], build_map_page(chart, paths[0].name))

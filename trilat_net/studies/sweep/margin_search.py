@@ -23,7 +23,7 @@ from ...reporting.result_text import TextTable
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.code_consent import list_imported_code
-from ...theory import find_root_crossings
+from ...theory.linear_edge import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
 from .stability_map import StableInterval, evaluate_criterion, find_criterion_edge

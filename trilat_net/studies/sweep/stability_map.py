@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...analysis.arm_rows import PlacedArm
 from ...core.vectors import Array
 from ...errors import ScenarioError, UsageError
 from ...fields import is_number
@@ -32,7 +33,7 @@ from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
-from ...theory import GrowthColumn, compute_growth_column
+from ...theory.linear_edge import GrowthColumn, compute_growth_column
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from .sweep_cell import CellClass
 from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
@@ -321,12 +322,8 @@ def _least_inertia(arm: ArmModel) -> float:
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    theta = arm.theta
-    ends = [
-        [[theta[0] + 2.0 * c * theta[1], theta[2] + c * theta[1]], [theta[2] + c * theta[1], theta[2]]]
-        for c in (-1.0, 1.0)
-    ]
-    return float(np.linalg.eigvalsh(np.array(ends)).min())
+    ends = PlacedArm(0.0, arm.lengths_m, np.array([[0.0, 0.0], [0.0, np.pi]]))
+    return float(np.linalg.eigvalsh(ends.inertia_matrix(arm.theta).T).min())
 
 
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:
@@ -395,12 +392,8 @@ class MapLine(NamedTuple):
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
         """Returns where it crosses a column, from below."""
-        places = zip(y.values, self.spare[:, column].tolist(), strict=True)
-        return [
-            low + (high - low) * a / (a - b)
-            for (low, a), (high, b) in pairwise(places)
-            if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)
-        ]
+        at, spare = y.values, self.spare[:, column].tolist()
+        return [at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1]) for n in _changes(spare)]
 
 
 ZERO_EXPONENT = "exponent = 0"

@@ -6,10 +6,6 @@ Invariant: every law gets the same number of candidates, torque clamp, horizon, 
 and classification. e alone ranks no law: arms that hang together have e = 0.
 
 docs/fair-comparison.md holds the procedure, the formulas and the table of search ranges.
-
-    from trilat_net.studies.tuning import plan_tuning
-
-    result = plan_tuning("free", budget=16).run()
 """
 
 from .tuning_plan import TuningPlan, TuningResult, plan_tuning

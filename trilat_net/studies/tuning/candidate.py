@@ -109,8 +109,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     held = stiffness > 0.0
     rows = np.vstack([start, np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))])
     last = np.maximum.accumulate(np.where(held, np.arange(1, len(t_s) + 1)[:, np.newaxis], 0), axis=0)
-    pose: Array = np.take_along_axis(rows, last, axis=0)
-    return pose
+    return np.take_along_axis(rows, last, axis=0)
 
 
 def _springs(scenario: Scenario) -> list[tuple[str, JointSpring]]:
