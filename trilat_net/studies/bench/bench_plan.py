@@ -447,14 +447,7 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Returns the suite, checked and ready to run.
-
-    Args:
-        study: "full", "small" or "round-trips".
-        tasks: which of the study's; none: all.
-        laws: the same.
-        links: the same; one that only the full study has may be named too.
-        seeds: of runs in which anything is drawn; None: as many as the study has.
+    """Returns the suite, checked and ready to run; its arguments are those of `trilat_net.bench`.
 
     Raises:
         UsageError: there is no such study, task, law or link, or no gains for a law.

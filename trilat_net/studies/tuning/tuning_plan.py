@@ -420,17 +420,9 @@ def plan_tuning(
     gravity_percent: float = 100.0,
     seeds: int = 1,
 ) -> TuningPlan:
-    """Returns a comparison, checked and ready to run.
+    """Returns a comparison, checked and ready to run; overrides are texts KEY=VALUE.
 
-    Args:
-        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        overrides: what is to be changed of it, as texts KEY=VALUE.
-        laws: which laws, by names or as classes; none means all that take any number of sites.
-        budget: candidates per law.
-        seed: of the search; the seed of the scenario is the scenario's own.
-        seeds: of how many seeds of the scenario, from its own on, each candidate is the mean.
-        objective: "error" or "settling".
-        gravity_percent: gravity that all laws get, in per cent of the truth.
+    The other arguments are those of `trilat_net.tune`: seeds of the scenario are those from its own on.
 
     Raises:
         ScenarioError: the scenario is none, or laws cannot be compared in it.
