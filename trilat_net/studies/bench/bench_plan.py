@@ -302,14 +302,9 @@ def tune_laws(
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
 ) -> list[TunedGains]:
-    """Tunes laws at every delay, and returns their gains.
+    """Tunes the laws of every form at every delay, with `budget` candidates per gain; returns their gains.
 
-    Args:
-        wanted: per form the laws.
-        jobs: processes of this machine.
-        on: what runs the candidates instead.
-        progress: called with the tunings that are done, and their number.
-        budget: candidates per gain of a law, at each delay.
+    `jobs` and `on` are those of `trilat_net.tune`; `progress` gets the tunings that are done, and all.
     """
     found: list[TunedGains] = []
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, wanted.values()))

@@ -65,11 +65,7 @@ class Objective(StrEnum):
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the places of the points that none dominates, by rising effort.
-
-    Args:
-        points: (objective, effort) of every run; None for one that does not compete.
-    """
+    """Returns the places of the points that none dominates, by rising effort; None does not compete."""
     order = sorted((point[1], point[0], n) for n, point in enumerate(points) if point is not None)
     kept: list[int] = []
     least = float("inf")
