@@ -375,13 +375,9 @@ def run_trials(
     done: Callable[[TrialResult], None] = lambda _: None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs trials in virtual time and returns their results.
+    """Runs trials in virtual time and returns their results; `done` gets every one as it comes.
 
-    Args:
-        batch: the trials.
-        jobs: how many processes; None for one per core. One trial, or one job, runs in this process.
-        done: called with every result as it comes.
-        on: what runs them instead: a Dask scheduler's address or an executor.
+    One trial, or one job, runs in this process; otherwise `jobs` and `on` are those of `check`.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()

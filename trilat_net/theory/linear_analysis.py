@@ -187,16 +187,9 @@ def analyse_linear_loop(
     ports: bool = False,
     hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario.
+    """Returns the linear analysis of a scenario; its arguments are those of `trilat_net.linear`.
 
-    Args:
-        source: the name of a shipped scenario, a path, or a scenario.
-        overrides: what is to be changed of it.
-        pose: the joint angles of all sites, rad, with true estimates; None for those at which a run ends.
-        roots: how many roots, the rightmost ones.
-        over: keys along which stability may change, and their ranges, as in "control.d=0.1:3".
-        ports: whether to analyse the ports of the operators.
-        hands: measured operators, of which any may hold any master, see `read_hands`.
+    `pose` is that of all sites, rad; of the measured operators, `hands`, any may hold any master.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.

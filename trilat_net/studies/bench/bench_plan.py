@@ -302,14 +302,9 @@ def tune_laws(
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
 ) -> list[TunedGains]:
-    """Tunes laws at every delay, and returns their gains.
+    """Tunes the laws of every form at every delay, with `budget` candidates per gain; returns their gains.
 
-    Args:
-        wanted: per form the laws.
-        jobs: processes of this machine.
-        on: what runs the candidates instead.
-        progress: called with the tunings that are done, and their number.
-        budget: candidates per gain of a law, at each delay.
+    `jobs` and `on` are those of `trilat_net.tune`; `progress` gets the tunings that are done, and all.
     """
     found: list[TunedGains] = []
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, wanted.values()))
@@ -447,14 +442,7 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Returns the suite, checked and ready to run.
-
-    Args:
-        study: "full", "small" or "round-trips".
-        tasks: which of the study's; none: all.
-        laws: the same.
-        links: the same; one that only the full study has may be named too.
-        seeds: of runs in which anything is drawn; None: as many as the study has.
+    """Returns the suite, checked and ready to run; its arguments are those of `trilat_net.bench`.
 
     Raises:
         UsageError: there is no such study, task, law or link, or no gains for a law.

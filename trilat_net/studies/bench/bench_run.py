@@ -229,14 +229,9 @@ def run_bench(
     *,
     confirm: bool = False,
 ) -> BenchResults:
-    """Runs what is left of a suite, and returns all of it.
+    """Runs what is left of a suite, and returns all of it; other arguments are those of `trilat_net.bench`.
 
-    Args:
-        folder: what its journal has is not run again.
-        jobs: in how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address or an executor.
-        progress: called with the runs that are done, and their number.
-        confirm: every run that is not stable, and did not diverge, is made again for 100 s.
+    What the journal of the folder has is not run again; `progress` gets the runs that are done, and all.
 
     Raises:
         RunFailed: a run ended its workers, or the cluster is gone. What is done is kept.

@@ -297,20 +297,11 @@ def plan_sweep(
     judge: str = "verdict",
     metrics: Sequence[str] = (),
 ) -> SweepPlan:
-    """Returns a sweep, checked and ready to run.
+    """Returns a sweep, checked and ready to run; overrides are texts KEY=VALUE.
 
-    Args:
-        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        overrides: what is to be changed of it everywhere, as texts KEY=VALUE.
-        over: the axes, as "link.delay_ms=0:1600:50" or "link.order=newest,in_order", or values by key.
-        seeds: how many, from the scenario's own on; or which.
-        laws: names of laws, or classes, swept besides the axes. One that all sites have stays with the gains
-            of the scenario; another one replaces the law of every site, with its default gains. Overrides of
-            gains count for either.
-        longest_s: how long an undecided cell may be extended, s; by default eight times its duration, and
-            not at all if twins judge.
-        judge: "twins" measures besides the growth exponent of every cell, and maps are drawn of that.
-        metrics: keys of `docs/metrics.md`: what is measured of every whole run besides.
+    The other arguments are those of `trilat_net.sweep`. A law that all sites have stays with the gains of the
+    scenario; another one replaces the law of every site, with its default gains. Overrides of gains count for
+    either.
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.

@@ -281,12 +281,8 @@ def run_sweep(
 ) -> FinishedSweep:
     """Runs what is left of a sweep, writes its results, and returns them.
 
-    Args:
-        folder: of the sweep; what its journal has is not run again.
-        jobs: in how many processes; None for one per core.
-        progress: called with the runs that are done, and their number as far as it is known.
-        known: runs that were made already, for an estimate.
-        on: what runs the cells instead: a Dask scheduler's address or an executor.
+    What the journal of the folder has, and the runs that are `known` from an estimate, are not made again;
+    `progress` gets the runs that are done, and their number as far as it is known.
 
     Raises:
         ScenarioError: a cell cannot run; says which. What is done is kept.

@@ -65,11 +65,7 @@ class Objective(StrEnum):
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the places of the points that none dominates, by rising effort.
-
-    Args:
-        points: (objective, effort) of every run; None for one that does not compete.
-    """
+    """Returns the places of the points that none dominates, by rising effort; None does not compete."""
     order = sorted((point[1], point[0], n) for n, point in enumerate(points) if point is not None)
     kept: list[int] = []
     least = float("inf")
@@ -420,17 +416,9 @@ def plan_tuning(
     gravity_percent: float = 100.0,
     seeds: int = 1,
 ) -> TuningPlan:
-    """Returns a comparison, checked and ready to run.
+    """Returns a comparison, checked and ready to run; overrides are texts KEY=VALUE.
 
-    Args:
-        source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        overrides: what is to be changed of it, as texts KEY=VALUE.
-        laws: which laws, by names or as classes; none means all that take any number of sites.
-        budget: candidates per law.
-        seed: of the search; the seed of the scenario is the scenario's own.
-        seeds: of how many seeds of the scenario, from its own on, each candidate is the mean.
-        objective: "error" or "settling".
-        gravity_percent: gravity that all laws get, in per cent of the truth.
+    The other arguments are those of `trilat_net.tune`: seeds of the scenario are those from its own on.
 
     Raises:
         ScenarioError: the scenario is none, or laws cannot be compared in it.
