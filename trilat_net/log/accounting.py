@@ -18,67 +18,56 @@ from ..net import topics
 from ..net.messages import READABLE, Event
 from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
-from ..scenario import parse_embedded
+from ..scenario import Scenario, parse_embedded
 from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 
 class RangeSet:
     """A set of whole numbers that grows at its upper end; keeps the highest `most` ranges."""
 
-    __slots__ = ("_firsts", "_lasts", "_most")
-
     def __init__(self, most: int) -> None:
         self._most = most
-        self._firsts: list[int] = []
-        self._lasts: list[int] = []
+        self._ranges: list[tuple[int, int]] = []
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        return zip(self._firsts, self._lasts, strict=True)
+        return iter(self._ranges)
 
     def __len__(self) -> int:
-        return len(self._firsts)
+        return len(self._ranges)
+
+    def _count_until(self, number: int) -> int:
+        """Returns how many ranges begin at or below a number."""
+        return bisect_right(self._ranges, (number, math.inf))
 
     def insert(self, first: int, last: int) -> None:
         """Adds numbers that are not in it, wherever they belong."""
-        place = bisect_right(self._firsts, first)
-        if place and self._lasts[place - 1] == first - 1:
-            self._lasts[place - 1] = last
+        place = self._count_until(first)
+        if place and self._ranges[place - 1][1] == first - 1:
+            self._ranges[place - 1] = self._ranges[place - 1][0], last
         else:
-            self._firsts.insert(place, first)
-            self._lasts.insert(place, last)
-        self._drop_lowest()
+            self._ranges.insert(place, (first, last))
+        del self._ranges[: -self._most]
 
     def remove(self, number: int, last: int | None = None) -> bool:
         """Removes one number, or those up to the last one of a range; returns False if it is not in."""
         if (found := self.find(number)) is None:
             return False
-        place = bisect_right(self._firsts, number) - 1
+        place = self._count_until(number) - 1
         sides = (found[0], number - 1), ((last or number) + 1, found[1])
-        parts = [(a, b) for a, b in sides if a <= b]
-        self._firsts[place : place + 1] = [a for a, _ in parts]
-        self._lasts[place : place + 1] = [b for _, b in parts]
-        self._drop_lowest()
+        self._ranges[place : place + 1] = [side for side in sides if side[0] <= side[1]]
+        del self._ranges[: -self._most]
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
         """Returns the range that a number is in, None if it is in none."""
-        place = bisect_right(self._firsts, number) - 1
-        if place < 0 or number > self._lasts[place]:
-            return None
-        return self._firsts[place], self._lasts[place]
+        place = self._count_until(number) - 1
+        return self._ranges[place] if place >= 0 and number <= self._ranges[place][1] else None
 
     def find_from(self, number: int) -> tuple[int, int] | None:
         """Returns the first range at or above a number, cut off below it; None if there is none."""
-        place = max(0, bisect_right(self._firsts, number) - 1)
-        if place < len(self._lasts) and self._lasts[place] < number:
-            place += 1
-        if place >= len(self._firsts):
-            return None
-        return max(number, self._firsts[place]), self._lasts[place]
-
-    def _drop_lowest(self) -> None:
-        if len(self._firsts) > self._most:
-            del self._firsts[0], self._lasts[0]
+        place = max(0, self._count_until(number) - 1)
+        near = self._ranges[place : place + 2]
+        return next(((max(number, first), last) for first, last in near if last >= number), None)
 
 
 MAX_GAPS = 50_000
@@ -309,23 +298,18 @@ class SessionAccounts:
 
     Args:
         session: its name.
-        rates_hz: tick rate of every site, in scenario order.
+        scenario: its scenario.
         continued: True for a later part of a log, which is counted from its first message on.
         events: True if events have numbers.
-        ticks: ticks of every site in the whole run, for `coverage`.
     """
 
     def __init__(
-        self,
-        session: str,
-        rates_hz: Mapping[str, int],
-        *,
-        continued: bool = False,
-        events: bool = True,
-        ticks: Mapping[str, int] | None = None,
+        self, session: str, scenario: Scenario, *, continued: bool = False, events: bool = True
     ) -> None:
-        self._session, self._rates_hz, self._continued = session, rates_hz, continued
-        self._ticks, self._ends = dict(ticks or {}), dict[str, int]()
+        self._session, self._continued = session, continued
+        self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
+        self._ticks = {name: scenario.ticks(name) for name in scenario.names}
+        self._ends: dict[str, int] = {}
         self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
         self._starts: dict[str, dict[int, Account]] = {}  # of events, by boot: each counts from 0
@@ -463,8 +447,7 @@ def open_session_accounts(
         return None
     return SessionAccounts(
         session,
-        {name: site.rate_hz for name, site in scenario.sites.items()},
+        scenario,
         continued=metadata.get(PART, {}).get("index", "1") != "1",
         events=version >= EVENTS_NUMBERED_SINCE,
-        ticks={name: scenario.ticks(name) for name in scenario.names},
     )

@@ -28,7 +28,9 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
+from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES, ArmModel
+from ..scenario.operators.kernel_operators import find_live_hand
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -203,26 +205,29 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     docs = read_field_docs(State)
     task = _TASK_VECTORS if arm.shares_pose else {}
     for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
-        values = getattr(site, field)
         if field in task:
             for n, axis in enumerate(TASK_AXES[: arm.counts.shared]):
-                unit, text = task[field][n >= PLACE], f"{docs[field].text}, along {axis}"
-                name = add_unit_suffix(f"{field}_{axis}", unit)
-                yield Column(name, np.ascontiguousarray(values[:, n]), unit, text, f"{field}[{n}]")
+                text = f"{docs[field].text}, along {axis}"
+                yield _make_number_column(site, field, n, f"{field}_{axis}", task[field][n >= PLACE], text)
             continue
         units = arm.joint_units(docs[field].unit)
         for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
             text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)
-            name = add_unit_suffix(f"{field}{n + 1}", unit)
-            yield Column(name, np.ascontiguousarray(values[:, n]), unit, text, f"{field}[{n}]")
+            yield _make_number_column(site, field, n, f"{field}{n + 1}", unit, text)
     for n, (parameter, unit) in enumerate(arm.parameters):
         stem, text = f"theta_hat{n + 1}", f"{docs['theta_hat'].text}, parameter {n + 1}"
         if arm.chain is not None:
             link, _, symbol = parameter.rpartition(".")
             stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
             text = f"estimate of {symbol} of link {link}, about the frame of its joint"
-        name, source = add_unit_suffix(stem, unit), f"theta_hat[{n}]"
-        yield Column(name, np.ascontiguousarray(site.theta_hat[:, n]), unit, text, source)
+        yield _make_number_column(site, "theta_hat", n, stem, unit, text)
+
+
+def _make_number_column(
+    site: SiteLog, field: str, n: int, stem: str, unit: str, text: str, known: NDArray[np.bool_] | None = None
+) -> Column:
+    values = np.ascontiguousarray(getattr(site, field)[:, n])
+    return Column(add_unit_suffix(stem, unit), values, unit, text, f"{field}[{n}]", known)
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
@@ -236,11 +241,9 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
-    """Yields what somebody who holds the arm does, a column per number; none without a live hand."""
-    if not site.layout.hand:
-        return
+    """Yields what somebody who holds the arm does, a column per number."""
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
-    yield Column("hand_grip", site.hand[:, 0].copy(), "", "how firmly the arm is held, 0 to 1", "hand[0]")
+    yield _make_number_column(site, "hand", 0, "hand_grip", "", "how firmly the arm is held, 0 to 1")
     whose = {"number": "number of the newest message of who holds the arm", "source": "who holds the arm"}
     for n, (name, text) in enumerate(whose.items(), 1):
         yield Column(
@@ -252,36 +255,28 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     for n in range(2 * size if what == "target" else size):
         stem, unit = (what, units[0]) if n < size else (f"{what}_rate", units[1])
         meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
-        column = add_unit_suffix(f"hand_{stem}_{names[n % size]}", unit)
-        yield Column(column, site.hand[:, 3 + n].copy(), unit, meaning, f"hand[{3 + n}]", held)
+        yield _make_number_column(site, "hand", 3 + n, f"hand_{stem}_{names[n % size]}", unit, meaning, held)
 
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
     axes = (*(("m", axis) for axis in "xyz"), *(("", f"q{axis}") for axis in "wxyz"))
     for n, (body, (unit, axis)) in enumerate(product(bodies, axes)):
         text = f"{axis} of the {'place' if unit else 'unit quaternion'} of {body}, a body of its plant"
-        yield Column(
-            add_unit_suffix(f"{body}_{axis}", unit), site.bodies[:, n].copy(), unit, text, f"bodies[{n}]"
-        )
+        yield _make_number_column(site, "bodies", n, f"{body}_{axis}", unit, text)
 
 
-def build_state_table(
-    site: SiteLog,
-    arm: ArmModel,
-    peer_rates_hz: Mapping[str, int],
-    hand_mode: str = "tip",
-    bodies: Iterable[str] = (),
-) -> Table:
-    """Returns the records of a site with its arm, a row each, in order of their ticks."""
-    docs = read_field_docs(State)
+def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
+    """Returns the records of a site, a row each, in order of their ticks."""
+    docs, arm = read_field_docs(State), scenario.arms[site.name]
+    live = find_live_hand(scenario.sites[site.name].hands)
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
-    columns += _make_hand_columns(site, arm, hand_mode)
-    columns += _make_bodies_columns(site, bodies)
-    for peer, rate_hz in peer_rates_hz.items():
-        used = site.used[peer]
+    columns += [] if live is None else _make_hand_columns(site, arm, live.mode)
+    columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
+    for peer in site.peers:
+        used, rate_hz = site.used[peer], scenario.sites[peer].rate_hz
         known: NDArray[np.bool_] = used >= 0
         age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
         source, text = f"used.{peer}", f"tick of the sample of {peer} in use"

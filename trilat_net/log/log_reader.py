@@ -37,7 +37,6 @@ from ..results import Result
 from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
-from ..scenario.operators.kernel_operators import find_live_hand
 from ..scenario.sample_uses import PictureDelay
 from .accounting import LAST, SessionAccounts
 from .data_tables import (
@@ -248,8 +247,7 @@ class Log(Result, Mapping[str, SiteLog]):
         written = self._contents.metadata.get(ACCOUNTS, {})
         if len(self.sources) == 1:
             return written
-        rates_hz = {name: self.scenario.sites[name].rate_hz for name in self.sites}
-        accounts = SessionAccounts(self.session["session"], rates_hz)
+        accounts = SessionAccounts(self.session["session"], self.scenario)
         for name in self.sites:
             sequences = {
                 self._topic(name, topics.STATE): self[name].tick.tolist(),
@@ -449,11 +447,7 @@ class Log(Result, Mapping[str, SiteLog]):
         site = self[name]
         match kind:
             case "" | "state":
-                rates_hz = {p: self.scenario.sites[p].rate_hz for p in site.peers}
-                live = find_live_hand(self.scenario.sites[name].hands)
-                mode = "tip" if live is None else live.mode
-                bodies = self.scenario.bodies_m(name)
-                return build_state_table(site, self.scenario.arms[name], rates_hz, mode, bodies)
+                return build_state_table(site, self.scenario)
             case "link":
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":
