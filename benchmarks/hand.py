@@ -1,4 +1,4 @@
-"""A live hand: from `move` to the first tick that names it, a program that is killed, and a flood."""
+"""A live hand: from `move` to the first tick that names it, a device, a killed program, and a flood."""
 
 import random
 import signal
@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 import trilat_net
-from tests.live.processes import HOLDER, PAPER, Session, Stage
+from tests.live.processes import HOLDER, PAPER, Session, Stage, connections
+from tests.sites.devices import HaplyService
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
@@ -19,7 +20,7 @@ from trilat_net.net.connection import resolve_member_connection
 from trilat_net.net.zenoh_bus import ZenohBus
 
 MOVES, DURATION_S = 1000, 60
-FLOOD_S = 5.0
+FLOOD_S, DEVICE_S = 5.0, 8.0
 
 
 def run() -> list[str]:
@@ -30,13 +31,19 @@ def run() -> list[str]:
             session = Session(stage, "play", PAPER, "--duration", str(DURATION_S))
             session.all()
             moved = _move(session)
+            led = _lead(session)
             killed_ns = _kill(session)
             flooded = _flood(session)
             session.ends_well()
             log = open_log(session.log)
         finally:
             stage.clear()
-    return [*_describe_moves(log, moved), *_describe_kill(log, killed_ns), *_describe_flood(log, flooded)]
+    return [
+        *_describe_moves(log, moved),
+        led,
+        *_describe_kill(log, killed_ns),
+        *_describe_flood(log, flooded),
+    ]
 
 
 def _epoch_ns(log: Log, site: str) -> int:
@@ -54,6 +61,20 @@ def _move(session: Session) -> list[tuple[int, int]]:
             called_ns = time.monotonic_ns()
             moved.append((hand.move(x + 0.05 * n / MOVES, y), called_ns))
     return moved
+
+
+def _lead(session: Session) -> str:
+    """Leads m1 by a service that speaks as Haply's; returns its rate, and what the program told."""
+    with HaplyService() as service:
+        words = ("hand", "m1", "--session", "t", "--device", f"haply_inverse3={service.address}")
+        program = session.stage.start("device", *words, *connections(session.endpoints))
+        program.prints("takes hold")
+        service.pressed, begun, begun_s = {"a"}, len(service.asked), time.monotonic()
+        time.sleep(DEVICE_S)
+        per_s = (len(service.asked) - begun) / (time.monotonic() - begun_s)
+        program.signal(signal.SIGINT)
+        program.code()
+    return f"a Haply, its service here: {per_s:.0f} states/s (of 1000); {program.text().splitlines()[-1]}"
 
 
 def _describe_moves(log: Log, moved: list[tuple[int, int]]) -> list[str]:

@@ -27,7 +27,10 @@ export class Headset {
     choice.setAttribute("aria-label", "motion of the arm over motion of a controller");
     choice.append(new Option("scale of the scenario", 0), ...SCALES.map((scale) => new Option(`arm moves ${scale} ×`, scale)));
     choice.addEventListener("change", () => { this.scale = Number(choice.value); });
-    this.button.addEventListener("click", () => (this.session ? this.session.end() : this.enter()));
+    this.button.addEventListener("click", () => {
+      if (this.session) this.session.end();
+      else this.enter().catch((error) => { this.session?.end(); Object.assign(this.button, { textContent: "enter VR: failed", title: error.message }); });
+    });
   }
 
   async enter() {

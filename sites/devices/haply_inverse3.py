@@ -43,7 +43,6 @@ class HaplyInverse3:
         self._id = ""
 
     def __enter__(self) -> Self:
-        """Connects to the service."""
         try:
             self._socket = self._open.enter_context(connect(self._address, open_timeout=2.0, **_PLAIN))
         except (OSError, ValueError, WebSocketException) as error:
@@ -52,7 +51,6 @@ class HaplyInverse3:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Takes the force away, and closes the connection."""
         with suppress(OSError):
             self.render((0.0, 0.0, 0.0))
         self._open.close()

@@ -39,7 +39,6 @@ class SpaceMouse:
         self._address, self._clock, self._file = address, clock or SystemClock(), -1
 
     def __enter__(self) -> Self:
-        """Opens it."""
         self._file = os.open(self._address or find_spacemouse(), os.O_RDONLY | os.O_NONBLOCK)
         self._place: Vector = (0.0, 0.0, 0.0)
         self._speed, self._pressed = self._place, 0
@@ -47,7 +46,6 @@ class SpaceMouse:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Closes it."""
         os.close(self._file)
 
     def read(self) -> DeviceState:

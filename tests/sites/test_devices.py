@@ -11,6 +11,7 @@ import pytest
 from sites.devices import Device, DeviceState, open_device
 from sites.devices.haply_inverse3 import HaplyInverse3
 from sites.devices.spacemouse import SpaceMouse, find_spacemouse
+from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
@@ -79,6 +80,15 @@ def lasts(device: Device) -> None:
 def test_device_is_one_of_those_that_there_are() -> None:
     with pytest.raises(UsageError, match="one of haply_inverse3, spacemouse"):
         open_device("phantom")
+
+
+def test_command_says_what_it_lacks(tmp_path: Path) -> None:
+    for words, problem in (
+        (("--session", "play"), "needs --scenario"),
+        (("--session", "play", "--device", "spacemouse", "--set", "seed=2"), "leave out --set"),
+        (("--device", "spacemouse"), "a session's name is"),
+    ):
+        trilat("hand", "m1", *words, cwd=tmp_path).refuses(problem)
 
 
 # --- Haply's Inverse3 -------------------------------------------------------------------------------------

@@ -114,6 +114,8 @@ def hand_command(
         if extra := {"--scenario", "--duration", "--seed", "--set"} & set(options.given_options(context)):
             raise UsageError(f"--device leads an arm of a session that runs: leave out {min(extra)}")
         return _lead_by_device(device, name, session, reach, join_timeout)
+    if not scenario:
+        raise UsageError("a class of your own needs --scenario, a device that you hold --device")
     from sites.hand_process import run_hand
 
     from ..net.connection import default_endpoints
