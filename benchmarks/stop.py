@@ -1,19 +1,44 @@
-"""`trilat stop` of a session on this machine: its processor time, and how long it takes from start to end."""
+"""Stops of a session on this machine: what `trilat stop` takes, and how soon a press on a page stops arms.
+
+A press is stamped by chromium where it reaches the page (`timeOrigin` + `timeStamp`), a tick by its place on
+the grid and how late it was, from the Unix time of the epoch in the log. All are clocks of one kernel; the
+page's is compared with this program's before every press, and how far the two may be apart is reported.
+"""
 
 import os
+import random
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
+from playwright.sync_api import Browser, Page, sync_playwright
 
+import trilat_net
 from tests.cli.running import PLAIN
+from tests.live.browsers import launch
+from tests.live.page_client import page_client
 from tests.live.processes import PAPER, Session, Stage
+from tests.net.waiting import until
+from trilat_net.log.log_reader import Log
+
+from .page import live_session
 
 STOPS, CPU_S = 20, 0.25
+PRESSES, P50_MS, P95_MS = 20, 60.0, 150.0
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+WAYS: dict[str, tuple[dict[str, Any], Callable[[Page], None]]] = {
+    "button on a user's page": ({"viewport": {"width": 1440, "height": 900}}, lambda page: _press(page)),
+    "touch on a phone": (PHONE, lambda page: page.touchscreen.tap(*_middle(page))),
+    "Esc": ({"viewport": {"width": 1440, "height": 900}}, lambda page: page.keyboard.press("Escape")),
+}
+_STAMP = """for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (event) => {
+trilat.pressed = performance.timeOrigin + event.timeStamp; }, true)"""
 
 
 def run() -> list[str]:
@@ -28,6 +53,7 @@ def run() -> list[str]:
         finally:
             stage.clear()
     return [
+        *_describe_presses(),
         f"trilat stop of three arms, {STOPS} times: processor time p50 {np.median(cpu_s):.3f} s, "
         f"most {cpu_s.max():.3f} s (at most {CPU_S:g})",
         f"  from its start to its end: p50 {np.median(took_s):.3f} s, most {took_s.max():.3f} s",
@@ -45,3 +71,87 @@ def _stop_once() -> tuple[float, float]:
     stop.returncode = os.waitstatus_to_exitcode(status)
     assert (stop.returncode, answers.count(": stop at tick")) == (0, len(PAPER)), answers
     return used.ru_utime + used.ru_stime, time.monotonic() - began_s
+
+
+def _middle(page: Page) -> tuple[float, float]:
+    box = page.locator("#stop").bounding_box()
+    assert box is not None
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def _press(page: Page) -> None:
+    page.mouse.move(*_middle(page))
+    page.mouse.down()
+    page.mouse.up()
+
+
+def _describe_presses() -> list[str]:
+    """Returns, for each way to press, how soon the last arm stopped."""
+    presses: dict[str, list[float]] = {}
+    apart_ms: list[float] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "run"
+        with live_session(folder) as (address, _), sync_playwright() as playwright:
+            browser = launch(playwright, gl=False)
+            for way in WAYS:
+                presses[way] = _press_often(browser, address, way, apart_ms)
+            browser.close()
+        log = trilat_net.open_log(str(folder / "run.mcap"))
+        took = {way: [_find_stop_ms(log, at_ms) for at_ms in pressed] for way, pressed in presses.items()}
+    lines = []
+    for way, rows in took.items():
+        last = np.max(rows, axis=1)
+        p50, p95 = np.percentile(last, (50, 95))
+        lines.append(
+            f"{way}, {len(rows)} presses, to the first stopped tick of the last of {len(log.sites)} arms: "
+            f"p50 {p50:.1f} ms (at most {P50_MS:g}), p95 {p95:.1f} ms (at most {P95_MS:g}), "
+            f"most {last.max():.1f} ms"
+        )
+    return [*lines, f"  the page's clock and this program's were at most {max(apart_ms):.2f} ms apart"]
+
+
+def _press_often(browser: Browser, address: str, way: str, apart_ms: list[float]) -> list[float]:
+    """Presses, lets the arms follow again, and so on; returns when, Unix time, ms."""
+    options, press = WAYS[way]
+    page = browser.new_page(**options)
+    page.goto(f"{address}?as=m1")
+    until(lambda: page.evaluate("Boolean(window.trilat?.frame)"), 60.0)
+    page.evaluate(_STAMP)
+    pressed = []
+    with page_client(address) as onlooker:
+        for _ in range(PRESSES):
+            onlooker.shows("run")
+            page.wait_for_timeout(1000.0 * random.uniform(0.1, 0.6))
+            apart_ms.append(_find_offset_ms(page))
+            press(page)
+            onlooker.shows("stopped")
+            pressed.append(float(page.evaluate("trilat.pressed")))
+            trilat_net.session("play").enable()
+    page.close()
+    return pressed
+
+
+def _find_offset_ms(page: Page) -> float:
+    """Returns how far the page's clock may be from this program's: the least bound of some looks."""
+    bounds = []
+    for _ in range(10):
+        before_s = time.time()
+        there_ms = float(page.evaluate("performance.timeOrigin + performance.now()"))
+        after_s = time.time()
+        middle_ms, half_ms = 500.0 * (before_s + after_s), 500.0 * (after_s - before_s)
+        bounds.append(abs(there_ms - middle_ms) + half_ms)
+    return min(bounds)
+
+
+def _find_stop_ms(log: Log, pressed_ms: float) -> list[float]:
+    """Returns how long after a press the first stopped tick of each arm was made, ms."""
+    epoch_ms = int(log.session["epoch_unix_ns"]) / 1e6
+    found = []
+    for site in log.sites:
+        part = log[site]
+        made_ms = epoch_ms + part.t_ns / 1e6 + part.late_us / 1e3
+        stopped = np.array([mode == "stopped" for mode in part.mode])
+        begins = np.flatnonzero(stopped & ~np.roll(stopped, 1))
+        after = begins[made_ms[begins] > pressed_ms]
+        found.append(float(made_ms[after[0]] - pressed_ms))
+    return found

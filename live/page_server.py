@@ -12,14 +12,15 @@ serves all pages and takes in the session's messages.
 import asyncio
 import logging
 import os
+import secrets
 import socket
 import ssl
 import sys
 import threading
 import webbrowser
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
@@ -94,6 +95,14 @@ _KINDS = {
     "svg": "image/svg+xml",
     "LICENSE": "text/plain; charset=utf-8",
 }
+_REPORT_POLICY = (
+    "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data: blob:"
+)
+LARGEST_BYTES = 256 << 20
+"""A larger log is not sent to a page: it is read from its folder."""
+OFFERED_NS = 600_000_000_000
+"""So long an open page has report and log at most."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -220,6 +229,7 @@ class PageServer:
     Attributes:
         address: where a browser finds the page of an experimenter, token included.
         end_requested: set once a page has asked for the end.
+        results: report and log by their addresses, once the session has ended.
     """
 
     def __init__(
@@ -247,6 +257,7 @@ class PageServer:
         self._frame: dict[str, Any] | None = None
         self._known: dict[str, dict[str, Any]] = {}
         self._ages = True
+        self.results: dict[str, Path] = {}
         self._n = 0
         self._notices: list[dict[str, Any]] = []
         self.end_requested = threading.Event()
@@ -372,21 +383,12 @@ class PageServer:
                 self.refused["too many pages"] += 1
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages\n")
             return None
+        if (result := self.results.get(target.path)) is not None and result.is_file():
+            kind = _KINDS.get(result.suffix[1:], "application/octet-stream")
+            return _send_file(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
         if (file := self._files.get(target.path)) is None:
             return connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
-        kind, content = file
-        headers = Headers(
-            {
-                "Content-Type": kind,
-                "Content-Length": str(len(content)),
-                "Content-Security-Policy": _POLICY,
-                "X-Content-Type-Options": "nosniff",
-                "Referrer-Policy": "no-referrer",
-                "Cache-Control": "no-store" if target.path in ("/", "/index.html") else "no-cache",
-                "Connection": "close",
-            }
-        )
-        return Response(HTTPStatus.OK, "OK", headers, content)
+        return _send_file(*file, _POLICY, "no-store" if target.path in ("/", "/index.html") else "no-cache")
 
     def _problem_of(self, request: Request, query: str) -> str | None:
         host = request.headers.get("Host", "")
@@ -407,7 +409,7 @@ class PageServer:
         assert role is not None  # or it would have been refused
         self._met += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
-        alone = role.kind == "experimenter" and not any(one.takes_part for one in self._list_experimenters())
+        alone = role.kind == "experimenter" and not any(one.takes_part for one in self.experimenters)
         page = Page(connection, self._met, role, hands, takes_part=alone or role.kind == "user")
         self._pages.add(page)
         sending = asyncio.create_task(self._send(page))
@@ -479,12 +481,14 @@ class PageServer:
             page.takes_part, page.asks = False, None
             page.hands.release()
         elif not page.takes_part and page.asks is None:
-            holders = {other for other in self._list_experimenters() - {page} if self._list_held(other)}
+            holders = {other for other in self.experimenters - {page} if self._list_held(other)}
             page.asks = (holders, self._clock.monotonic_ns()) if holders else None
             page.takes_part = not holders
 
-    def _list_experimenters(self) -> set[Page]:
-        return {page for page in self._pages if page.role.kind == "experimenter"}
+    @property
+    def experimenters(self) -> set[Page]:
+        """The pages of experimenters that are open."""
+        return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _let_take_part(self, page: Page, answer: AnswerPage) -> None:
         for other in self._pages:
@@ -511,6 +515,11 @@ class PageServer:
             self.refused["nobody can hold it"] += 1
             return
         page.hands.move(order, pushes=site.hand.mode == "force")
+
+    def tell_refused(self) -> None:
+        """Says at the terminal what was refused, and how often."""
+        for reason, count in sorted((+self.refused).items()):
+            self._say(f"the page refused {count} messages or requests: {reason}")
 
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
@@ -553,6 +562,7 @@ class PageServer:
         return {
             "n": self._n,
             **shown,
+            "results": list(self.results) if page.role == Role() else [],
             "notices": notices,
             "ages": self._ages,
             "pages": len(self._pages),
@@ -586,16 +596,57 @@ class PageServer:
         return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
 
-@contextmanager
-def attend_with_page(
-    options: PageOptions, clock: Clock, session: str, endpoints: Sequence[str], say: Callable[[str], None]
-) -> Iterator[Callable[[], bool]]:
-    """The `SessionAttendant` that serves a page, until that asks for the end of the session."""
-    with (
-        closing(ZenohBus([], endpoints)) as bus,
-        serve_page(bus, clock, session, options, say, ends=True) as page,
-    ):
+def _send_file(kind: str, content: bytes, policy: str, cache: str) -> Response:
+    headers = {
+        "Content-Type": kind,
+        "Content-Length": str(len(content)),
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": cache,
+        "Connection": "close",
+    }
+    return Response(HTTPStatus.OK, "OK", Headers(headers), content)
+
+
+class PageAttendant:
+    """The page of a session that is run here; a context, as the page outlives the session for its report."""
+
+    def __init__(self, options: PageOptions, clock: Clock) -> None:
+        self._options, self._clock, self._open = options, clock, ExitStack()
+        self._page: PageServer | None = None
+
+    def __enter__(self) -> "PageAttendant":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    @contextmanager
+    def attend(
+        self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
+    ) -> Iterator[Callable[[], bool]]:
+        """The `SessionAttendant` that serves the page, until that asks for the end of the session."""
+        bus = self._open.enter_context(closing(ZenohBus([], endpoints)))
+        serving = serve_page(bus, self._clock, session, self._options, say, ends=True)
+        self._page = page = self._open.enter_context(serving)
         yield page.end_requested.is_set
+        page.tell_refused()
+
+    def offer(self, paths: Iterable[Path]) -> None:
+        """Offers files of the ended session to experimenters while their page is open, or until Ctrl-C.
+
+        The address of a file cannot be guessed, and only these pages are told.
+        """
+        page, clock, secret = self._page, self._clock, secrets.token_urlsafe()
+        if page is None:
+            return
+        small = (path for path in paths if path.stat().st_size <= LARGEST_BYTES)
+        page.results = {f"/{secret}/{path.name}": path for path in small}
+        give_up_ns = clock.monotonic_ns() + OFFERED_NS
+        with suppress(KeyboardInterrupt):
+            while page.experimenters and clock.monotonic_ns() < give_up_ns:
+                clock.sleep_until(clock.monotonic_ns() + OFFERED_NS // 3000)
 
 
 @contextmanager
@@ -609,8 +660,6 @@ def serve_page(
             if options.opens and _has_browser():
                 webbrowser.open(page.address)
         yield page
-        for reason, count in sorted((+page.refused).items()):
-            say(f"the page refused {count} messages or requests: {reason}")
 
 
 def _has_browser() -> bool:
@@ -628,3 +677,4 @@ def show_on_page(
     """The `SessionOnlooker` of a page."""
     with serve_page(bus, clock, session, options, say, ends=False) as page:
         yield page.view, lambda: None
+        page.tell_refused()

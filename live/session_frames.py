@@ -1,10 +1,10 @@
 """Frames of a session for pages: what never changes, what is now, and the newest points of the plots.
 
-Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next frame
-is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people by the transpose of
-the Jacobian, which near a singular pose gives the least force that explains the torque. A frame as one site
-knows the session shows of a peer nothing but its pose at one tick: that of the sample that the site's newest
-record has in use, or which the picture of the site's user has come to (`SessionView.find_shown`).
+Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next is
+whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people and of the law by the
+transpose of the Jacobian, which near a singular pose gives the least force that explains the torque. A frame
+as one site knows the session shows of a peer nothing but its pose at one tick: that of the sample that the
+site has in use, or to which the picture of the site's user has come (`SessionView.find_shown`).
 """
 
 from contextlib import suppress
@@ -111,6 +111,7 @@ class ArmFrames:
             "tau": _rounded(own.tau[-1], 3),
             "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
             "hand": _rounded(hand[-1], 3),
+            "pull": self._find_pull(own, split),
             "wall": _rounded(wall[-1], 3),
             **self._describe_grip(own, hand[-1]),
         }
@@ -132,10 +133,17 @@ class ArmFrames:
         torque = split.operator
         if not self._spec.hands and np.abs(torque).max() < 1e-9 * (1.0 + np.abs(own.tau_x).max()):
             return np.zeros_like(split.end_effector.at)
-        J = split.end_effector.J
-        inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=_LEAST_SINGULAR_VALUE)
-        found: Array = np.einsum("kij,kj->ki", inverse, torque)
-        return found
+        return _find_force(split.end_effector.J, torque)
+
+    def _find_pull(self, own: AlignedRecords, split: TorqueSplit) -> list[float]:
+        """Returns the force with which the law pulls the end effector, which a user feels, at the end.
+
+        It is that of the torque beyond what carries the arm; [] if nobody knows the masses.
+        """
+        if not self._spec.arm.known:
+            return []
+        torque = own.tau[-1:] - self._rows.gravity_torque(own.q[-1:])
+        return _rounded(_find_force(split.end_effector.J[-1:], torque)[0], 3)
 
     def _wall_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
         total = np.zeros_like(split.end_effector.at)
@@ -143,6 +151,13 @@ class ArmFrames:
             force = wall_force(wall, own.nominal_s, split.end_effector)
             total = total + force[:, np.newaxis] * np.array(wall.b)
         return total
+
+
+def _find_force(J: Array, torque: Array) -> Array:
+    """Returns the least force at the end effector that explains a torque, shape (K, 2) or (K, 3), N."""
+    inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=_LEAST_SINGULAR_VALUE)
+    found: Array = np.einsum("kij,kj->ki", inverse, torque)
+    return found
 
 
 class SessionFrames:
@@ -156,6 +171,7 @@ class SessionFrames:
     def __init__(self, view: SessionView) -> None:
         self._view = view
         self._arms: dict[str, ArmFrames] = {}
+        self._shapes: Json = {}
         self._seen: dict[str, int] = {}
         self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
@@ -165,12 +181,13 @@ class SessionFrames:
     def describe(self) -> Json:
         """Returns the session as a page needs it once: sites, links, columns of the plots."""
         view, scenario = self._view, self._view.scenario
+        if scenario is not None and not self._arms:  # before it runs: the compiled arms take seconds to load
+            self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
+            self._shapes = {site: arm.describe() for site, arm in self._arms.items()}
         if scenario is None or not view.running:
             here = sorted(view.met)
             sites = [] if scenario is None else [name for name in scenario.names if name not in view.met]
             return {"running": False, "session": view.session, "here": here, "missing": sites}
-        if not self._arms:
-            self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
         links = {name: list(name.split("->")) for name in scenario.links}
         return {
             "running": True,
@@ -179,7 +196,7 @@ class SessionFrames:
             "title": scenario.title or scenario.name,
             "about": scenario.about,
             "duration_s": scenario.duration_s,
-            "sites": {site: arm.describe() for site, arm in self._arms.items()},
+            "sites": self._shapes,
             "links": links,
             "shares": {site: scenario.dominance[site] for site in scenario.names},
             "columns": [f"{site}.{kind}" for site in scenario.names for kind in ("e", "tau", "hand", "wall")]

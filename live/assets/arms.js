@@ -45,8 +45,8 @@ export function arrow(g, from, to, colour, width) {
 }
 
 class ArmCard {
-  constructor(parent, name, about) {
-    Object.assign(this, { name, about });
+  constructor(parent, name, about, n, count) {
+    Object.assign(this, { name, about, n });
     this.card = element(parent, "article", "card arm watched");
     this.card.tabIndex = 0;
     this.card.setAttribute("aria-label", `arm ${name}, ${about.role}`);
@@ -60,9 +60,13 @@ class ArmCard {
     this.alarms.setAttribute("role", "status");
     this.alarms.style.cssText = "display:contents";
     this.foot = element(this.card, "div", "foot");
+    this.foot.dataset.name = name;
+    this.card.style.setProperty("--n", n);
+    this.card.style.setProperty("--up", count - 1 - n);
     this.view = { centre: this.middle(), half: 0 };
     this.hold = null; // what this page's hand does: { at, to } in the arm's frame
     this.trail = [];
+    this.under = true;
     this.nextWords = 0;
   }
 
@@ -98,23 +102,46 @@ class ArmCard {
     if (performance.now() < this.nextWords) return;
     this.nextWords = performance.now() + WORDS_MS;
     const size = (force) => Math.hypot(...force);
-    const parts = site.e === undefined ? [] : [["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, ""], ["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, ""],
-      ["hand", `${size(site.hand).toFixed(1)} N`, "more"]];
-    if (site.age_ms !== undefined) parts.push(["age", site.age_ms === null ? "–" : `${site.age_ms.toFixed(0)} ms`, ""]);
-    if (site.e !== undefined && this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, ""]);
-    const text = parts.map(([key, value, kind]) => `<span class="${kind}">${key} <b>${value}</b></span>`).join("");
-    if (text !== this.written) { this.written = text; this.foot.innerHTML = text; }
+    const parts = [];
+    if (site.e !== undefined) {
+      parts.push(["|e|", `${site.e.toFixed(3)} ${this.about.unit}`, "", "how far the arm is from where its peers want it"]);
+      parts.push(["τ", `${Math.max(...site.tau.map(Math.abs)).toFixed(1)} N m`, "more", "largest torque of the law at a joint"]);
+      if (site.pull.length) parts.push(["law", `${size(site.pull).toFixed(1)} N`, "", "force with which the law pulls the end of the arm, beyond what carries it: what a user feels"]);
+      parts.push(["hand", `${size(site.hand).toFixed(1)} N`, "more", "force of its operator on the end of the arm"]);
+      if (this.about.walls.length) parts.push(["wall", `${size(site.wall).toFixed(1)} N`, "", "force of the wall on the end of the arm"]);
+    }
+    if (site.age_ms !== undefined) parts.push(["age", site.age_ms === null ? "–" : `${site.age_ms.toFixed(0)} ms`, "", "how old what is drawn of this arm is"]);
+    const text = parts.map(([key, value, kind, tip]) => `<span class="${kind}" data-tip="${tip}">${key} <b>${value}</b></span>`).join("");
+    if (text === this.written) return;
+    this.written = text;
+    const spans = this.foot.children;
+    if (spans.length !== parts.length) this.foot.innerHTML = text; // words stay, so that a tip that is read does too
+    else parts.forEach(([, value], n) => { spans[n].lastChild.textContent = value; });
   }
 
-  fit(site) {
+  need(site) { // half of the height that the picture must span, m
     const { view } = this;
     const aspect = this.canvas.width / this.canvas.height;
     let needed = 0.56 * this.about.reach;
-    for (const point of [...site.points, ...(this.about.task ? [] : site.ghost)]) {
+    const [cx, cy] = this.flat(view.centre);
+    const room = 0.14 * this.about.reach; // for the ring at the end
+    for (const point of [...site.points, ...(this.about.task ? [] : site.ghost), ...this.facing(site)]) {
       const [x, y] = this.flat(point);
-      const [cx, cy] = this.flat(view.centre);
-      needed = Math.max(needed, 1.18 * Math.abs(y - cy), (1.12 * Math.abs(x - cx)) / aspect);
+      needed = Math.max(needed, 1.04 * Math.abs(y - cy) + room, (1.04 * Math.abs(x - cx) + room) / aspect);
     }
+    return needed;
+  }
+
+  facing(site) { // where the walls that the arm can reach are nearest to its end
+    const tip = site.points[site.points.length - 1];
+    return this.about.walls.map(({ at, normal }) => {
+      const depth = normal.reduce((sum, v, n) => sum + v * (tip[n] - at[n]), 0);
+      return tip.map((x, n) => x - depth * normal[n]);
+    }).filter((point) => Math.hypot(...point) < 1.1 * this.about.reach);
+  }
+
+  fit(needed) {
+    const { view } = this;
     const now = performance.now();
     const share = view.half ? 1 - Math.exp((this.fitted - now) / (needed > view.half ? 120 : 4000)) : 1;
     this.fitted = now;
@@ -136,10 +163,11 @@ class ArmCard {
     return ratio;
   }
 
-  draw(painter, site, scale, holds) {
+  draw(painter, site, scale, holds, shared) {
     const ratio = this.size();
     if (this.canvas.width < 2) return;
-    this.fit(site);
+    if (shared) this.view = shared;
+    else this.fit(this.need(site));
     const g = this.canvas.getContext("2d");
     const tip = site.points[site.points.length - 1];
     this.trail.push(tip);
@@ -154,6 +182,7 @@ class ArmCard {
   over(g, site, ratio, scale) {
     const tip = site.points[site.points.length - 1];
     const at = this.project(tip);
+    this.tip = at;
     g.lineJoin = "round";
     g.strokeStyle = siteColour(this.about);
     g.lineWidth = 1.5 * ratio;
@@ -165,6 +194,7 @@ class ArmCard {
       g.stroke();
     }
     g.globalAlpha = 1;
+    const said = []; // where words stand: none over another
     const push = (force, colour, label) => {
       const size = Math.hypot(...force);
       if (size < 0.02 * scale) return;
@@ -176,11 +206,24 @@ class ArmCard {
       g.fillStyle = colour;
       const words = `${label} ${size.toFixed(size < 10 ? 1 : 0)} N`;
       const wide = g.measureText(words).width;
-      const x = end[0] < at[0] ? end[0] - wide - 8 * ratio : end[0] + 8 * ratio;
-      g.fillText(words, Math.max(6 * ratio, Math.min(this.canvas.width - wide - 6 * ratio, x)), Math.max(52 * ratio, end[1] + 4 * ratio));
+      const x = end[0] < at[0] ? end[0] - wide - 16 * ratio : end[0] + 16 * ratio;
+      let y = Math.max(52 * ratio, end[1] + 4 * ratio);
+      while (said.some((other) => Math.abs(other - y) < 13 * ratio)) y += 14 * ratio;
+      said.push(y);
+      g.fillText(words, Math.max(6 * ratio, Math.min(this.canvas.width - wide - 6 * ratio, x)), y);
     };
+    push(site.pull, css("--warn"), "law");
     push(site.wall, css("--bad"), "wall");
     push(site.hand, css("--good"), "hand");
+    if (this.scene) { // of arms over each other each says which it is
+      g.font = `700 ${12.5 * ratio}px system-ui, sans-serif`;
+      g.textAlign = "center";
+      g.fillStyle = css("--ink");
+      g.fillText(this.name, at[0], at[1] - (18 + 15 * this.n) * ratio);
+      g.strokeStyle = siteColour(this.about);
+      g.lineWidth = 1.5 * ratio;
+      g.beginPath(); g.moveTo(at[0], at[1] - 8 * ratio); g.lineTo(at[0], at[1] - (14 + 15 * this.n) * ratio); g.stroke();
+    }
     const target = this.hold?.to || site.target;
     if (target) {
       const to = this.project(target);
@@ -202,8 +245,15 @@ class ArmCard {
 
 export class Arms {
   constructor(parent, hello, say) {
-    this.cards = Object.entries(hello.sites).map(([name, about]) => new ArmCard(parent, name, about));
+    const sites = Object.entries(hello.sites);
+    this.cards = sites.map(([name, about], n) => new ArmCard(parent, name, about, n, sites.length));
     this.byName = Object.fromEntries(this.cards.map((card) => [card.name, card]));
+    const main = hello.as || sites.find(([, about]) => about.role === "slave")?.[0] || sites.at(-1)[0];
+    this.byName[main].card.classList.add("main"); // a user's own arm, or where the work is done
+    parent.classList.toggle("three", sites.length === 3);
+    this.parent = parent;
+    this.shared = null;
+    for (const kind of ["pointermove", "pointerdown"]) parent.addEventListener(kind, (event) => this.raise(event), true);
     this.painter = new PlainPainter();
     this.scale = 10;
     say("drawn flat until WebGL is there");
@@ -217,6 +267,42 @@ export class Arms {
     }).catch((error) => say(`no WebGL here (${error.message}): drawn flat`));
   }
 
+  together(on) { // all arms in one frame, their fields over each other
+    this.parent.classList.toggle("together", on);
+    this.shared = on ? { centre: [], half: 0 } : null;
+    for (const card of this.cards) {
+      card.scene = on;
+      card.under = !on || card.n === 0; // the ground is drawn once
+      card.card.style.zIndex = "";
+      card.trail = [];
+      if (!on) card.view = { centre: card.middle(), half: 0 };
+    }
+  }
+
+  fitAll(frame) {
+    const middles = this.cards.map((card) => card.middle());
+    this.shared.centre = middles[0].map((_, axis) => middles.reduce((sum, middle) => sum + middle[axis], 0) / middles.length);
+    for (const card of this.cards) { card.view = this.shared; card.size(); }
+    this.cards[0].fit(Math.max(...this.cards.map((card) => card.need(frame.sites[card.name]))));
+  }
+
+  raise(event) { // in one scene a pointer means the arm whose end is nearest
+    if (!this.shared || event.buttons > (event.type === "pointerdown" ? 1 : 0) || this.passing || this.cards.some((card) => card.hold)) return;
+    const way = (card) => {
+      const box = card.canvas.getBoundingClientRect();
+      const ratio = card.canvas.width / box.width;
+      const [x, y] = card.tip || [0, 0];
+      return Math.hypot((event.clientX - box.left) * ratio - x, (event.clientY - box.top) * ratio - y) + (card.graspable ? 0 : 1e6);
+    };
+    const [nearest] = [...this.cards].sort((a, b) => way(a) - way(b));
+    for (const card of this.cards) card.card.style.zIndex = card === nearest ? 1 : "";
+    if (event.type !== "pointerdown" || nearest.canvas === event.target || event.target.tagName !== "CANVAS") return;
+    event.stopPropagation(); // a finger has not moved there before
+    this.passing = true;
+    nearest.canvas.dispatchEvent(new PointerEvent("pointerdown", event));
+    this.passing = false;
+  }
+
   pace(took) { // a machine without a graphics card draws bodies too slowly to feel an arm
     this.slow = took > SLOW_MS ? (this.slow || 0) + 1 : 0;
     if (this.slow < SLOW_FRAMES || this.painter instanceof PlainPainter || this.wishes.has("webgl")) return;
@@ -226,12 +312,13 @@ export class Arms {
 
   draw(frame) {
     // one scale for all forces, so that they compare: the largest of late, in round steps
-    const sizes = Object.values(frame.sites).flatMap((site) => [Math.hypot(...site.hand), Math.hypot(...site.wall)]);
+    const sizes = Object.values(frame.sites).flatMap((site) => [Math.hypot(...site.hand), Math.hypot(...site.wall), Math.hypot(...site.pull)]);
     this.most = Math.max(5, ...sizes, 0.995 * (this.most || 0));
     this.scale = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 1e4].find((step) => step >= 0.9 * this.most) || 1e4;
     const begun = performance.now();
     this.painter.begin?.();
-    for (const card of this.cards) card.draw(this.painter, frame.sites[card.name], this.scale, frame.holds.includes(card.name));
+    if (this.shared) this.fitAll(frame);
+    for (const card of this.cards) card.draw(this.painter, frame.sites[card.name], this.scale, frame.holds.includes(card.name), this.shared);
     this.pace(performance.now() - begun);
   }
 }

@@ -116,8 +116,8 @@ export class Hands {
   }
 
   key(event, down) {
-    if (event.target.matches("input, select, textarea, button")) return;
     const { key } = event;
+    if (event.target.matches("input[type=text], select, textarea, a, .scroll") || (event.target.matches("button, input") && /^( |Enter|Arrow)/.test(key))) return;
     if (down && /^[1-9]$/.test(key) && this.arms.cards[key - 1]) this.arms.cards[key - 1].card.focus();
     else if (key === " " && this.chosen) {
       event.preventDefault();

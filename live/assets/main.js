@@ -22,8 +22,13 @@ export function send(message) {
   return true;
 }
 
+const FINGERS = matchMedia("(pointer: coarse)");
+const LATE_MS = 1000;
+const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages";
 let hidesAt = 0;
 let nextWords = 0;
+let heardAt = performance.now(); // when the newest message came
+let late = false;
 function notice(text, ms = 6000) {
   $("notice").textContent = text;
   $("notice").hidden = false;
@@ -36,22 +41,83 @@ function state(text, kind = "") {
   $("state").className = `chip ${kind}`;
 }
 
+function enable() { // controls act as long as the page takes part and is not cut off
+  const able = page.takesPart && !late;
+  for (const control of document.querySelectorAll(CONTROLS)) control.disabled = !able;
+  $("part").disabled = late;
+  $("stop").disabled = !page.stops || socket?.readyState !== WebSocket.OPEN;
+}
+
+const tell = (text, kind = "") => { // the line that says what to do
+  if ($("todo").textContent === text && $("todo").className === kind) return;
+  $("todo").textContent = text;
+  $("todo").className = kind;
+};
+
+function advise(frame) {
+  const { hello } = page;
+  const able = parts.arms.cards.filter((card) => card.graspable).map((card) => card.name);
+  const held = parts.arms.cards.filter((card) => card.hold).map((card) => card.name);
+  if (frame.ended && frame.results.length) return results(frame.results);
+  if (frame.ended) return tell(hello.ends ? "The session has ended. Its log is being checked; report and log will be here." : "The session has ended.");
+  const still = Object.values(frame.sites).filter((site) => site.mode === "stopped").length;
+  if (still && hello.role !== "user") return tell(`Arms are stopped. trilat enable --session ${hello.session} lets them follow again.`);
+  if (still) return tell("Arms are stopped; the experimenter lets them follow again.");
+  if (held.length) return tell(`You hold ${held.join(" and ")}: lead the end where it shall go, and let go when you are there.`);
+  const where = hello.as ? "your arm" : able.length > 1 ? "an arm" : able[0];
+  if (able.length && FINGERS.matches) return tell(`Drag the ring at the end of ${where}. STOP stops every arm.`);
+  if (able.length) return tell(`Drag the ring at the end of ${where}, or press space and the arrow keys. STOP or Esc stops every arm.`);
+  if (hello.role === "experimenter" && !frame.takes_part) return tell(frame.asks ? "Asking the pages that hold an arm ..." : "You watch. Press “take part” to hold arms and change links.");
+  if (hello.role === "experimenter") return tell("Change links and dominance at the side; no arm here can be held.");
+  tell(page.stops ? "You watch. STOP or Esc stops every arm." : "You watch.");
+}
+
+function results(paths) { // of a session that this program ran: its report and its log
+  if ($("todo").querySelector("a")) return;
+  $("todo").className = "";
+  $("todo").replaceChildren("The session has ended. ", ...paths.map((path) => {
+    const link = document.createElement("a");
+    Object.assign(link, { href: path, target: "_blank", textContent: path.endsWith(".html") ? "Open its report" : `Save its log, ${path.split("/").pop()}` });
+    if (!path.endsWith(".html")) link.download = path.split("/").pop();
+    return link;
+  }));
+}
+
+setInterval(() => { // what is shown is as old as the newest message; nobody is called silent for that
+  const silent_ms = performance.now() - heardAt;
+  const now = silent_ms > LATE_MS && Boolean(page.hello);
+  if (now) {
+    const seconds = Math.floor(silent_ms / 1000);
+    state(`this page is ${seconds} s behind`, "bad");
+    const cut = page.frame?.ended ? "The session has ended, and its server with it." : `This page is ${seconds} s behind: what it shows is old, and its buttons are off but for STOP, which may be late.`;
+    tell(page.frame?.ended || socket?.readyState === WebSocket.OPEN ? cut : `This page is ${seconds} s behind and cut off: what it shows is old, and its buttons are off. To stop every arm: trilat stop --session ${page.hello.session}`, page.frame?.ended ? "" : "late");
+    if (page.frame?.ended) state("ended");
+  }
+  if (now === late) return enable();
+  late = now;
+  document.body.classList.toggle("late", late && !page.frame?.ended);
+  if (late) parts?.hands.letGo();
+  enable();
+}, 250);
+
 function begin(hello) {
   page.hello = hello;
   $("title").textContent = hello.title || "trilat live";
   $("session").textContent = `session ${hello.session}`;
   $("end").hidden = !hello.ends;
-  document.body.className = `${hello.role}${hello.as ? " as" : ""}`;
+  for (const role of ["experimenter", "user", "watcher"]) document.body.classList.toggle(role, hello.role === role);
+  document.body.classList.toggle("as", Boolean(hello.as));
   $("whose").textContent = hello.as ? `as ${hello.as} knows it: its own arm now, the others as received` : "as it is, without delay";
   document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
+    tell(hello.missing.length ? `The session begins when ${hello.missing.join(" and ")} ${hello.missing.length > 1 ? "are" : "is"} there: trilat site ${hello.missing[0]}` : "The session is about to begin.");
     return;
   }
-  const able = Object.values(hello.sites).filter((site) => site.stops).length;
-  $("stop").disabled = !able;
-  $("stop").title = able ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
+  page.stops = Object.values(hello.sites).some((site) => site.stops);
+  $("stop").dataset.tip = page.stops ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
+  enable();
   if (parts !== null) return;
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
@@ -66,14 +132,12 @@ function begin(hello) {
 
 function take(frame) {
   if (parts === null) return;
-  for (const site of Object.values(frame.sites)) for (const key of ["ghost", "hand", "wall"]) site[key] ??= []; // not known of a peer
+  for (const site of Object.values(frame.sites)) for (const key of ["ghost", "hand", "wall", "pull"]) site[key] ??= []; // not known of a peer
   page.frame = frame;
   page.frames += 1;
   if (page.takesPart !== frame.takes_part) {
     page.takesPart = frame.takes_part;
-    for (const control of document.querySelectorAll("#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages")) {
-      control.disabled = !frame.takes_part;
-    }
+    enable();
     $("part").setAttribute("aria-pressed", frame.takes_part);
   }
   if (page.asks && !frame.asks && !frame.takes_part) notice("nobody who holds an arm let this page take part");
@@ -88,7 +152,7 @@ function take(frame) {
   const stopped = alarms(frame);
   if (stopped.length) state(stopped.join(", "), "bad");
   else if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
-  else if (frame.ended) state("ended");
+  else if (frame.ended) { state("ended"); $("end").hidden = true; }
   else if (silent.length) state(`${silent.join(", ")} silent`, "bad");
   else state("running", "good");
   for (const { ok, text } of frame.notices) if (!ok) notice(text);
@@ -98,13 +162,14 @@ function take(frame) {
   $("ages").checked = frame.ages;
   if (performance.now() < nextWords) return;
   nextWords = performance.now() + WORDS_MS;
+  advise(frame);
   $("clock").textContent = `${frame.t.toFixed(1)} s`;
   if (page.hello.as) return;
   const pages = frame.pages === 1 ? "1 page" : `${frame.pages} pages`;
-  const late = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
+  const behind = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
   const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";
   const missing = parts.names.reduce((sum, name) => sum + frame.sites[name].missing, 0);
-  $("counts").textContent = `${pages} · loops late by at most ${late} µs · ${missing} records missing${refused}`;
+  $("counts").textContent = `${pages} · loops late by at most ${behind} µs · ${missing} records missing${refused}`;
 }
 
 let raised = "";
@@ -181,6 +246,7 @@ function connect() {
   socket.addEventListener("open", () => { pause = 500; opened = true; });
   socket.addEventListener("message", ({ data }) => {
     const message = JSON.parse(data);
+    heardAt = performance.now();
     if (message.hello) {
       begin(message.hello);
       send({ do: "seen", n: message.hello.n });
@@ -192,6 +258,7 @@ function connect() {
   });
   socket.addEventListener("close", ({ code, reason }) => {
     state(page.frame?.ended ? "ended" : "not connected", page.frame?.ended ? "" : "bad");
+    enable();
     parts?.hands.letGo();
     if (code === 1008) return notice(`the server closed this page: ${reason}`, 1e9);
     if (!opened) { // a browser does not say why
@@ -210,17 +277,57 @@ for (const answer of ["yes", "no"]) {
 }
 function stop() { // of whoever sees the page, whether it takes part or not
   parts?.hands.letGo();
-  if ($("stop").disabled) return;
+  if (page.hello?.running && !page.stops) return;
   if (send({ do: "stop" })) notice("stopping every arm", 3000);
   else notice(`not connected: nothing is stopped by this page; trilat stop --session ${page.hello?.session}`, 1e9);
 }
-$("stop").addEventListener("click", stop);
+$("stop").addEventListener("pointerdown", stop); // at the press, not when it is let go
+$("stop").addEventListener("click", ({ detail }) => { if (detail === 0) stop(); }); // by a key
 $("end").addEventListener("click", () => { if (confirm("End the session for everybody?")) send({ do: "end" }); });
 const mark = () => { send({ do: "mark", text: $("mark-text").value.trim() || "mark" }); $("mark-text").value = ""; };
 $("mark").addEventListener("click", mark);
-$("mark-text").addEventListener("keydown", (event) => { if (event.key === "Enter") mark(); });
+$("mark-text").addEventListener("keydown", (event) => { if (event.key === "Enter") { mark(); event.target.blur(); } });
 addEventListener("keydown", (event) => {
   if (event.key === "Escape" && !event.repeat) stop();
-  if (page.hello?.role === "experimenter" && !event.target.matches("input, select, textarea") && event.key.toLowerCase() === "m" && !event.ctrlKey && !event.metaKey) mark();
+  if (event.target.matches("input[type=text], select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (page.hello?.role === "experimenter" && event.key.toLowerCase() === "m") mark();
+  if (event.key.toLowerCase() === "f" && !event.repeat) fullScreen();
 });
+
+function fullScreen() { // the arms alone, on the whole screen where the browser lets it
+  const on = document.body.classList.toggle("full");
+  $("full").setAttribute("aria-pressed", on);
+  if (on) document.documentElement.requestFullscreen?.().then(() => navigator.keyboard?.lock?.(["Escape"])).catch(() => {});
+  else if (document.fullscreenElement) document.exitFullscreen();
+}
+$("full").addEventListener("click", fullScreen);
+document.addEventListener("fullscreenchange", () => {
+  if (document.fullscreenElement || !document.body.classList.contains("full")) return;
+  fullScreen();
+  if (!navigator.keyboard?.lock) stop(); // the browser keeps the Esc that leaves the full screen, and Esc stops every arm
+});
+for (const id of ["apart", "scene"]) {
+  $(id).addEventListener("click", () => {
+    parts?.arms.together(id === "scene");
+    for (const one of ["apart", "scene"]) $(one).setAttribute("aria-pressed", one === id);
+  });
+}
+// What was pressed with a pointer keeps no focus: keys then lead arms, wherever one has clicked.
+for (const kind of ["click", "change"]) {
+  addEventListener(kind, ({ target }) => { if (target.matches?.("button, select, input:not([type=text])") && !target.matches("button:focus-visible")) target.blur(); });
+}
+
+function showTip({ target }) {
+  const owner = target.closest?.("[data-tip]");
+  $("tip").hidden = !owner;
+  if (!owner) return;
+  $("tip").textContent = owner.dataset.tip;
+  owner.setAttribute("aria-describedby", "tip");
+  const [at, own] = [owner.getBoundingClientRect(), $("tip").getBoundingClientRect()];
+  const above = at.bottom + own.height + 8 > innerHeight;
+  $("tip").style.left = `${Math.max(4, Math.min(innerWidth - own.width - 4, at.left + at.width / 2 - own.width / 2))}px`;
+  $("tip").style.top = `${above ? at.top - own.height - 5 : at.bottom + 5}px`;
+}
+for (const kind of ["pointerover", "focusin"]) addEventListener(kind, showTip);
+for (const kind of ["pointerdown", "focusout", "scroll"]) addEventListener(kind, () => { $("tip").hidden = true; }, true);
 connect();

@@ -139,7 +139,7 @@ export class Network {
     const [x, y] = point(0.5);
     g.textAlign = Math.abs(uy) < 0.3 ? "center" : uy < 0 ? "left" : "right";
     g.textBaseline = "middle";
-    g.fillText(`${link.age_ms.toFixed(0)} ms`, x - 10 * uy, y + 13 * ux);
+    g.fillText(`${stale ? "stale, " : ""}${link.age_ms.toFixed(0)} ms`, x - 10 * uy, y + 13 * ux);
   }
 
   row(name, frame) {

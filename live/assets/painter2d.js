@@ -50,11 +50,13 @@ export class PlainPainter {
   paint(card, site, g) {
     const { canvas, about } = card;
     const unit = canvas.height / (2 * card.view.half);
-    const thick = 0.075 * about.reach * unit;
+    const thick = 0.06 * about.reach * unit;
     g.clearRect(0, 0, canvas.width, canvas.height);
     for (const { at, normal } of about.walls) this.wall(card, g, at, normal);
     const base = about.planar ? [0, 0] : [0, 0, 0];
-    if (about.task && site.ghost.length) {
+    if (card.scene) {
+      // where arms lie over each other shadows only blur them
+    } else if (about.task && site.ghost.length) {
       g.strokeStyle = css("--soft");
       g.lineWidth = 0.25 * thick;
       g.beginPath(); g.arc(...this.project(card, site.ghost[0]), 0.6 * thick, 0, 2 * Math.PI); g.stroke();
@@ -64,8 +66,10 @@ export class PlainPainter {
     bodyPoses(about, site).forEach(({ at, edges }) => this.line(card, g, edges.map(at), css("--ink"), 0.18 * thick));
     const [bx, by] = this.project(card, base);
     g.fillStyle = css("--ink");
-    g.fillRect(bx - 0.8 * thick, by - 0.8 * thick, 1.6 * thick, 1.6 * thick);
+    if (card.under) g.fillRect(bx - 0.8 * thick, by - 0.8 * thick, 1.6 * thick, 1.6 * thick);
+    g.globalAlpha = card.scene ? 0.8 : 1;
     this.line(card, g, site.points, siteColour(about), thick);
+    g.globalAlpha = 1;
     g.fillStyle = css("--card");
     for (const point of site.points) {
       g.beginPath(); g.arc(...this.project(card, point), 0.27 * thick, 0, 2 * Math.PI); g.fill();

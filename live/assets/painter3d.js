@@ -59,6 +59,7 @@ export class ArmScene {
     plate.position.copy(normal).multiplyScalar(depth);
     plate.receiveShadow = true;
     this.scene.add(plate);
+    this.below = [plate];
     const [a, b] = this.card.about.planar ? [ahead, Y] : [ahead, side];
     const points = [];
     const far = this.card.about.planar ? 3 : 1.5;
@@ -67,12 +68,14 @@ export class ArmScene {
         for (const end of [-far, far]) points.push(along.clone().multiplyScalar(end * size).addScaledVector(across, (n / 4) * size).addScaledVector(normal, depth - 0.001 * size));
       }
     }
-    this.scene.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), this.lineColour));
+    this.below.push(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), this.lineColour));
+    this.scene.add(this.below[1]);
     const base = new THREE.Mesh(new THREE.CylinderGeometry(1.9 * this.thick, 2.3 * this.thick, this.card.about.planar ? 0.16 * size : 0.5 * this.thick, 32), this.baseColour);
     base.quaternion.setFromUnitVectors(Y, normal);
     base.position.copy(normal).multiplyScalar(this.card.about.planar ? depth / 2 : 0.2 * this.thick);
     base.castShadow = true;
     this.scene.add(base);
+    this.below.push(base);
   }
 
   mesh(geometry, material, shadow) {
@@ -117,7 +120,8 @@ export class ArmScene {
 
   pose(site) {
     const points = site.points.map(vector);
-    const wanted = site.ghost.map(vector);
+    const wanted = this.card.scene ? [] : site.ghost.map(vector); // where arms lie over each other shadows only blur them
+    for (const part of this.below) part.visible = this.card.under;
     this.links.forEach((tube, n) => this.span(tube, points[n], points[n + 1]));
     this.joints.forEach((ball, n) => ball.position.copy(points[n]));
     this.goal.visible = wanted.length > 0; // of a peer nobody knows where it ought to be

@@ -7,22 +7,18 @@ const LEAST = { rad: 0.01, m: 0.001, "N m": 1, N: 1, ms: 10, J: 0.1 };
 const EVERY_MS = 66;
 
 class Plot {
-  constructor(parent, title, unit, series, note = "") {
+  constructor(parent, title, unit, series, note = "", words = "") {
     this.series = series;
     this.least = LEAST[unit] || 1e-3; // what is less is drawn as nothing
     this.card = document.createElement("figure");
     this.card.className = "card plot";
-    this.card.style.margin = 0;
+    this.card.setAttribute("aria-label", `${title}, ${unit}: ${series.map(({ label }) => label).join(", ")}`);
     const head = this.card.appendChild(document.createElement("h2"));
     head.textContent = `${title} (${unit})`;
-    const keys = head.appendChild(document.createElement("span"));
-    keys.className = "keys";
-    for (const { label, colour, dash } of series) {
-      const key = keys.appendChild(document.createElement("span"));
-      const swatch = key.appendChild(document.createElement("span"));
-      swatch.className = `swatch${dash ? " dashed" : ""}`;
-      swatch.style.backgroundColor = `var(${colour})`;
-      key.append(label);
+    if (words) {
+      const more = head.appendChild(document.createElement("span"));
+      more.className = "soft";
+      more.textContent = words;
     }
     this.box = this.card.appendChild(document.createElement("div"));
     this.note = this.card.appendChild(document.createElement("p"));
@@ -44,13 +40,43 @@ class Plot {
       return [bottom < 0 ? bottom - 0.06 * (top - bottom) : 0, top + 0.1 * (top - bottom)];
     };
     this.plot = new uPlot({
-      width: Math.max(sizeOf(this.box).width, 120), height: 132, padding: [6, 16, 0, 0], legend: { show: false }, cursor: { show: false },
+      width: Math.max(sizeOf(this.box).width, 120), height: 132, padding: [6, this.room(), 0, 0], legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false, range: () => [this.now - SPAN_S, this.now] }, y: { range } },
-      axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => `${v} s`) }, axis(46)],
+      axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => (v < 0 ? "" : `${v} s`)) }, axis(46)],
       series: [{}, ...this.series.map(({ colour, dash, width = 1.6 }) => ({
         stroke: css(colour), width, dash: dash ? [5, 3] : undefined, points: { show: false }, pxAlign: 0, spanGaps: false,
       }))],
+      hooks: { draw: [(u) => this.label(u)] },
     }, this.data, this.box);
+  }
+
+  room() { return 16 + 7.4 * Math.max(...this.series.map(({ label }) => label.length)); } // for the labels at the ends, px
+
+  label(u) { // a line is named at its end, so that no colour has to tell it
+    const ratio = devicePixelRatio || 1;
+    const { ctx, bbox } = u;
+    const ends = this.series.flatMap(({ label, colour }, n) => {
+      const column = u.data[n + 1];
+      const last = column.findLastIndex((value) => value !== null && value !== undefined);
+      return last < 0 ? [] : [{ label, colour, y: u.valToPos(column[last], "y", true) }];
+    }).sort((a, b) => a.y - b.y);
+    const gap = 12 * ratio;
+    ends.forEach((end, n) => { end.at = Math.max(end.y, n ? ends[n - 1].at + gap : -Infinity); });
+    const over = ends.length ? ends.at(-1).at - (bbox.top + bbox.height) : 0;
+    if (over > 0) for (let n = ends.length - 1, most = bbox.top + bbox.height; n >= 0; n--, most -= gap) ends[n].at = Math.min(ends[n].at, most);
+    ctx.save();
+    ctx.font = `600 ${11 * ratio}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
+    ctx.textBaseline = "middle";
+    const x = bbox.left + bbox.width;
+    for (const { label, colour, y, at } of ends) {
+      ctx.strokeStyle = css(colour);
+      ctx.lineWidth = ratio;
+      ctx.beginPath(); ctx.moveTo(x, y); ctx.lineTo(x + 6 * ratio, at); ctx.stroke();
+      ctx.fillStyle = css("--ink");
+      ctx.fillText(label, x + 8 * ratio, at);
+    }
+    ctx.restore();
   }
 
   add(row) {
@@ -75,7 +101,7 @@ export class Plots {
     const per = (kind, extra = {}) => sites.map((site) => ({ label: site, colour: `--site-${hello.sites[site].colour}`, from: column(`${site}.${kind}`), ...extra }));
     const unit = hello.sites[sites[0]].unit;
     const walled = sites.filter((site) => hello.sites[site].walls.length);
-    const walls = walled.map((site) => ({ label: `wall at ${site}`, colour: `--site-${hello.sites[site].colour}`, dash: true, from: column(`${site}.wall`) }));
+    const walls = walled.map((site) => ({ label: `wall ${site}`, colour: `--site-${hello.sites[site].colour}`, dash: true, from: column(`${site}.wall`) }));
     const links = Object.entries(hello.links).map(([name, [from, to]]) => ({
       label: name.replace("->", "→"), colour: `--site-${hello.sites[from].colour}`, dash: sites.indexOf(to) > sites.indexOf(from), from: column(`${name}.age`),
     }));
@@ -86,8 +112,8 @@ export class Plots {
       [new Plot(parent, "age of samples in use", "ms", links), links],
     ].map(([plot, series]) => ({ plot, from: series.map((one) => one.from) }));
     this.energy = new Plot(parent, "V", "J", [
-      { label: "V", colour: "--ink", width: 2 }, { label: "V less what hands and walls gave: must not rise", colour: "--accent", dash: true },
-    ], "V follows from every record, a moment later");
+      { label: "V", colour: "--ink", width: 2 }, { label: "V − given", colour: "--accent", dash: true },
+    ], "V follows from every record, a moment later", "dashed: less what hands and walls gave; it must not rise");
     this.energy.card.classList.add("wide");
     this.drawn = 0;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {

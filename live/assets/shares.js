@@ -39,9 +39,11 @@ export class Shares {
   }
 
   knob(name, radius, take, label) {
-    const group = element(this.svg, "g", { tabindex: 0, role: "slider", "aria-label": label, "aria-valuetext": "" });
+    const group = element(this.svg, "g", { tabindex: 0, role: "slider", "aria-label": label, "aria-valuetext": "", "aria-valuemin": 0, "aria-valuemax": 1, "aria-valuenow": 0 });
     element(group, "circle", { class: "hit", r: 18 });
     const mark = element(group, "circle", { class: `knob ${name}`, r: radius });
+    const word = element(group, "text", { class: "whose", x: 0, y: -11 });
+    word.textContent = label.startsWith("row of ") ? label.slice(7) : "";
     const knob = { group, mark, at: [0, 0], held: false };
     const place = (event) => {
       const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.svg.getScreenCTM().inverse());
@@ -122,7 +124,10 @@ export class Shares {
       const share = rows[site]?.[this.sites[j]] ?? 0;
       return CORNERS[j].map((x, axis) => share * x + (1 - share) * CORNERS[k][axis]);
     });
-    this.knobs.forEach((knob, n) => this.move(knob, spots[n], this.rows.children[n].textContent));
+    this.knobs.forEach((knob, n) => {
+      this.move(knob, spots[n], this.rows.children[n].textContent);
+      knob.group.setAttribute("aria-valuenow", (rows[this.sites[n]]?.[this.sites[this.others(n)[0]]] ?? 0).toFixed(2));
+    });
     this.rays.forEach((ray, n) => {
       const [[x1, y1], [x2, y2]] = [CORNERS[n], spots[n]];
       for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) ray.setAttribute(name, value);

@@ -471,3 +471,26 @@ def test_a_page_as_no_site_of_the_session_is_closed(server: PageServer) -> None:
         hears(page)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.reason == "the session has no such site"
+
+
+def test_report_and_log_are_the_experimenters_alone(
+    server: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At an address that no other page is told and nobody guesses; the report's scripts reach nothing."""
+    monkeypatch.setattr(server._frames, "make", lambda: {"sites": {}})
+    monkeypatch.setattr(server._frames, "narrow", lambda *_, **__: {})
+    report = tmp_path / "report.html"
+    report.write_text("<p>a report</p>")
+    server.results = {"/secret/report.html": report}
+    told = {}
+    for link in ("", "?as=m1", "?watch", "?watch&as=m1"):
+        with socket(server, link=server.address + link) as page:
+            while "results" not in (message := hears(page)):
+                page.send(json.dumps({"do": "seen", "n": 2**40}))
+            told[link] = message["results"]
+    assert told == {"": ["/secret/report.html"], "?as=m1": [], "?watch": [], "?watch&as=m1": []}
+    status, policy, content = get(server, "/secret/report.html")
+    assert (status, content) == (200, b"<p>a report</p>")
+    assert "sandbox" in policy
+    assert "default-src 'none'" in policy
+    assert get(server, "/report.html")[0] == get(server, "/secret/")[0] == 404

@@ -14,7 +14,7 @@ from sites.monitor import describe_angles
 from sites.running_session import RunningSession
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
-from trilat_net.analysis.arm_rows import joint_positions_m
+from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection
@@ -80,6 +80,26 @@ def test_peers_are_drawn_as_the_log_says(
     assert len(frames) > 60
     assert len(moved) > 50
     assert frames[-1]["sites"][peers[0]]["age_ms"] >= 100.0
+
+
+def test_a_user_is_shown_how_its_law_pulls(tmp_path: Path) -> None:
+    """The torque beyond what carries the arm does the work of a force at its end, N."""
+    keys = {"duration_s": 1.5, "arm.g_m_s2": 9.81, "sites.m1.q0_rad": [0.3, 1.2]}
+    session = Session.whole(load_scenario("paper", keys), tmp_path)
+    frames: Frames = []
+    session.stranger(looking(frames, "m1"))
+    log = session.run()
+    arm = build_arm_rows(log.scenario, "m1")
+    largest = 0.0
+    for own in (frame["sites"]["m1"] for frame in frames):
+        record = log["m1"].states[own["tick"]]
+        q = np.array([record.q])
+        J = arm.place_end_effector(q, np.zeros_like(q)).J[0]
+        torque = np.array(record.tau) - arm.gravity_torque(q)[0]
+        if np.linalg.svd(J, compute_uv=False)[-1] > 0.1 * np.linalg.norm(J):
+            assert J.T @ np.array(own["pull"]) == pytest.approx(torque, abs=5e-3)
+            largest = max(largest, np.linalg.norm(own["pull"]))
+    assert largest > 1.0
 
 
 def test_a_peer_stays_until_its_missing_record_has_come(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from sites.demo_session import SessionAttendant
+    from live.page_server import PageAttendant
     from sites.running_session import RunningSession
 
     from ..scenario import Scenario
@@ -28,10 +28,8 @@ def demo_command(scenario: options.ScenarioArgument = "paper", *, run: options.R
     run_and_report(run.load(scenario), run)
 
 
-def run_and_report(
-    chosen: "Scenario", run: options.RunOptions, attend: "SessionAttendant | None" = None
-) -> None:
-    """Runs a scenario live, then verifies and reports; what `attend` yields may end it as planned."""
+def run_and_report(chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None) -> None:
+    """Runs a scenario live, then verifies and reports; a page may end it as planned, and gets the report."""
     from sites.demo_session import run_demo
 
     from ..files import make_results_folder, require_libraries
@@ -42,17 +40,19 @@ def run_and_report(
         terminal.print_text(chosen.title or chosen.name)
         members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
         terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
-        outcome = run_demo(chosen, results, terminal.out, attend)
+        outcome = run_demo(chosen, results, terminal.out, page.attend if page else None)
     for problem in outcome.problems:
         terminal.print_error(problem)
     there = outcome.log.exists()
-    if outcome.interrupted and not (attend and there):
+    if outcome.interrupted and not (page and there):
         kept = f"; {outcome.log} holds what there was" if there else ""
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not there:
         raise typer.Exit(outcome.exit_code)
     _, conclusion = terminal.conclude_files([outcome.log], results, as_json=run.as_json, png=run.png)
+    if page is not None:
+        page.offer((conclusion.page, outcome.log))
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)
 
@@ -82,7 +82,7 @@ def live_command(
         tls: Encrypt the page by the keys of a member in this folder (trilat keys new); headsets ask for it.
         insecure: Allow --host beyond loopback, without encryption.
     """
-    from live.page_server import LONGEST_S, PageOptions, attend_with_page, show_on_page
+    from live.page_server import LONGEST_S, PageAttendant, PageOptions, show_on_page
     from live.terminal_watch import watch_session
 
     clock, say = SystemClock(), terminal.print_line
@@ -99,7 +99,8 @@ def live_command(
         raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
     if any(reach):
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
-    run_and_report(run.load(scenario, LONGEST_S), run, partial(attend_with_page, page, clock))
+    with PageAttendant(page, clock) as attendant:
+        run_and_report(run.load(scenario, LONGEST_S), run, attendant)
 
 
 _check_count = options.check_range(5, 10_000, "a number")

@@ -1,0 +1,123 @@
+"""What a page's server would send of a session of `play`, and browsers that are sent it."""
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, Page, WebSocketRoute
+
+from live.session_frames import SessionFrames, show_event
+from live.session_view import SessionView
+from sites.running_session import open_hand
+from tests.net.waiting import until
+from tests.sites.relay import RelayClock
+from tests.sites.sessions import SESSION, Session
+from trilat_net.net.bus import Bus
+from trilat_net.scenario import load_scenario
+
+SCREENS: dict[str, dict[str, Any]] = {
+    "desktop": {"viewport": {"width": 1440, "height": 900}},
+    "phone": {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True},
+}
+QUERIES = {"experimenter": "", "user": "?as=m1", "watcher": "?watch"}
+_ABOUT_PAGES = {
+    "notices": [],
+    "ages": True,
+    "pages": 1,
+    "asks": False,
+    "asked": [],
+    "holds": [],
+    "refused": 0,
+    "results": [],
+}
+Json = dict[str, Any]
+
+
+@dataclass
+class RecordedSession:
+    """Hellos and frames of every role.
+
+    Attributes:
+        cut: true: pages get nothing more.
+    """
+
+    hellos: dict[str, Json] = field(default_factory=dict)
+    frames: dict[str, list[Json]] = field(default_factory=dict)
+    cut: bool = False
+
+    @contextmanager
+    def shown(
+        self, browser: Browser, address: str, role: str, screen: str, scheme: str, **last: Any
+    ) -> Iterator[Page]:
+        """A page that has drawn all frames, and gets the last one again until the session is cut off.
+
+        Args:
+            last: what the last frame has besides.
+        """
+        *before, end = self.frames[role]
+        frames = chain(before, repeat({**end, **last, "points": [], "energies": [], "events": []}))
+
+        def send(route: WebSocketRoute) -> None:
+            def answer(message: Any) -> None:
+                if json.loads(message)["do"] == "seen" and not self.cut:
+                    route.send(json.dumps(next(frames)))
+
+            route.on_message(answer)
+            route.send(json.dumps({"hello": self.hellos[role]}))
+
+        context = browser.new_context(color_scheme=scheme, **SCREENS[screen])
+        try:
+            page = context.new_page()
+            page.route_web_socket("**/socket*", send)
+            page.goto(address + QUERIES[role])
+            newest = self.frames[role][-1]["n"]
+            until(lambda: page.evaluate("window.trilat?.frame?.n") == newest, 60.0)
+            page.evaluate("new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))")
+            yield page
+        finally:
+            context.close()
+
+
+def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
+    """Returns a session at 300 ms in which somebody leads m1."""
+    scenario = load_scenario("play", {"duration_s": duration_s, "rate_hz": 200, "link.delay_ms": 300})
+    found = RecordedSession(frames={role: [] for role in QUERIES})
+
+    def look(bus: Bus, clock: RelayClock) -> None:
+        view = SessionView(bus, clock, SESSION)
+        pages = SessionFrames(view)
+        hand = open_hand(bus, clock, SESSION, "m1", scenario, "Ada")
+        points = energies = events = n = 0
+        while not view.ended:
+            view.poll()
+            if (frame := pages.make()) is not None and 1.0 < frame["t"] < duration_s - 0.2:
+                n += 1
+                turn = 2.0 * frame["t"]
+                hand.move(1.0 + 0.15 * math.sin(turn), 0.6 + 0.25 * math.cos(turn))
+                added = {
+                    "points": pages.points.since(points, 10_000),
+                    "energies": pages.energies.since(energies, 10_000),
+                    "events": [show_event(event) for event in view.events.since(events, 100)],
+                }
+                points, energies, events = pages.points.count, pages.energies.count, view.events.count
+                every = {"n": n, **_ABOUT_PAGES}
+                nothing: Json = {key: [] for key in added}
+                known = pages.narrow(frame, "m1", ages=True)
+                found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
+                found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
+                found.frames["user"].append({**every, **known, **nothing, "takes_part": True})
+                about, narrow = pages.describe(), pages.describe_narrowed()
+                for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
+                    who = {"role": role, "as": "m1" if role == "user" else "", "ends": role == "experimenter"}
+                    found.hellos[role] = {**of, **who, "n": 0}
+            clock.sleep_until(clock.monotonic_ns() + 33_333_333)
+
+    session = Session.whole(scenario, folder)
+    session.stranger(look)
+    session.run()
+    return found

@@ -1,0 +1,164 @@
+"""The page in a browser, for every role, by day and by night, at a desk and on a phone: what people can use.
+
+`axe-core/axe.min.js` is axe-core 4.14.1 of Deque Systems, under the Mozilla Public License 2.0.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from live.page_server import PageServer
+from tests.live.browsers import launch, needs_browser, tip_px
+from tests.net.local_bus import LocalNetwork
+from trilat_net.net.clock import SystemClock
+
+from .recorded_session import QUERIES, SCREENS, RecordedSession, record_session
+
+pytestmark = [needs_browser, pytest.mark.long]
+
+AXE = Path(__file__).parent / "axe-core" / "axe.min.js"
+SCHEMES = ("light", "dark")
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
+    return record_session(tmp_path_factory.mktemp("session"))
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
+        yield server.address
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = launch(playwright, gl=False)
+        yield browser
+        browser.close()
+
+
+def grave_findings(page: Page) -> list[str]:
+    """What axe-core calls serious or critical, each with its first place."""
+    page.evaluate(AXE.read_text(encoding="utf-8"))
+    found: list[dict[str, Any]] = page.evaluate("axe.run().then((found) => found.violations)")
+    grave = [one for one in found if one["impact"] in ("serious", "critical")]
+    return [f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}" for one in grave]
+
+
+@pytest.mark.parametrize("role", QUERIES)
+@pytest.mark.parametrize("screen", SCREENS)
+def test_axe_finds_nothing_serious(
+    session: RecordedSession, address: str, browser: Browser, role: str, screen: str
+) -> None:
+    for scheme in SCHEMES:
+        with session.shown(browser, address, role, screen, scheme) as page:
+            assert grave_findings(page) == []
+            page.click("#scene")
+            assert grave_findings(page) == []
+
+
+ALARM = {"word": "STOPPED", "reason": "ordered to stop", "advice": "trilat enable --session t m1"}
+
+
+@pytest.mark.parametrize("screen", SCREENS)
+def test_axe_finds_nothing_serious_in_what_is_raised(
+    session: RecordedSession, address: str, browser: Browser, screen: str
+) -> None:
+    """Alarms, what a page is asked, and the report at the end."""
+    newest = session.frames["experimenter"][-1]
+    sites = {name: {**site, "alarm": ALARM, "mode": "stopped"} for name, site in newest["sites"].items()}
+    ended = {"ended": True, "results": ["/x/report.html", "/x/run.mcap"], "asked": [2]}
+    for scheme in SCHEMES:
+        shown = session.shown(browser, address, "experimenter", screen, scheme, sites=sites, **ended)
+        with shown as page:
+            assert page.locator("#todo a").count() == 2
+            assert page.locator("#alarms .raised").count() == 3
+            assert grave_findings(page) == []
+
+
+def test_arms_have_half_of_the_window(session: RecordedSession, address: str, browser: Browser) -> None:
+    for role in QUERIES:
+        with session.shown(browser, address, role, "desktop", "light") as page:
+            box = page.locator("#arms").bounding_box()
+            assert box is not None
+            assert box["y"] + box["height"] <= 900
+            assert box["width"] * box["height"] >= 0.5 * 1440 * 900
+
+
+SMALL = """[...document.querySelectorAll("button, select, input, a")]
+.map((one) => [one, one.getBoundingClientRect()])
+.filter(([one, box]) => box.width && one.type !== "checkbox" && Math.min(box.width, box.height) < 43.9)
+.map(([one, box]) => `${one.outerHTML.slice(0, 60)} ${box.width.toFixed(0)}x${box.height.toFixed(0)}`)"""
+
+
+def test_a_phone_shows_arms_first_and_targets_of_44_px(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
+    for role in QUERIES:
+        with session.shown(browser, address, role, "phone", "light") as page:
+            arms, stop = (page.locator(part).bounding_box() for part in ("#arms", "#stop"))
+            assert arms is not None
+            assert stop is not None
+            assert arms["y"] + arms["height"] <= stop["y"] + 4.0
+            assert page.evaluate("document.documentElement.scrollWidth") <= 390
+            assert page.evaluate(SMALL) == []
+
+
+HELD = "trilat.parts.arms.cards.filter((card) => card.hold).map((card) => card.name)"
+
+
+def test_keys_lead_an_arm_wherever_one_has_clicked(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
+    with session.shown(browser, address, "experimenter", "desktop", "light") as page:
+        page.click("#link-presets button:has-text('100 ms')")
+        page.keyboard.press("2")
+        page.keyboard.press(" ")
+        assert page.evaluate("trilat.parts.arms.cards.map((card) => Boolean(card.hold))") == [
+            False,
+            True,
+            False,
+        ]
+        page.keyboard.press(" ")
+        page.focus("#mark-text")
+        page.keyboard.type("m 2 m")
+        assert page.input_value("#mark-text") == "m 2 m"
+        assert page.evaluate(HELD) == []
+
+
+def test_a_page_that_is_cut_off_says_so(session: RecordedSession, address: str, browser: Browser) -> None:
+    """It calls no arm silent for its own lag, and its buttons are off."""
+    with session.shown(browser, address, "experimenter", "desktop", "light") as page:
+        session.cut = True
+        try:
+            page.wait_for_selector("body.late")
+        finally:
+            session.cut = False
+        assert "s behind" in page.inner_text("#state")
+        assert "s behind" in page.inner_text("#todo")
+        assert "silent" not in page.inner_text("body").lower()
+        assert page.is_disabled("#end")
+        assert page.is_disabled("#link-delay")
+        assert page.is_disabled("#part")
+
+
+def test_a_pointer_means_the_nearest_arm_of_one_scene(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
+    with session.shown(browser, address, "experimenter", "desktop", "light") as page:
+        page.click("#scene")
+        for n, name in enumerate(("m1", "m2", "s")):
+            page.evaluate("trilat.parts.arms.draw(trilat.frame)")
+            x, y = tip_px(page, n)
+            page.mouse.move(x, y)
+            page.mouse.down()
+            held = page.evaluate(
+                "trilat.parts.arms.cards.filter((card) => card.hold).map((card) => card.name)"
+            )
+            page.mouse.up()
+            assert held == [name]
