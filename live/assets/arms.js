@@ -110,7 +110,7 @@ class ArmCard {
     const { view } = this;
     const aspect = this.canvas.width / this.canvas.height;
     let needed = 0.56 * this.about.reach;
-    for (const point of [...site.points, ...(this.about.task ? [] : site.ghost)]) {
+    for (const point of [...site.points, ...(this.needs || []), ...(this.about.task ? [] : site.ghost)]) {
       const [x, y] = this.flat(point);
       const [cx, cy] = this.flat(view.centre);
       needed = Math.max(needed, 1.18 * Math.abs(y - cy), (1.12 * Math.abs(x - cx)) / aspect);
@@ -154,6 +154,7 @@ class ArmCard {
   over(g, site, ratio, scale) {
     const tip = site.points[site.points.length - 1];
     const at = this.project(tip);
+    this.extra?.(g, ratio, tip); // of an experiment: its target
     g.lineJoin = "round";
     g.strokeStyle = siteColour(this.about);
     g.lineWidth = 1.5 * ratio;

@@ -5,6 +5,7 @@ import { Hands } from "./hands.js";
 import { Network, describeLink } from "./network.js";
 import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
+import { renew, Stage } from "./stage.js";
 
 const $ = (id) => document.getElementById(id);
 const page = { hello: null, frame: null, takesPart: null, sent: 0, frames: 0, energies: [] };
@@ -20,6 +21,8 @@ export function send(message) {
   page.sent += 1;
   return true;
 }
+
+const stage = new Stage(send); // of an experiment; without one it shows nothing
 
 let hidesAt = 0;
 let nextWords = 0;
@@ -43,6 +46,8 @@ function begin(hello) {
   document.body.className = `${hello.role}${hello.as ? " as" : ""}`;
   $("whose").textContent = hello.as ? `as ${hello.as} knows it: its own arm now, the others as received` : "as it is, without delay";
   document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
+  stage.take(hello.stage, page, parts?.arms);
+  if (!hello.running && hello.stage) return state("between trials");
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
@@ -51,7 +56,8 @@ function begin(hello) {
   const able = Object.values(hello.sites).filter((site) => site.stops).length;
   $("stop").disabled = !able;
   $("stop").title = able ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
-  if (parts !== null) return;
+  if (parts !== null) return renew(parts, hello, page.sites);
+  page.sites = hello.sites;
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
   const hands = new Hands(arms, hello, send, page, stop);
@@ -93,6 +99,7 @@ function take(frame) {
   if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
   events(frame.events);
   parts.plots?.take(frame);
+  stage.take(frame.stage, page, parts.arms);
   $("ages").checked = frame.ages;
   if (performance.now() < nextWords) return;
   nextWords = performance.now() + WORDS_MS;

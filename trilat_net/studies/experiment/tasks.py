@@ -28,6 +28,10 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         """When a trial ends at the latest, s."""
         raise NotImplementedError
 
+    def ask(self, slave: str) -> str:
+        """Returns what a participant is told to do, in a sentence."""
+        raise NotImplementedError
+
     def begin(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
         """Returns what is asked in a trial, by the number of its target from 0.
 
@@ -105,6 +109,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         """The time-out, s."""
         return self.timeout_s
 
+    def ask(self, slave: str) -> str:
+        """See `TrialTask`."""
+        return f"Bring the end effector of {slave} into the circle, and keep it there for {self.dwell_s:g} s."
+
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
         """Returns the next target around the ring."""
         place = (number // 2 + (number % 2) * (self.targets // 2)) % self.targets
@@ -153,6 +161,10 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def longest_s(self) -> float:
         """Its duration, s."""
         return self.duration_s
+
+    def ask(self, slave: str) -> str:
+        """See `TrialTask`."""
+        return f"Keep the end effector of {slave} in the circle, which moves for {self.duration_s:g} s."
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - phases are of the seed
         """Returns the path, which begins at the start."""
