@@ -124,8 +124,11 @@ class ExperimentSessions:
         path = make_folder(self._experiment.folder / LOGS) / planned.file
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True
-        if self._list_tries(planned):
-            self._note_aborted(planned, "the program was ended")
+        for left in self._list_tries(planned)[-1:]:
+            if any(left.glob("run.mcap*")):
+                self._note_aborted(planned, "the program was ended")
+            else:  # its session had not begun
+                shutil.rmtree(left, ignore_errors=True)
         rest_s = plan.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
         while not self._try(step, trial, path, rest_s):
             if self._ends():

@@ -202,7 +202,7 @@ class Stage:
             t_s: the time of its arms, s; None without a session.
         """
         step, asked, watch, protocol = self._step, self._asked, self._watch, self._plan.protocol
-        found: Json = {"phase": self._phase, "title": protocol.title or protocol.name}
+        found: Json = {"phase": self._phase, "title": protocol.title or protocol.name, "told": self._told}
         if step is None:
             return found
         planned, replies = step.planned, {} if asked is None else asked.replies
@@ -217,7 +217,6 @@ class Stage:
             "block": planned.block,
             "blocks": len(protocol.conditions),
             "practice": planned.practice,
-            "told": self._told,
         }
         if asked is not None:
             found["rest_s"] = max(0.0, (asked.from_ns - self._clock.monotonic_ns()) / NS_PER_S)

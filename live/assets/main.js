@@ -47,7 +47,11 @@ function begin(hello) {
   $("whose").textContent = hello.as ? `as ${hello.as} knows it: its own arm now, the others as received` : "as it is, without delay";
   document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
   stage.take(hello.stage, page, parts?.arms);
-  if (!hello.running && hello.stage) return state("between trials");
+  if (!hello.running && hello.stage) {
+    parts?.hands.letGo();
+    alarms({ sites: {} });
+    return state("between trials");
+  }
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
@@ -115,7 +119,7 @@ function take(frame) {
 let raised = "";
 // What nobody may overlook: of each arm that holds, is stopped or in fault the mode, why, and what to do.
 function alarms(frame) {
-  const list = parts.names.map((name) => [name, frame.sites[name].alarm]).filter(([, alarm]) => alarm);
+  const list = (parts?.names || []).map((name) => [name, frame.sites[name]?.alarm]).filter(([, alarm]) => alarm);
   const text = JSON.stringify(list);
   if (text !== raised) {
     raised = text;

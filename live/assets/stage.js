@@ -113,7 +113,10 @@ export class Stage {
     if (shown.second) {
       make(card, "h2", "Another page of this user is open");
       make(card, "p", "Go on there, or close it to go on here.");
-    } else if (shown.phase === "consent") this.consent(card, shown);
+      return;
+    }
+    this.feedback(card, shown);
+    if (shown.phase === "consent") this.consent(card, shown);
     else if (shown.phase === "questionnaire") this.form(card, shown);
     else if (shown.phase === "trial") this.invite(card, shown);
     else if (shown.phase === "starting") {
@@ -131,7 +134,7 @@ export class Stage {
     this.confirm(card, shown, "I agree");
   }
 
-  invite(card, shown) {
+  feedback(card, shown) {
     const { why, measures, succeeded } = shown.told;
     if (why) make(card, "p", `This trial is made again: ${why}.`, "again");
     if (succeeded !== undefined) {
@@ -144,6 +147,9 @@ export class Stage {
         make(told, "dd", `${value.toFixed(digits)} ${unit}`).dataset.measure = name;
       }
     }
+  }
+
+  invite(card, shown) {
     make(card, "h2", this.where(shown).replace(/^t/, "T"));
     make(card, "p", shown.task);
     this.ready = this.confirm(card, shown, "I am ready");

@@ -29,7 +29,7 @@ sites.m1.q0_rad = [-0.6, 1.2]
 sites.m1.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
 sites.m2.q0_rad = [-0.6, 1.2]
 sites.m2.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
-sites.s.q0_rad = [-0.6, 1.2]
+sites.s = {{ role = "slave", q0_rad = [-0.6, 1.2] }}
 on_stale = {{ action = "glide", silence_ms = 100.0 }}
 dominance.m1 = {{ m2 = 0.2, s = 0.8 }}
 dominance.m2 = {{ m1 = 0.2, s = 0.8 }}
@@ -40,8 +40,8 @@ dominance.s = {{ m1 = 0.6, m2 = 0.4 }}
 [task]
 kind = "reach"
 targets = 4
-distance_m = 0.1
-width_m = 0.08
+distance_m = 0.3
+width_m = 0.2
 dwell_s = 0.2
 timeout_s = {timeout}
 """
@@ -56,7 +56,7 @@ LOOK = """(site) => {
   const box = own.canvas.getBoundingClientRect();
   if (!own.project) return found;
   const slave = frame.sites[shown.target.site].points.at(-1), held = own.hold ? own.hold.to : tip;
-  const aim = held.map((x, n) => x + 0.3 * (shown.target.at[n] - slave[n]));
+  const aim = held.map((x, n) => x + 0.6 * (shown.target.at[n] - slave[n]));
   const ratio = own.canvas.width / box.width;
   const px = (at) => { const [x, y] = own.project(at); return [box.left + x / ratio, box.top + y / ratio]; };
   return { ...found, tip: px(tip), aim: px(aim), held: Boolean(own.hold), graspable: own.graspable };
@@ -141,7 +141,7 @@ def participants(
         try:
             found, problems = [], list[str]()
             for site in sites:
-                page = browser.new_context(**options).new_page()
+                page = browser.new_context(viewport={"width": 640, "height": 480}, **options).new_page()
                 page.on("pageerror", lambda error: problems.append(str(error)))
                 page.goto(role_address(running, f"user {site}"))
                 found.append(Participant(page, site))
