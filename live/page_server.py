@@ -350,7 +350,7 @@ class PageServer:
         """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
         while True:
             begun_ns = self._clock.monotonic_ns()
-            polls = self._turn_over, self._poll_session, self._poll_stage
+            polls = self._desk.poll, self.view.poll, self._turn_over, self._poll_stage
             for step in (*polls, self._tell_links, self._settle_asked, self._make_frame):
                 try:
                     step()
@@ -360,10 +360,6 @@ class PageServer:
                 page.wake.set()
             spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
-
-    def _poll_session(self) -> None:
-        self._desk.poll()
-        self.view.poll()
 
     def _poll_stage(self) -> None:
         if self._stage is not None:

@@ -23,7 +23,7 @@ CONSENT = 'consent = "We record how the arms move."\nquestionnaires = [{ name = 
 
 
 def settled(running: Process, count: int) -> bool:
-    return running.text().count(" after ") >= count or running.ended()
+    return running.text().count(": succeeded after") >= count or running.ended()
 
 
 def rows_of(folder: Path, name: str = "trials.csv") -> list[dict[str, str]]:

@@ -13,12 +13,16 @@ ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol (TOML).", met
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
-@options.command("reaching.toml")
-def experiment_new_command(file: ProtocolArgument, force: options.ForceOption = False) -> None:
+@options.command("reaching.toml", "two-people.toml --pair")
+def experiment_new_command(
+    file: ProtocolArgument,
+    pair: Annotated[bool, flag("--pair", "For two people, who hold a master each.")] = False,
+    force: options.ForceOption = False,
+) -> None:
     """Writes a protocol with comments, which runs as it is."""
     from ..studies.experiment.experiment_run import new_experiment
 
-    new_experiment(file, force=force)
+    new_experiment(file, pair=pair, force=force)
     terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
 
 
@@ -30,7 +34,7 @@ def experiment_check_command(file: ProtocolArgument, as_json: options.JsonOption
     terminal.print_result(check_experiment(file), as_json=as_json)
 
 
-@options.command("reaching.toml", "runs/experiment-reaching-001")
+@options.command("reaching.toml", "two-people.toml --live", "runs/experiment-reaching-001")
 def experiment_run_command(
     file: Annotated[Path, typer.Argument(help="A protocol, or the folder of one that goes on.")],
     out: Annotated[Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")] = None,

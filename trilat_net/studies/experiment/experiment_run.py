@@ -250,16 +250,21 @@ class Experiment(Result):
 _SHOWN = ("succeeded", "completion_s", "error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
-def new_experiment(file: str | Path, *, force: bool = False) -> Path:
+def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
     """Writes a protocol with comments, which runs as it is; the command is `trilat experiment new`.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
 
+    Args:
+        file: where it is written.
+        pair: true: of two people who hold a master each; false: of one.
+        force: whether it may replace a file.
+
     Raises:
         UsageError: the file exists.
     """
-    template = resources.files("trilat_net") / "scenarios" / "_experiment.txt"
+    template = resources.files("trilat_net") / "scenarios" / f"_experiment{'_pair' if pair else ''}.txt"
     write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
     return Path(file)
 
