@@ -8,8 +8,10 @@ a folder of its own, which stays if the trial does not count, with a note that s
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -41,10 +43,11 @@ SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
 or people end the experiment."""
 
 
+@dataclass
 class ExperimentSessions:
     """What is left of an experiment, made with people step by step.
 
-    Args:
+    Attributes:
         experiment: in its folder.
         stage: what its pages are asked.
         clock: of the stage.
@@ -53,17 +56,12 @@ class ExperimentSessions:
         say: tells people at the terminal.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        stage: Stage,
-        clock: Clock,
-        run_session: SessionRunner,
-        ends: Callable[[], bool],
-        say: Callable[[str], None],
-    ) -> None:
-        self._experiment, self._stage, self._clock = experiment, stage, clock
-        self._run_session, self._ends, self._say = run_session, ends, say
+    experiment: Experiment
+    stage: Stage
+    clock: Clock
+    run_session: SessionRunner
+    ends: Callable[[], bool]
+    say: Callable[[str], None]
 
     def run(self) -> bool:
         """Goes on to the end; false if it was ended before.
@@ -72,56 +70,47 @@ class ExperimentSessions:
             LogRefused: a disk refused something; all that was done is kept.
             UsageError: its trials are of synthetic participants.
         """
-        experiment = self._experiment
-        with experiment.open_trials(people=True) as self._trials, experiment.open_notes() as self._notes:
+        trials, notes = self.experiment.open_trials(people=True), self.experiment.open_notes()
+        with trials as self._trials, notes as self._notes:
             done = {entry.cell for entry in self._trials.done.values()}
-            for step in experiment.plan.list_steps():
+            for step in self.experiment.plan.list_steps():
                 is_trial = step.kind == "trial"
                 if is_trial and step.planned.number in done:
                     continue
                 if not (self._make_trial(step) if is_trial else self._ask(step)):
                     return False
-            self._stage.close()
+            self.stage.close()
         return True
 
     def _ask(self, step: Step, rest_s: float = 0.0) -> bool:
         """Waits until every user has done a step; notes consents and answers as they come."""
-        users = dict(zip(self._stage.users, step.planned.group, strict=True))
+        users = dict(zip(self.stage.users, step.planned.group, strict=True))
         cells = {site: f"{step.key} {who}" for site, who in users.items()}
-        asked = self._stage.ask(
+        asked = self.stage.ask(
             step, rest_s, [site for site, cell in cells.items() if (cell, 0) in self._notes.done]
         )
         noted = len(self._notes.done)
         while not asked.replies.keys() >= users.keys():
-            if self._ends():
+            if self.ends():
                 return False
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
             for site, (answers, _) in list(asked.replies.items()) if step.kind != "trial" else ():
                 told = step.form.name if step.form else ""
-                self._note(cells[site], step.kind, users[site], step.planned, told, answers)
+                self._note(cells[site], step.kind, users[site], step.planned.number, told, answers)
         if len(self._notes.done) > noted:
-            self._experiment.write_tables()
+            self.experiment.write_tables()
         return True
 
-    def _note(
-        self,
-        cell: str,
-        kind: str,
-        who: str,
-        planned: PlannedTrial,
-        text: str,
-        answers: dict[str, float] | None = None,
-    ) -> None:
-        unix_s = round(self._clock.unix_ns() / NS_PER_S, 3)
-        self._notes.add(Note(cell, kind, who, planned.number, unix_s, text, answers or {}))
+    def _note(self, cell: str, kind: str, who: str, number: int, *told: Any) -> None:
+        self._notes.add(Note(cell, kind, who, number, round(self.clock.unix_ns() / NS_PER_S, 3), *told))
 
     def _make_trial(self, step: Step) -> bool:
         """Makes a trial until one counts; false if the experiment was ended before."""
-        plan, planned = self._experiment.plan, step.planned
+        plan, planned = self.experiment.plan, step.planned
         trial = ExperimentTrial(
             plan.protocol, plan.scenarios[planned.condition], planned, plan.digest, whose=""
         )
-        path = make_folder(self._experiment.folder / LOGS) / planned.file
+        path = make_folder(self.experiment.folder / LOGS) / planned.file
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True
         for left in self._list_tries(planned)[-1:]:
@@ -131,43 +120,43 @@ class ExperimentSessions:
                 shutil.rmtree(left, ignore_errors=True)
         rest_s = plan.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
         while not self._try(step, trial, path, rest_s):
-            if self._ends():
+            if self.ends():
                 return False
             rest_s = 0.0
         return True
 
     def _list_tries(self, planned: PlannedTrial) -> list[Path]:
-        return sorted((self._experiment.folder / TRIES).glob(f"{planned.number:05d}-*"))
+        return sorted((self.experiment.folder / TRIES).glob(f"{planned.number:05d}-*"))
 
     def _note_aborted(self, planned: PlannedTrial, why: str) -> None:
         """Notes why the newest try does not count, unless that is noted."""
         cell = f"aborted {self._list_tries(planned)[-1].name}"
-        self._note(cell, "aborted", "-".join(planned.group), planned, why)
-        self._experiment.write_tables()
+        self._note(cell, "aborted", "-".join(planned.group), planned.number, why)
+        self.experiment.write_tables()
 
     def _try(self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float) -> bool:
         """Runs the session of a trial, once all users are ready; false if it does not count."""
-        number, begun_ns = len(self._list_tries(step.planned)) + 1, self._clock.monotonic_ns()
-        folder = make_folder(self._experiment.folder / TRIES / f"{step.planned.number:05d}-{number:02d}")
-        watch, asked = TrialWatch(trial, self._clock), self._stage.ask(step, rest_s)
+        number, begun_ns = len(self._list_tries(step.planned)) + 1, self.clock.monotonic_ns()
+        folder = make_folder(self.experiment.folder / TRIES / f"{step.planned.number:05d}-{number:02d}")
+        watch, asked = TrialWatch(trial, self.clock), self.stage.ask(step, rest_s)
         ready: list[str] = []
 
         def begins() -> bool:
-            if not ready and asked.replies.keys() >= set(self._stage.users):
-                ready.extend(self._stage.users)
-                self._stage.begin(watch)
+            if not ready and asked.replies.keys() >= set(self.stage.users):
+                ready.extend(self.stage.users)
+                self.stage.begin(watch)
             return bool(ready)
 
         try:
-            result = self._run_session(watch, folder, begins)
+            result = self.run_session(watch, folder, begins)
         except OSError as error:
             raise describe_write_error(folder, error) from None
-        self._stage.check()
+        self.stage.check()
         if result.problems and result.exit_code == LogRefused.exit_code:
             raise LogRefused("; ".join(result.problems))
         if not ready:  # nobody has begun anything: people have ended it, or the sites have waited for long
             shutil.rmtree(folder, ignore_errors=True)
-            if result.problems and self._clock.monotonic_ns() - begun_ns < SOON_NS:
+            if result.problems and self.clock.monotonic_ns() - begun_ns < SOON_NS:
                 raise RunFailed("; ".join(result.problems))
             return False
         why = _find_reason(watch, result)
@@ -176,8 +165,8 @@ class ExperimentSessions:
             why = self._count(trial, path)
         if why:
             self._note_aborted(step.planned, why)
-            self._stage.tell(None, why)
-            self._say(f"trial {step.planned.number} is to be made again: {why}")
+            self.stage.tell(None, why)
+            self.say(f"trial {step.planned.number} is to be made again: {why}")
         return not why
 
     def _count(self, trial: ExperimentTrial, path: Path) -> str:
@@ -186,17 +175,17 @@ class ExperimentSessions:
         try:
             entry = trial.settle(path)
         except LogError as error:
-            path.replace((*tries, self._experiment.folder)[0] / path.name)
+            path.replace((*tries, self.experiment.folder)[0] / path.name)
             return str(error)
         self._trials.add(entry)
         for folder in tries:
             shutil.rmtree(folder, ignore_errors=True)
-        self._stage.tell(entry)
-        self._experiment.write_tables()
+        self.stage.tell(entry)
+        self.experiment.write_tables()
         planned, took_s = trial.planned, entry.measures["completion_s"]
         how = f"{'succeeded' if entry.succeeded else 'failed'} after {took_s:.2f} s"
-        whose = f"trial {planned.number} of {len(self._experiment.plan.trials)}, {', '.join(planned.group)}"
-        self._say(f"{whose}, {planned.condition}: {how}")
+        whose = f"trial {planned.number} of {len(self.experiment.plan.trials)}, {', '.join(planned.group)}"
+        self.say(f"{whose}, {planned.condition}: {how}")
         return ""
 
 

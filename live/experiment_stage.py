@@ -17,7 +17,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.studies.experiment.protocol import ExperimentPlan, Step
 from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry, find_slave
 
-from .page_orders import AbortTrial, DoStep
+from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
 
 AWAY_NS = 8 * NS_PER_S
@@ -50,12 +50,7 @@ class TrialWatch:
         return bool(self.aborted) or (ended and self._clock.monotonic_ns() - self._ended_ns > END_NS)
 
     def poll(self, view: SessionView, away: Collection[str]) -> list[str]:
-        """Takes in the records that have come; returns moments that the log is to mark.
-
-        Args:
-            view: of the session.
-            away: users whose page is gone for good.
-        """
+        """Takes in the records that have come, and whose page is `away`; returns moments for the log."""
         if self.over or self.judge.outcome is not None or not view.running:
             return []
         modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
@@ -155,12 +150,7 @@ class Stage:
         self._asked, self._step, self._phase = None, None, "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Takes in what has come of a session, and who is there; returns moments that the log is to mark.
-
-        Args:
-            view: of the session, or of none.
-            pages: the site and the number of every user's page.
-        """
+        """Takes in what has come, and site and number of each user's page; returns moments for the log."""
         now_ns, asked = self._clock.monotonic_ns(), self._asked
         self._holders = {site: min(n for at, n in pages if at == site) for site, _ in pages}
         self._seen_ns |= dict.fromkeys(self._holders, now_ns)
@@ -175,7 +165,7 @@ class Stage:
         away = [site for site in self.users if now_ns - self._seen_ns.get(site, now_ns) > AWAY_NS]
         return self._watch.poll(view, away)
 
-    def take(self, site: str, page: int, message: DoStep | AbortTrial) -> bool:
+    def take(self, site: str, page: int, message: StageMessage) -> bool:
         """Takes a message of a user's page, or of an experimenter's, ""; false: nobody asked for it."""
         if isinstance(message, AbortTrial):
             watch, who = self._watch, site or "the experimenter"
@@ -193,14 +183,7 @@ class Stage:
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Returns what a page shows: a user what it is asked, an experimenter who does what.
-
-        Args:
-            role: "experimenter", "user" or "watcher".
-            site: whose page it is; "" of nobody's.
-            page: its number.
-            t_s: the time of its arms, s; None without a session.
-        """
+        """Returns what a page shows, by role, site and number, at a time of its arms, s, if there are any."""
         step, asked, watch, protocol = self._step, self._asked, self._watch, self._plan.protocol
         found: Json = {"phase": self._phase, "title": protocol.title or protocol.name, "told": self._told}
         if step is None:
@@ -211,7 +194,9 @@ class Stage:
         found |= {
             "key": step.key,
             "users": [{"site": at, "who": names[at], "state": state} for at, state in states.items()],
-            "task": protocol.task.ask(find_slave(self._plan.scenarios[planned.condition]).site),
+            "task": protocol.task.asks.format(
+                slave=find_slave(self._plan.scenarios[planned.condition]).site, task=protocol.task
+            ),
             "trial": planned.trial,
             "trials": protocol.practice + protocol.trials,
             "block": planned.block,

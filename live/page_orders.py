@@ -101,11 +101,7 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
     """The session is to end, in order."""
 
 
-class StageMessage(PageMessage, frozen=True, kw_only=True):
-    """A message of somebody who takes part in an experiment."""
-
-
-class DoStep(StageMessage, frozen=True, kw_only=True, tag="step"):
+class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
     """A user has done what the stage asks for: has agreed, is ready, or has answered.
 
     Attributes:
@@ -117,13 +113,14 @@ class DoStep(StageMessage, frozen=True, kw_only=True, tag="step"):
     answers: Annotated[list[float], Meta(max_length=40)] = []
 
 
-class AbortTrial(StageMessage, frozen=True, kw_only=True, tag="abort"):
+class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
     """The trial that runs is to end, and to be made again later."""
 
     why: Annotated[str, Meta(max_length=200)] = ""
 
 
 Order = SetLink | SetShares
+StageMessage = DoStep | AbortTrial
 _DECODER = msgspec.json.Decoder(
     Seen
     | TakePart

@@ -40,9 +40,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 
 from .page_orders import (
     MAX_MESSAGE_BYTES,
-    AbortTrial,
     AnswerPage,
-    DoStep,
     EndSession,
     MarkMoment,
     MessageLimits,
@@ -54,6 +52,7 @@ from .page_orders import (
     SetLink,
     SetShares,
     ShowAges,
+    StageMessage,
     StopArms,
     TakePart,
     read_page_message,
@@ -491,7 +490,7 @@ class PageServer:
             self._ages = message.shown
         elif isinstance(message, MoveHand):
             self._move_hand(page, message)
-        elif isinstance(message, DoStep | AbortTrial):
+        elif isinstance(message, StageMessage):
             asked = self._stage is not None and self._stage.take(page.role.site, page.number, message)
             self.refused["was not asked"] += not asked
         elif isinstance(message, EndSession) and self._ends:

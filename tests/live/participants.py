@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from trilat_net.net.clock import SystemClock
 
@@ -56,7 +56,7 @@ LOOK = """(site) => {
   const box = own.canvas.getBoundingClientRect();
   if (!own.project) return found;
   const slave = frame.sites[shown.target.site].points.at(-1), held = own.hold ? own.hold.to : tip;
-  const aim = held.map((x, n) => x + 0.6 * (shown.target.at[n] - slave[n]));
+  const aim = held.map((x, n) => x + 0.35 * (shown.target.at[n] - slave[n]));
   const ratio = own.canvas.width / box.width;
   const px = (at) => { const [x, y] = own.project(at); return [box.left + x / ratio, box.top + y / ratio]; };
   return { ...found, tip: px(tip), aim: px(aim), held: Boolean(own.hold), graspable: own.graspable };
@@ -132,19 +132,21 @@ class Participant:
             mouse.move(*shown["aim"])
 
 
+def join(browser: Browser, running: Process, site: str) -> Participant:
+    """Opens the page of a user in a context of its own; small, so that drawing costs little."""
+    page = browser.new_context(viewport={"width": 640, "height": 480}).new_page()
+    page.goto(role_address(running, f"user {site}"))
+    return Participant(page, site)
+
+
 @contextmanager
-def participants(
-    running: Process, sites: Sequence[str] = ("m1", "m2"), **options: Any
-) -> Iterator[list[Participant]]:
+def participants(running: Process, sites: Sequence[str] = ("m1", "m2")) -> Iterator[list[Participant]]:
     with sync_playwright() as playwright:
         browser = launch(playwright, gl=False)
         try:
-            found, problems = [], list[str]()
-            for site in sites:
-                page = browser.new_context(viewport={"width": 640, "height": 480}, **options).new_page()
-                page.on("pageerror", lambda error: problems.append(str(error)))
-                page.goto(role_address(running, f"user {site}"))
-                found.append(Participant(page, site))
+            found, problems = [join(browser, running, site) for site in sites], list[str]()
+            for one in found:
+                one.page.on("pageerror", lambda error: problems.append(str(error)))
             yield found
             assert problems == []
         finally:

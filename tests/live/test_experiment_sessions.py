@@ -15,7 +15,7 @@ from trilat_net.studies.experiment.experiment_run import Experiment, open_experi
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .browsers import needs_browser, page_address, shows
-from .participants import FAR, Participant, begin, participants, take_part, write_protocol
+from .participants import FAR, Participant, begin, join, participants, take_part, write_protocol
 from .processes import Process, Stage
 
 pytestmark = needs_browser
@@ -31,8 +31,8 @@ def rows_of(folder: Path, name: str = "trials.csv") -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[float, float]:
-    """When the target appears and when the trial ends, found in the log's numbers alone."""
+def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[bool, float, float]:
+    """Whether it succeeded, when the target appears and when the trial ends, by the log's numbers alone."""
     planned = done.plan.trials[int(row["trial_number"]) - 1]
     scenario = done.plan.scenarios[planned.condition]
     goal = ExperimentTrial(done.plan.protocol, scenario, planned, done.plan.digest, whose="").make_goal()
@@ -44,7 +44,8 @@ def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[float, float]:
     left = np.concatenate([[-1], np.flatnonzero(~inside)])
     since = left[np.searchsorted(left, np.arange(len(inside)), side="right") - 1] + 1
     dwelt = inside & (part.t_s - part.t_s[np.minimum(since, len(inside) - 1)] >= task.dwell_s)  # type: ignore[union-attr]
-    return goal.appears_s, float(part.t_s[np.flatnonzero(dwelt)[0]])
+    late = part.t_s >= goal.appears_s + task.longest_s
+    return bool(dwelt.any()), goal.appears_s, float(part.t_s[np.flatnonzero(dwelt | late)[0]])
 
 
 def assert_log_table_and_page_agree(folder: Path, people: list[Participant], running: Process) -> None:
@@ -54,19 +55,21 @@ def assert_log_table_and_page_agree(folder: Path, people: list[Participant], run
     for n, row in enumerate(rows):
         log = open_log(folder / row["log"])
         assert verify(log).passed
-        appears_s, ended_s = judged_again(done, row)
-        assert float(row["completion_s"]) == ended_s - appears_s
+        succeeded, appears_s, ended_s = judged_again(done, row)
+        assert (row["succeeded"], float(row["completion_s"])) == (str(int(succeeded)), ended_s - appears_s)
         assert f"P1, P2, condition {row['condition']}" in log.scenario.about
         assert done.plan.digest in log.scenario.about
         marks = [event.text for event in log.events if event.kind == "mark"]
         number = row["trial_number"]
-        assert marks == [f"trial {number} begins", "target appears", f"trial {number} succeeded"]
+        how = "succeeded" if succeeded else "failed"
+        assert marks == [f"trial {number} begins", "target appears", f"trial {number} {how}"]
         assert log["m1"].hand[:, 0].max() > 0.5 < log["m2"].hand[:, 0].max()  # both took hold
         told = {
             "completion_s": f"{float(row['completion_s']):.2f} s",
             "error_end_mm": f"{float(row['error_end_mm']):.1f} mm",
         }
         assert all(one.told[n] == told for one in people), (n, people[0].told, told)
+    assert sum(row["succeeded"] == "1" for row in rows) > len(rows) // 2
     assert "Traceback" not in running.text()
 
 
@@ -77,7 +80,7 @@ def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) ->
     count = trials // (2 if conditions else 1)
     running = begin(stage, write_protocol(stage.folder, count, CONSENT, conditions), "--out", str(folder))
     with participants(running) as people:
-        take_part(people, running.ended, 30.0 * trials)
+        take_part(people, running.ended, 60.0 * trials)
         assert people[0].page.inner_text("#sheet h2") == "That was all. Thank you."
     assert running.code() == 0, running
     assert_log_table_and_page_agree(folder, people, running)
@@ -133,8 +136,9 @@ def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
         take_part(people, lambda: people[0].look().get("appeared"))
         people[1].page.context.close()
         running.prints("is to be made again: the page of m2 is gone")
-        with participants(running, ["m2"]) as again:
-            take_part([people[0], *again], running.ended)
+        browser = people[0].page.context.browser
+        assert browser is not None
+        take_part([people[0], join(browser, running, "m2")], running.ended)
     assert running.code() == 0, running
     events = [row["text"] for row in rows_of(folder, "events.csv") if row["event"] == "aborted"]
     assert events == ["m1 stopped it", "the page of m2 is gone"]

@@ -84,13 +84,13 @@ class Experiment(Result):
         self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
-    def open_trials(self, *, people: bool) -> RunJournal[TrialEntry]:
-        """Opens the journal of trials, to go on with people or with synthetic participants.
+    def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
+        """Opens the journal of trials, to read it or to go on with people or synthetic participants.
 
         Raises:
             UsageError: its trials are of the others.
         """
-        if any(entry.people != people for entry in self.read_entries().values()):
+        if people is not None and any(one.people != people for one in self.read_entries().values()):
             whose = "synthetic participants: go on without" if people else "people: go on with"
             raise UsageError(f"{self.folder}: its trials are of {whose} --live, or begin another experiment")
         return RunJournal(self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy)
@@ -101,7 +101,7 @@ class Experiment(Result):
 
     def read_entries(self) -> dict[int, TrialEntry]:
         """Returns the trials that are done, by number."""
-        with RunJournal(self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy) as journal:
+        with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
@@ -156,38 +156,27 @@ class Experiment(Result):
 
     def list_answers(self) -> list[dict[str, Any]]:
         """Returns a row for each item that somebody has answered."""
-        trials = {one.number: one for one in self.plan.trials}
         return [
-            {
-                "participant": note.who,
-                **self._name_block(trials[note.number]),
-                "questionnaire": note.text,
-                "item": item,
-                "value": value,
-                "unix_s": note.unix_s,
-            }
-            for note in self.read_notes()
+            {**row, "questionnaire": note.text, "item": item, "value": value, "unix_s": note.unix_s}
+            for row, note in self._list_answered()
             for item, value in note.answers.items()
         ]
 
     def list_scores(self) -> list[dict[str, Any]]:
         """Returns a row for each questionnaire that somebody has answered, with its score by its name."""
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
-        trials = {one.number: one for one in self.plan.trials}
         return [
-            {
-                self.unit: "-".join(trials[note.number].group),
-                "participant": note.who,
-                **self._name_block(trials[note.number]),
-                note.text: forms[note.text].score(note.answers),
-            }
-            for note in self.read_notes()
-            if note.answers
+            {**row, note.text: forms[note.text].score(note.answers)} for row, note in self._list_answered()
         ]
 
-    def _name_block(self, last: PlannedTrial) -> dict[str, Any]:
-        block = [one for one in self.plan.trials if (one.group, one.block) == (last.group, last.block)]
-        return {"condition": next(one.condition for one in block if not one.catch), "block": last.block}
+    def _list_answered(self) -> Iterator[tuple[dict[str, Any], Note]]:
+        """Yields whose answers of which block there are, and these."""
+        of = {(one.group, one.block): one.condition for one in self.plan.trials if not one.catch}
+        for note in self.read_notes():
+            last = self.plan.trials[note.number - 1]
+            row = {self.unit: "-".join(last.group), "participant": note.who}
+            if note.answers:
+                yield {**row, "condition": of[last.group, last.block], "block": last.block}, note
 
     def write_tables(self) -> Path:
         """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path.

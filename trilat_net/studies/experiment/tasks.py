@@ -22,14 +22,11 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     """A task, as a protocol has it; `begin` draws what is asked of one trial."""
 
     words: ClassVar[str] = ""
+    asks: ClassVar[str] = ""
 
     @property
     def longest_s(self) -> float:
         """When a trial ends at the latest, s."""
-        raise NotImplementedError
-
-    def ask(self, slave: str) -> str:
-        """Returns what a participant is told to do, in a sentence."""
         raise NotImplementedError
 
     def begin(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
@@ -97,6 +94,9 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     """
 
     words: ClassVar[str] = "reaching to a ring of targets"
+    asks: ClassVar[str] = (
+        "Bring the end effector of {slave} into the circle, and keep it there for {task.dwell_s:g} s."
+    )
 
     targets: Annotated[int, Meta(ge=2, le=36)] = 8
     distance_m: Metres = 0.2
@@ -108,10 +108,6 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     def longest_s(self) -> float:
         """The time-out, s."""
         return self.timeout_s
-
-    def ask(self, slave: str) -> str:
-        """See `TrialTask`."""
-        return f"Bring the end effector of {slave} into the circle, and keep it there for {self.dwell_s:g} s."
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
         """Returns the next target around the ring."""
@@ -150,6 +146,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     """
 
     words: ClassVar[str] = "tracking a path of sines"
+    asks: ClassVar[str] = "Keep the end effector of {slave} in the circle for {task.duration_s:g} s."
 
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     amplitude_m: Metres = 0.1
@@ -161,10 +158,6 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def longest_s(self) -> float:
         """Its duration, s."""
         return self.duration_s
-
-    def ask(self, slave: str) -> str:
-        """See `TrialTask`."""
-        return f"Keep the end effector of {slave} in the circle, which moves for {self.duration_s:g} s."
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - phases are of the seed
         """Returns the path, which begins at the start."""
