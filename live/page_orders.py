@@ -101,7 +101,26 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
     """The session is to end, in order."""
 
 
+class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
+    """A user has done what the stage asks for: has agreed, is ready, or has answered.
+
+    Attributes:
+        key: of the step, as the page was shown it.
+        answers: of a questionnaire, in the order of its items.
+    """
+
+    key: Name
+    answers: Annotated[list[float], Meta(max_length=40)] = []
+
+
+class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
+    """The trial that runs is to end, and to be made again later."""
+
+    why: Annotated[str, Meta(max_length=200)] = ""
+
+
 Order = SetLink | SetShares
+StageMessage = DoStep | AbortTrial
 _DECODER = msgspec.json.Decoder(
     Seen
     | TakePart
@@ -113,6 +132,8 @@ _DECODER = msgspec.json.Decoder(
     | MoveHand
     | MarkMoment
     | EndSession
+    | DoStep
+    | AbortTrial
 )
 _RATES: dict[type[PageMessage], tuple[float, int]] = {
     PageMessage: (240.0, 480),
@@ -121,6 +142,8 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
     TakePart: (1.0, 5),
     AnswerPage: (1.0, 5),
     StopArms: (5.0, 10),
+    DoStep: (2.0, 5),
+    AbortTrial: (1.0, 3),
 }
 """Messages of a kind, and of all, that a page may send on average, 1/s, and at once."""
 
@@ -157,6 +180,8 @@ def read_page_message(text: str | bytes) -> PageMessage:
         numbers = message.to
     elif isinstance(message, SetLink | SetShares):
         numbers = message.to.values()
+    elif isinstance(message, DoStep):
+        numbers = message.answers
     if not all(isinstance(number, str) or math.isfinite(number) for number in numbers):
         raise WireError("not finite", type(message).__name__)
     return message
@@ -200,14 +225,15 @@ class OrderDesk:
 
     Attributes:
         replies: the answers that nobody has read yet: site, channel of the order, if it is accepted, text.
+        refused: counts what is refused, and why.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+    def __init__(self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None) -> None:
         self._bus, self._clock, self._session = bus, clock, session
         self._waiting: dict[tuple[str, str], ChangeRequest] = {}
         self._open: dict[tuple[str, str], tuple[Inbox, int]] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter() if refused is None else refused
 
     def order(self, order: Order, sites: Collection[str], links: Collection[str]) -> None:
         """Takes an order, if the session has the site or the link; it replaces one that waits for that."""

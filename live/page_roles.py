@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 from urllib.parse import parse_qs
 
-from .page_orders import MoveHand, PageMessage, Seen, StopArms
+from .page_orders import MoveHand, PageMessage, Seen, StageMessage, StopArms
 
 TOKEN_BYTES = 16
 
@@ -33,7 +33,8 @@ class Role:
         """True if a message is one that this role may send."""
         if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
             return True
-        return self.kind == "user" and isinstance(message, MoveHand) and message.site == self.site
+        own = isinstance(message, MoveHand) and message.site == self.site
+        return self.kind == "user" and (own or isinstance(message, StageMessage))
 
     @property
     def query(self) -> str:

@@ -1,7 +1,8 @@
 """The page's server: its files and its socket, from one `websockets` server in a thread of its own.
 
 It is an onlooker of a session that is started for it, or of one that runs already: the session neither waits
-for it nor needs it, and runs on if it fails. A browser is opened only where there is one.
+for it nor needs it, and runs on if it fails. In an experiment it shows one session after the other, with a
+stage around them. A browser is opened only where there is one.
 
 Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
 page sees fewer frames and nobody waits for it. A page of another origin, without a token, with messages that
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -55,6 +56,7 @@ from .page_orders import (
     SetLink,
     SetShares,
     ShowAges,
+    StageMessage,
     StopArms,
     TakePart,
     read_page_message,
@@ -62,6 +64,9 @@ from .page_orders import (
 from .page_roles import Role, RoleLinks
 from .session_frames import SessionFrames, show_event
 from .session_view import SessionView
+
+if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
+    from .experiment_stage import Stage
 
 FRAMES_PER_S = 30
 FRAMES_AHEAD = 2
@@ -72,6 +77,7 @@ MOST_PAGES = 16
 ANSWER_NS = 10_000_000_000
 """A page that holds an arm may say for so long whether another one takes part."""
 RESTART_S = 1.0
+TURN_NS = 10_000_000
 WAITING_FRAMES = 10
 """Frames between two looks at who is there, before a session begins."""
 POINTS_PER_FRAME = 240
@@ -166,6 +172,7 @@ class Page:
         self.notified = 0
         self.unseen: deque[int] = deque()
         self.points = self.energies = self.events = 0
+        self.greeted = False
         self.limits, self.excess = MessageLimits(), 0
 
 
@@ -225,6 +232,7 @@ class PageServer:
         options: how it is served; at another address than this machine's links need their tokens.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
+        stage: what is asked of people between sessions and in them, in an experiment.
 
     Attributes:
         address: where a browser finds the page of an experimenter, token included.
@@ -241,25 +249,22 @@ class PageServer:
         *,
         ends: bool = False,
         say: Callable[[str], None] = lambda _: None,
+        stage: "Stage | None" = None,
     ) -> None:
-        self._bus, self._clock, self._ends, self._say = bus, clock, ends, say
+        self._clock, self._ends, self._say, self._stage = clock, ends, say, stage
         self._host, self._port, self._tls = options.host, options.port, options.make_context()
         self._scheme = "http" if self._tls is None else "https"
         self._met = 0
-        self.view = SessionView(bus, clock, session)
-        self._frames = SessionFrames(self.view)
-        self._desk = OrderDesk(bus, clock, session)
-        self.refused: Counter[str] = self._desk.refused
+        self._pages: set[Page] = set()
+        self.refused: Counter[str] = Counter()
+        self._next: tuple[Bus, str] | None = None
+        self._turn_to(bus, session)
         self._guarded = options.host not in LOOPBACK
         self._links, self._told = RoleLinks(guarded=self._guarded), False
         self._files = _list_assets()
-        self._pages: set[Page] = set()
-        self._frame: dict[str, Any] | None = None
-        self._known: dict[str, dict[str, Any]] = {}
         self._ages = True
         self.results: dict[str, Path] = {}
         self._n = 0
-        self._notices: list[dict[str, Any]] = []
         self.end_requested = threading.Event()
         self.address = ""
         self._ready = threading.Event()
@@ -282,6 +287,33 @@ class PageServer:
             with suppress(RuntimeError):  # its loop has ended already
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
+
+    def show(self, bus: Bus, session: str) -> None:
+        """Shows another session from now on; the bus of the one before is no longer used on return."""
+        self._next = bus, session
+        while self._next is not None and self._thread.is_alive():
+            self._clock.sleep_until(self._clock.monotonic_ns() + TURN_NS)
+
+    def _turn_over(self) -> None:
+        if self._next is not None:
+            try:
+                self._turn_to(*self._next)
+            finally:
+                self._next = None
+
+    def _turn_to(self, bus: Bus, session: str) -> None:
+        self._bus, self.view = bus, SessionView(bus, self._clock, session)
+        self._frames, self._desk = (
+            SessionFrames(self.view),
+            OrderDesk(bus, self._clock, session, self.refused),
+        )
+        self._frame: dict[str, Any] | None = None
+        self._known: dict[str, dict[str, Any]] = {}
+        self._notices: list[dict[str, Any]] = []
+        for page in self._pages:
+            page.hands = PageHands(bus, self._clock, session, f"page {page.number}")
+            page.points = page.energies = page.events = 0
+            page.greeted = False
 
     def _run(self) -> None:
         """Serves pages until the end, and again after whatever ended it."""
@@ -335,10 +367,13 @@ class PageServer:
 
     def _tell_links(self) -> None:
         """Tells the links of the other roles at the terminal, once the scenario is known."""
-        if self._told or self.view.scenario is None:
+        scenario = self.view.scenario
+        if self._told or (scenario is None and self._stage is None):
             return
         self._told = True
-        users = [name for name, spec in self.view.scenario.sites.items() if spec.role == "master"]
+        sites = {} if scenario is None else scenario.sites
+        users = [name for name, spec in sites.items() if spec.role == "master"]
+        users = users if self._stage is None else [*self._stage.users]
         for line in self._links.list_users(self._base, users):
             self._say(line)
 
@@ -346,7 +381,7 @@ class PageServer:
         """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
         while True:
             begun_ns = self._clock.monotonic_ns()
-            polls = self._desk.poll, self.view.poll
+            polls = self._desk.poll, self.view.poll, self._turn_over, self._poll_stage
             for step in (*polls, self._tell_links, self._settle_asked, self._make_frame):
                 try:
                     step()
@@ -356,6 +391,12 @@ class PageServer:
                 page.wake.set()
             spent_s = (self._clock.monotonic_ns() - begun_ns) * 1e-9
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
+
+    def _poll_stage(self) -> None:
+        if self._stage is not None:
+            users = [(page.role.site, page.number) for page in self._pages if page.role.kind == "user"]
+            for moment in self._stage.poll(self.view, users):
+                self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
         self._n += 1
@@ -472,6 +513,9 @@ class PageServer:
             self._ages = message.shown
         elif isinstance(message, MoveHand):
             self._move_hand(page, message)
+        elif isinstance(message, StageMessage):
+            asked = self._stage is not None and self._stage.take(page.role.site, page.number, message)
+            self.refused["was not asked"] += not asked
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
 
@@ -524,7 +568,6 @@ class PageServer:
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
         encode: Callable[[Any], bytes] = msgspec.json.encode
-        greeted = False
         with suppress(ConnectionClosed):
             while True:
                 await page.wake.wait()
@@ -540,17 +583,24 @@ class PageServer:
                 page.notified, page.sent = page.sent, self._n
                 page.unseen.append(page.sent)
                 try:
-                    payload = encode(self._frame_for(page) if greeted and begins else self._greet(page.role))
+                    payload = encode(self._frame_for(page) if page.greeted and begins else self._greet(page))
                 except Exception as error:
                     self._count_failure("frame", error)
                     continue
-                greeted = begins
+                page.greeted = begins
                 await page.connection.send(payload, text=True)
 
-    def _greet(self, role: Role) -> dict[str, Any]:
+    def _greet(self, page: Page) -> dict[str, Any]:
+        role = page.role
         about = self._frames.describe_narrowed() if role.site else self._frames.describe()
         ends = self._ends and role.kind == "experimenter"
-        return {"hello": {**about, "role": role.kind, "as": role.site, "n": self._n, "ends": ends}}
+        shown = {"role": role.kind, "as": role.site, "n": self._n, "ends": ends, **self._describe_stage(page)}
+        return {"hello": {**about, **shown}}
+
+    def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
+        if self._stage is None:
+            return {}
+        return {"stage": self._stage.describe(page.role.kind, page.role.site, page.number, t_s)}
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
         notices = [one for one in self._notices if one["n"] > page.notified]
@@ -571,6 +621,7 @@ class PageServer:
             "asked": [one.number for one in self._pages if one.asks is not None and page in one.asks[0]],
             "holds": self._list_held(page),
             "refused": sum(self.refused.values()),
+            **self._describe_stage(page, shown["t"]),
         }
 
     def _show_as(self, site: str) -> dict[str, Any]:
@@ -651,10 +702,17 @@ class PageAttendant:
 
 @contextmanager
 def serve_page(
-    bus: Bus, clock: Clock, session: str, options: PageOptions, say: Callable[[str], None], *, ends: bool
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    options: PageOptions,
+    say: Callable[[str], None],
+    *,
+    ends: bool,
+    stage: "Stage | None" = None,
 ) -> Iterator[PageServer]:
     """Serves a page inside the block, and opens a browser at it."""
-    with PageServer(bus, clock, session, options, ends=ends, say=say) as page:
+    with PageServer(bus, clock, session, options, ends=ends, say=say, stage=stage) as page:
         say(f"experimenter: {page.address}")
         with suppress(OSError, webbrowser.Error):
             if options.opens and _has_browser():

@@ -20,7 +20,6 @@ from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
 from trilat_net.net.messages import Event
-from trilat_net.reporting.appearance import order_palette
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
@@ -29,6 +28,8 @@ from .session_view import SessionView, SiteView, Tail
 POINTS_KEPT = 1200
 """Points of a plot that a new page gets: 40 s."""
 ENERGY_EVERY_S = 0.025
+COLOURS = 6
+"""Of sites, in `page.css`."""
 LONGEST_FRAME_S = 0.5
 """A frame looks at no more records than this, s."""
 _LEAST_SINGULAR_VALUE = 0.05
@@ -57,7 +58,7 @@ class ArmFrames:
 
     def describe(self) -> Json:
         """Returns what never changes."""
-        chain, places = self._model.chain, order_palette(self._scenario)
+        chain, places = self._model.chain, self._scenario.order_palette(COLOURS)
         start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[0]
         reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
         return {

@@ -36,6 +36,8 @@ from .site_parts import warm_up
 POLL_NS = 100_000_000
 START_S = 10
 """Time for a site to start, s, where many share a few processors."""
+WAIT_S = 600
+"""For so long sites wait for each other and for the recorder, s."""
 END_TIMEOUT_NS = 15 * NS_PER_S
 """Time for a child to end after its signal; then it is killed."""
 
@@ -95,11 +97,16 @@ the session; what it yields returns true once the session is to end."""
 
 
 def run_demo(
-    scenario: Scenario, folder: Path, console: Console, attend: SessionAttendant | None = None
+    scenario: Scenario,
+    folder: Path,
+    console: Console,
+    attend: SessionAttendant | None = None,
+    begins: Callable[[], bool] = lambda: True,
 ) -> SessionResult:
     """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
 
-    Its log is valid whenever the session began.
+    Its log is valid whenever the session began. Until `begins` returns true the sites wait for the recorder,
+    at most `WAIT_S`; so the session begins a second or two after that.
 
     Raises:
         ScenarioError: an arm outside of the program lacks limits.
@@ -108,9 +115,10 @@ def run_demo(
     result = SessionResult(folder / "run.mcap")
     session, clock = scenario.name, SystemClock()
     with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
-        _compile_core(scenario, display, interrupt)
+        compile_core(scenario, display.say, interrupt)
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
-        sites, recorder = _start(scenario, folder, session, endpoints)
+        sites, start_recorder = _start(scenario, folder, session, endpoints)
+        recorder: list[_Child] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
@@ -119,13 +127,15 @@ def run_demo(
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
-                while not (interrupt.requested() or is_enough() or _is_over([*sites, recorder], result)):
+                while not (interrupt.requested() or is_enough() or _is_over([*sites, *recorder], result)):
+                    if not recorder and begins():
+                        recorder.append(start_recorder())
                     monitor.poll()
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         finally:
             _end_all(sites, recorder, clock)
         result.interrupted = interrupt.number
-    for child in [*sites, recorder]:
+    for child in [*sites, *recorder]:
         problem = child.problem()
         if child.code() == LogRefused.exit_code:
             result.exit_code = LogRefused.exit_code
@@ -134,11 +144,12 @@ def run_demo(
     return result
 
 
-def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interrupt) -> None:
+def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
+    """Compiles what a scenario's arms need, if it may not be cached; a signal interrupts it."""
     layouts = {arm.counts: name for name, arm in scenario.arms.items()}
     chains = any(arm.chain is not None for arm in scenario.arms.values())
     if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
-        compiling_notice.say = display.say
+        compiling_notice.say = say
         with interrupt.raising():
             for name in layouts.values():
                 warm_up(scenario, name)
@@ -146,13 +157,13 @@ def _compile_core(scenario: Scenario, display: SessionDisplay, interrupt: Interr
 
 def _start(
     scenario: Scenario, folder: Path, session: str, endpoints: list[str]
-) -> tuple[list[_Child], _Child]:
+) -> tuple[list[_Child], Callable[[], _Child]]:
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
     file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     connect = [["--connect", endpoint] for endpoint in endpoints]
-    patience = ["--join-timeout", str(max(60, START_S * len(endpoints)))]
+    patience = ["--join-timeout", str(max(WAIT_S, START_S * len(endpoints)))]
     sites = [
         _Child(
             name,
@@ -171,7 +182,7 @@ def _start(
             words = ["hand", name, "--scenario", str(file), "--session", session]
             sites.append(_Child(f"hand-{name}", [*words, *connect[n], *patience], output))
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    return sites, _Child(topics.RECORDER, [*arguments, *patience, "--force"], output)
+    return sites, lambda: _Child(topics.RECORDER, [*arguments, *patience, "--force"], output)
 
 
 def _is_over(children: list[_Child], result: SessionResult) -> bool:
@@ -179,9 +190,9 @@ def _is_over(children: list[_Child], result: SessionResult) -> bool:
     return bool(result.problems) or all(child.code() == 0 for child in children)
 
 
-def _end_all(sites: list[_Child], recorder: _Child, clock: Clock) -> None:
+def _end_all(sites: list[_Child], recorder: list[_Child], clock: Clock) -> None:
     """Ends the sites, then the recorder, which by then has all their messages."""
-    for group in (sites, [recorder]):
+    for group in (sites, recorder):
         for child in group:
             child.end(signal.SIGINT)
         give_up_ns = clock.monotonic_ns() + END_TIMEOUT_NS

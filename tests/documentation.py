@@ -95,6 +95,9 @@ ELSEWHERE = {
     "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
     "docs/policies.md: trilat hand": "tests/live/test_own_hands.py",
     "docs/ros2.md: trilat": "tests/live/test_ros2.py",
+    "docs/two-people.md: trilat experiment new": "tests/cli/test_experiments.py",
+    "docs/two-people.md: trilat experiment run": "tests/live/test_experiment_sessions.py",
+    "docs/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
     "docs/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
     "docs/sweep.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
 }

@@ -72,6 +72,7 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 # --- settings ---------------------------------------------------------------------------------------------
 
 SCENARIO_OF = {
+    "docs/experiments.md": "paper",
     "docs/arms.md": "six_joints",
     "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
@@ -102,6 +103,11 @@ def test_settings_make_a_scenario(block: Block, tmp_path: Path, monkeypatch: pyt
         for line in text.splitlines():
             hands = tomllib.loads(line)
             assert tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
+        return
+    if block.page == "docs/experiments.md":
+        written = tn.new_experiment("p.toml").read_text(encoding="utf-8")
+        (tmp_path / "p.toml").write_text(written.replace("[set]", text + "[set]", 1), encoding="utf-8")
+        assert len(tn.check_experiment("p.toml").protocol.questionnaires) == 3
         return
     if text.startswith("name"):
         (tmp_path / "mine.toml").write_text(write_own_arm(tmp_path, text))

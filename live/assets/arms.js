@@ -125,7 +125,7 @@ class ArmCard {
     let needed = 0.56 * this.about.reach;
     const [cx, cy] = this.flat(view.centre);
     const room = 0.14 * this.about.reach; // for the ring at the end
-    for (const point of [...site.points, ...(this.about.task ? [] : site.ghost), ...this.facing(site)]) {
+    for (const point of [...site.points, ...(this.needs || []), ...(this.about.task ? [] : site.ghost), ...this.facing(site)]) {
       const [x, y] = this.flat(point);
       needed = Math.max(needed, 1.04 * Math.abs(y - cy) + room, (1.04 * Math.abs(x - cx) + room) / aspect);
     }
@@ -183,6 +183,7 @@ class ArmCard {
     const tip = site.points[site.points.length - 1];
     const at = this.project(tip);
     this.tip = at;
+    this.extra?.(g, ratio, tip); // of an experiment: its target
     g.lineJoin = "round";
     g.strokeStyle = siteColour(this.about);
     g.lineWidth = 1.5 * ratio;

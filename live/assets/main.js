@@ -5,6 +5,7 @@ import { Hands } from "./hands.js";
 import { Network, describeLink } from "./network.js";
 import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
+import { renew, Stage } from "./stage.js";
 import { Headset } from "./xr.js";
 
 const $ = (id) => document.getElementById(id);
@@ -25,6 +26,8 @@ export function send(message) {
 const FINGERS = matchMedia("(pointer: coarse)");
 const LATE_MS = 1000;
 const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages";
+const stage = new Stage(send); // of an experiment; without one it shows nothing
+
 let hidesAt = 0;
 let nextWords = 0;
 let heardAt = performance.now(); // when the newest message came
@@ -107,8 +110,15 @@ function begin(hello) {
   $("end").hidden = !hello.ends;
   for (const role of ["experimenter", "user", "watcher"]) document.body.classList.toggle(role, hello.role === role);
   document.body.classList.toggle("as", Boolean(hello.as));
+  document.body.classList.toggle("staged", Boolean(hello.stage)); // the stage says what to do
   $("whose").textContent = hello.as ? `as ${hello.as} knows it: its own arm now, the others as received` : "as it is, without delay";
   document.title = hello.running ? `${hello.name} – trilat live` : "trilat live";
+  stage.take(hello.stage, page, parts?.arms);
+  if (!hello.running && hello.stage) {
+    parts?.hands.letGo();
+    alarms({ sites: {} });
+    return state("between trials");
+  }
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
@@ -118,7 +128,8 @@ function begin(hello) {
   page.stops = Object.values(hello.sites).some((site) => site.stops);
   $("stop").dataset.tip = page.stops ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
   enable();
-  if (parts !== null) return;
+  if (parts !== null) return renew(parts, hello, page.sites);
+  page.sites = hello.sites;
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
   const hands = new Hands(arms, hello, send, page, stop);
@@ -159,6 +170,7 @@ function take(frame) {
   if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
   events(frame.events);
   parts.plots?.take(frame);
+  stage.take(frame.stage, page, parts.arms);
   $("ages").checked = frame.ages;
   if (performance.now() < nextWords) return;
   nextWords = performance.now() + WORDS_MS;
@@ -175,7 +187,7 @@ function take(frame) {
 let raised = "";
 // What nobody may overlook: of each arm that holds, is stopped or in fault the mode, why, and what to do.
 function alarms(frame) {
-  const list = parts.names.map((name) => [name, frame.sites[name].alarm]).filter(([, alarm]) => alarm);
+  const list = (parts?.names || []).map((name) => [name, frame.sites[name]?.alarm]).filter(([, alarm]) => alarm);
   const text = JSON.stringify(list);
   if (text !== raised) {
     raised = text;

@@ -133,6 +133,8 @@ export class Plots {
     this.now = frame.t;
   }
 
+  clear() { for (const { plot } of [...this.streams, { plot: this.energy }]) plot.data = plot.data.map(() => []); }
+
   draw() {
     const now = performance.now();
     if (now - this.drawn < EVERY_MS) return;

@@ -43,3 +43,21 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
     assert "the number of participants must be a multiple of 4, is 11" in " ".join(refused.err.split())
     assert "holds no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
     assert "reaching.toml: exists" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
+
+
+def test_protocol_of_two_people_runs_as_it_is_written(tmp_path: Path) -> None:
+    trilat("experiment", "new", "two-people.toml", "--pair", cwd=tmp_path).succeeds()
+    told = trilat("experiment", "check", "two-people.toml", cwd=tmp_path).succeeds()
+    assert "3 conditions of 1 + 10 trials: 33 trials" in told
+    file = tmp_path / "two-people.toml"
+    text = re.sub(r"\[conditions\.delay_\d00\]\n[^\[]*", "", file.read_text(encoding="utf-8"))
+    file.write_text(text.replace("trials = 10", "trials = 1"), encoding="utf-8")
+    told = trilat(
+        "experiment", "run", "two-people.toml", "--out", "models", "--jobs", "1", cwd=tmp_path
+    ).succeeds()
+    assert "two_people: 2 of 2 trials, in models" in told
+    refused = trilat("experiment", "run", "models", "--live", "--no-browser", cwd=tmp_path)
+    assert refused.code == 2
+    assert "its trials are of synthetic participants" in " ".join(refused.err.split())
+    refused = trilat("experiment", "run", "two-people.toml", "--live", "--host", "0.0.0.0", cwd=tmp_path)
+    assert "say --insecure" in " ".join(refused.err.split())

@@ -7,18 +7,22 @@ import typer
 
 from ..reporting import terminal_output as terminal
 from . import options
-from .options import value
+from .options import flag, value
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol (TOML).", metavar="FILE")]
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
-@options.command("reaching.toml")
-def experiment_new_command(file: ProtocolArgument, force: options.ForceOption = False) -> None:
+@options.command("reaching.toml", "two-people.toml --pair")
+def experiment_new_command(
+    file: ProtocolArgument,
+    pair: Annotated[bool, flag("--pair", "For two people, who hold a master each.")] = False,
+    force: options.ForceOption = False,
+) -> None:
     """Writes a protocol with comments, which runs as it is."""
     from ..studies.experiment.experiment_run import new_experiment
 
-    new_experiment(file, force=force)
+    new_experiment(file, pair=pair, force=force)
     terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
 
 
@@ -30,27 +34,46 @@ def experiment_check_command(file: ProtocolArgument, as_json: options.JsonOption
     terminal.print_result(check_experiment(file), as_json=as_json)
 
 
-@options.command("reaching.toml", "runs/experiment-reaching-001")
+@options.command("reaching.toml", "two-people.toml --live", "runs/experiment-reaching-001")
 def experiment_run_command(
     file: Annotated[Path, typer.Argument(help="A protocol, or the folder of one that goes on.")],
     out: Annotated[Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")] = None,
+    live: Annotated[bool, flag("--live", "With people, on pages in their browsers.")] = False,
+    *,
+    serving: options.PageServing,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs an experiment with synthetic participants, in virtual time: a verified log for each trial."""
+    """Runs an experiment: with synthetic participants in virtual time, or with people.
+
+    Each trial leaves a verified log. With --live it prints a link for the experimenter and one for each user;
+    trials begin once all users are ready on their pages. The page's button or Ctrl-C ends it for now.
+    """
+    from live.page_server import PageOptions
+
     from ..studies.experiment.experiment_run import begin_experiment, open_experiment
     from .studies import show_progress
 
+    page, code = PageOptions(*serving), 0
+    if live:
+        page.check()
     begun = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
     with terminal.lines_aside(as_json):
         terminal.print_text(
             f"{len(begun.plan.trials)} trials, into {begun.folder}; it goes on after Ctrl-C by"
         )
-        terminal.print_text(f"  trilat experiment run {begun.folder}")
-        with show_progress("trials", terminal.print_text) as show:
-            begun.run(jobs, show, on)
+        terminal.print_text(f"  trilat experiment run {begun.folder}{' --live' if live else ''}")
+        if live:
+            from live.experiment_sessions import run_with_people
+
+            code = run_with_people(begun, page, terminal.print_line)
+        else:
+            with show_progress("trials", terminal.print_text) as show:
+                begun.run(jobs, show, on)
     terminal.print_result(begun, as_json=as_json)
+    if code:
+        raise typer.Exit(code)
 
 
 @options.command("runs/experiment-reaching-001")

@@ -383,7 +383,19 @@ class RunOptions(NamedTuple):
         return load_chosen_scenario(source, self.overrides, lasts_s, self.seed)
 
 
-_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions)
+class PageServing(NamedTuple):
+    """The options of a command that serves a page."""
+
+    host: Annotated[
+        str, value("--host", "ADDRESS", "Address of the page; beyond loopback with --tls or --insecure.")
+    ] = "127.0.0.1"
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0
+    insecure: Annotated[bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")] = False
+    browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True
+    tls: Annotated[Path | None, value("--tls", "DIR", "Encrypt by a member's keys in this folder.")] = None
+
+
+_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
 
 
 def spread(run: Callable[..., Any]) -> Callable[..., Any]:

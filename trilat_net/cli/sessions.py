@@ -64,11 +64,7 @@ def live_command(
     session: Annotated[str | None, value("--session", "ID")] = None,
     *,
     reach: options.Reach,
-    host: Annotated[str, typer.Option("--host")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0,
-    tls: Annotated[Path | None, value("--tls", "DIR")] = None,
-    insecure: Annotated[bool, flag("--insecure")] = False,
-    browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True,
+    serving: options.PageServing,
     run: options.RunOptions,
 ) -> None:
     """Runs a scenario live, with a page on which to watch it and take hold of the arms.
@@ -78,15 +74,12 @@ def live_command(
 
     Options:
         session: Show this running session instead of starting one.
-        host: Address of the page; beyond loopback it has a token, and needs --tls or --insecure.
-        tls: Encrypt the page by the keys of a member in this folder (trilat keys new); headsets ask for it.
-        insecure: Allow --host beyond loopback, without encryption.
     """
     from live.page_server import LONGEST_S, PageAttendant, PageOptions, show_on_page
     from live.terminal_watch import watch_session
 
     clock, say = SystemClock(), terminal.print_line
-    page = PageOptions(host, port, insecure, browser, tls)
+    page = PageOptions(*serving)
     page.check()
     if session is not None:
         alone = {"--duration", "--out", "--seed", "--set", "--force", "--png", "--json", "scenario"}

@@ -220,6 +220,8 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)),
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
+_SLAVE = 2
+"""The slave's place in a palette of colours."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
 """A list of numbers, one a line."""
 
@@ -338,6 +340,15 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sha256(self) -> str:
         """The hash of the canonical text, which names the experiment."""
         return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def order_palette(self, colours: int) -> list[int]:
+        """Returns the places of a palette in the order of the sites; sites beyond them begin anew."""
+        free, order, roles = list(range(colours)), [], [site.role for site in self.sites.values()]
+        for n, role in enumerate(roles[:colours]):
+            kept = [place for place in free if place != _SLAVE or "slave" not in roles[n:]]
+            order.append(_SLAVE if role == "slave" and _SLAVE in free else kept[0])
+            free.remove(order[-1])
+        return [*order, *free]
 
     def ticks(self, site: str) -> int:
         """Returns the number of ticks of a site."""

@@ -11,6 +11,8 @@ import pytest
 import trilat_net as tn
 from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.protocol import Protocol, list_orders, plan_experiment, read_protocol
+from trilat_net.studies.experiment.questionnaires import Questionnaire, find_form
+from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"}]}
 
@@ -84,6 +86,16 @@ def test_digest_knows_what_was_planned() -> None:
         ({"users": ["m3"]}, "condition near: .*has no site m3; there are m1, m2, s"),
         ({"users": ["s"]}, "has no live hand, so nobody can hold it"),
         ({"participants": ["A", "A"]}, "two participants have one pseudonym"),
+        ({"force_limit_n": {"P9": 5.0}}, "force_limit_n: there is no participant P9"),
+        ({"force_limit_n": {"P1": 50.0}}, "condition near: .*50 N: the live hand at m1 has a limit of 40 N"),
+        ({"catch": {"condition": "nowhere"}}, "catch.condition: there is no condition nowhere"),
+        ({"questionnaires": [{"name": "tlx"}, {"name": "tlx"}]}, "two questionnaires have one name"),
+        ({"questionnaires": [{"name": "mine"}]}, "mine has no items; those that ship are tlx, sus, agency"),
+        ({"questionnaires": [{"name": "sus", "items": {"a": "A?"}}]}, "give your own another name"),
+        (
+            {"questionnaires": [{"name": "mine", "items": {"a": "A?"}, "most": 1}]},
+            "a scale has 2 to 101 numbers",
+        ),
         ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
         (
             {"conditions": {"a": {"link.delay_ms": -1}, "b": {"control.K": 1}}},
@@ -118,3 +130,52 @@ def test_template_is_a_protocol(tmp_path: Path) -> None:
     plan = tn.check_experiment(tn.new_experiment(tmp_path / "reaching.toml"))
     assert "12 participants at m1, reaching to a ring of targets" in plan.summary()
     assert plan.to_dict()["counted"] == 12 * 4 * 4
+
+
+def test_catch_trials_are_a_share_of_every_other_block() -> None:
+    plan = plan_experiment(make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2}))
+    of = {
+        (group, block): [one for one in plan.trials if (one.group, one.block) == (group, block)]
+        for group, block in {(one.group, one.block) for one in plan.trials}
+    }
+    for trials in of.values():
+        own = next(one.condition for one in trials if not one.catch)
+        caught = [one for one in trials if one.catch]
+        assert len(caught) == (0 if own == "near" else 2)
+        assert all(one.condition == "near" and not one.practice for one in caught)
+    assert len({one.trial for one in plan.trials if one.catch}) > 2  # drawn for every block
+    assert plan.list_orders()["P1"] == ["near", "far"]
+    assert plan.to_dict()["counted"] == 4 * (10 + 8)
+
+
+def test_participant_who_bears_less_has_a_weaker_hand() -> None:
+    protocol = make_protocol(force_limit_n={"P2": 7.0})
+    plan = plan_experiment(protocol)
+    for planned in plan.trials:
+        trial = ExperimentTrial(protocol, plan.scenarios[planned.condition], planned, plan.digest)
+        assert trial.scenario.sites["m1"].hands[0].force_limit_n == (
+            7.0 if planned.group == ("P2",) else 40.0
+        )
+
+
+def test_people_are_asked_around_their_trials() -> None:
+    asked = [{"name": "tlx"}, {"name": "sus", "after": "experiment"}]
+    plan = plan_experiment(make_protocol(trials=1, consent="Yes?", questionnaires=asked))
+    own = [step.key for step in plan.list_steps() if step.planned.group == ("P1",)]
+    assert own == [
+        "consent 1",
+        "trial 1",
+        "questionnaire 1 tlx",
+        "trial 2",
+        "questionnaire 2 tlx",
+        "questionnaire 2 sus",
+    ]
+    assert len(list(plan.list_steps())) == 4 * len(own)
+
+
+def test_shipped_questionnaires_have_their_published_scores() -> None:
+    forms = {name: find_form(Questionnaire(name=name)) for name in ("tlx", "sus", "agency")}
+    assert {name: len(form.items) for name, form in forms.items()} == {"tlx": 6, "sus": 10, "agency": 4}
+    assert forms["tlx"].score(forms["tlx"].read([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])) == 35.0
+    assert forms["sus"].score(forms["sus"].read([5.0, 1.0] * 5)) == 100.0
+    assert forms["agency"].score(forms["agency"].read([3.0, -3.0, 1.0, 1.0])) == 0.5

@@ -1,7 +1,7 @@
 """What an experiment found: means by condition, comparisons, a mixed model, figures, a methods paragraph.
 
-Invariant: it is a function of the journal. Practice does not count; a trial that failed does, with the time
-that it had. Every number of a figure or a sentence is in a table.
+Invariant: it is a function of the journals. Practice and catch trials do not count; a trial that failed does,
+with the time that it had. Every number of a figure or a sentence is in a table.
 """
 
 import csv
@@ -59,7 +59,7 @@ class ExperimentAnalysis(Result):
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
         self._experiment, self._exclude, protocol = experiment, exclude, experiment.plan.protocol
-        self.unit = "pair" if len(protocol.users) > 1 else "participant"
+        self.unit = experiment.unit
         order = list(protocol.conditions).index
         who = {"-".join(group) for group in protocol.groups}
         if unknown := sorted(exclude.keys() - who):
@@ -67,14 +67,17 @@ class ExperimentAnalysis(Result):
                 f"there is no {self.unit} {', '.join(unknown)}: there are {', '.join(sorted(who))}"
             )
         kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
-        counted = [row for row in kept if not row["practice"]]
+        counted = [row for row in kept if not (row["practice"] or row["catch"])]
         self.rows = sorted(counted, key=lambda row: order(row["condition"]))
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
         self.throughput_rows = list(self._find_throughput())
+        scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
+        self._scores = [row for row in scores if row[self.unit] not in exclude]
+        forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.means: dict[str, list[ConditionMean]] = {}
         self.comparisons: dict[str, list[Comparison]] = {}
-        for measure in MEASURES:
+        for measure in (*MEASURES, *forms):
             rows = self.of(measure)
             if len({row.get(measure) for row in rows}) > 1:
                 self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
@@ -83,7 +86,9 @@ class ExperimentAnalysis(Result):
 
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows that have a measure."""
-        return self.throughput_rows if measure.startswith("throughput") else self.rows
+        if measure.startswith("throughput"):
+            return self.throughput_rows
+        return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
         """Yields the throughput of each participant and condition, where the task is to reach."""

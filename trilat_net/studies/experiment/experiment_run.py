@@ -1,8 +1,8 @@
-"""Runs an experiment in its folder: a verified log for each trial, the journal, and tables in the end.
+"""An experiment in its folder: a verified log for each trial, journals, and tables in the end.
 
 Invariant: a folder belongs to one plan, by its digest. A trial in the journal is never made again, and
 one that was interrupted is made anew, whole: nothing is there twice and nothing is lost, wherever it was
-killed. The tables are a function of the journal.
+killed. The tables are a function of the journals. People and synthetic participants never share a folder.
 """
 
 import csv
@@ -24,12 +24,36 @@ from ...scenario import parse_scenario
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..study_folder import RunJournal, build_resume_hint
 from .protocol import ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
+from .questionnaires import find_form
 from .trial_run import TrialEntry, run_trial
 
-PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, TRIALS_FILE = (
-    "protocol.toml", "protocol.json", "trials.journal", "trials.csv",
+PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, NOTES_FILE, TRIALS_FILE = (
+    "protocol.toml", "protocol.json", "trials.journal", "notes.journal", "trials.csv",
 )  # fmt: skip
 LOGS = "logs"
+
+
+class Note(msgspec.Struct, frozen=True):
+    """What happened with people besides the trials that are done, in a journal of its own.
+
+    Attributes:
+        cell: what it is of, once: a step and a participant, or a trial that was aborted.
+        kind: "consent", "questionnaire" or "aborted".
+        who: the participant; of a trial all of them.
+        number: of the trial that it is, comes before, or comes after.
+        unix_s: when, by the machine's clock.
+        text: of a questionnaire its name; why a trial was aborted.
+        answers: by item.
+    """
+
+    cell: str
+    kind: str
+    who: str
+    number: int
+    unix_s: float
+    text: str = ""
+    answers: dict[str, float] = {}
+    seed: int = 0
 
 
 class ExperimentStatus(NamedTuple):
@@ -52,19 +76,40 @@ class Experiment(Result):
     Attributes:
         folder: where it is.
         plan: its protocol and trials.
+        unit: whose a row of its table is: "pair" or "participant".
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
         self.folder, self.plan = folder, plan
+        self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
-    def _open(self) -> RunJournal[TrialEntry]:
+    def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
+        """Opens the journal of trials, to read it or to go on with people or synthetic participants.
+
+        Raises:
+            UsageError: its trials are of the others.
+        """
+        if people is not None and any(one.people != people for one in self.read_entries().values()):
+            whose = "synthetic participants: go on without" if people else "people: go on with"
+            raise UsageError(f"{self.folder}: its trials are of {whose} --live, or begin another experiment")
         return RunJournal(self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy)
+
+    def open_notes(self) -> RunJournal[Note]:
+        """Opens the journal of consents, answers and aborted trials."""
+        return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
         """Returns the trials that are done, by number."""
-        with self._open() as journal:
+        with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
+
+    def read_notes(self) -> list[Note]:
+        """Returns what happened with people besides, in order."""
+        if not (self.folder / NOTES_FILE).exists():
+            return []
+        with self.open_notes() as journal:
+            return list(journal.done.values())
 
     def status(self) -> ExperimentStatus:
         """Returns how far it is."""
@@ -77,7 +122,7 @@ class Experiment(Result):
     ) -> "Experiment":
         """Makes the trials that are left, with synthetic participants, and writes the tables."""
         logs, plan = make_folder(self.folder / LOGS), self.plan
-        with self._open() as journal:
+        with self.open_trials(people=False) as journal:
             done = {entry.cell for entry in journal.done.values()}
             left = [one for one in plan.trials if one.number not in done]
             texts = {name: scenario.text for name, scenario in plan.scenarios.items()}
@@ -89,15 +134,17 @@ class Experiment(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each trial that is done, in the order of the plan."""
-        done, unit = self.read_entries(), "pair" if len(self.plan.protocol.users) > 1 else "participant"
+        done = self.read_entries()
         return [
             {
                 "trial_number": planned.number,
-                unit: "-".join(planned.group),
+                self.unit: "-".join(planned.group),
                 "condition": planned.condition,
                 "block": planned.block,
                 "trial": planned.trial,
                 "practice": int(planned.practice),
+                "catch": int(planned.catch),
+                "people": int(entry.people),
                 "succeeded": int(entry.succeeded),
                 **entry.measures,
                 "log": f"{LOGS}/{planned.file}",
@@ -107,14 +154,53 @@ class Experiment(Result):
             if (entry := done.get(planned.number)) is not None
         ]
 
+    def list_answers(self) -> list[dict[str, Any]]:
+        """Returns a row for each item that somebody has answered."""
+        return [
+            {**row, "questionnaire": note.text, "item": item, "value": value, "unix_s": note.unix_s}
+            for row, note in self._list_answered()
+            for item, value in note.answers.items()
+        ]
+
+    def list_scores(self) -> list[dict[str, Any]]:
+        """Returns a row for each questionnaire that somebody has answered, with its score by its name."""
+        forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
+        return [
+            {**row, note.text: forms[note.text].score(note.answers)} for row, note in self._list_answered()
+        ]
+
+    def _list_answered(self) -> Iterator[tuple[dict[str, Any], Note]]:
+        """Yields whose answers of which block there are, and these."""
+        of = {(one.group, one.block): one.condition for one in self.plan.trials if not one.catch}
+        for note in self.read_notes():
+            last = self.plan.trials[note.number - 1]
+            row = {self.unit: "-".join(last.group), "participant": note.who}
+            if note.answers:
+                yield {**row, "condition": of[last.group, last.block], "block": last.block}, note
+
     def write_tables(self) -> Path:
-        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path."""
-        rows, stream = self.to_rows(), io.StringIO()
-        if rows:
-            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        write_whole(self.folder / TRIALS_FILE, stream.getvalue(), force=True)
+        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path.
+
+        With people also questionnaires.csv, and events.csv: who agreed, and which trials were aborted.
+        """
+        happened = [
+            {
+                "unix_s": one.unix_s,
+                "event": one.kind,
+                "who": one.who,
+                "trial_number": one.number,
+                "text": one.text,
+            }
+            for one in self.read_notes()
+        ]
+        tables = {"questionnaires.csv": self.list_answers(), "events.csv": happened}
+        for name, rows in {TRIALS_FILE: self.to_rows(), **tables}.items():
+            if rows or name == TRIALS_FILE:
+                stream, heads = io.StringIO(), dict.fromkeys(key for row in rows for key in row)
+                writer = csv.DictWriter(stream, list(heads), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+                write_whole(self.folder / name, stream.getvalue(), force=True, remedy=self._remedy)
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
@@ -132,7 +218,7 @@ class Experiment(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text: a row for each condition."""
-        status, rows = self.status(), [row for row in self.to_rows() if not row["practice"]]
+        status, rows = self.status(), [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
         yield f"{self.plan.protocol.name}: {status.done} of {status.total} trials, in {self.folder}"
         table = []
         for condition in self.plan.protocol.conditions:
@@ -143,21 +229,31 @@ class Experiment(Result):
         yield TextTable(("condition", "trials", *_SHOWN), table, align="l" + "r" * (1 + len(_SHOWN)))
         if status.next is not None:
             yield f"next: trial {status.next.number}, {', '.join(status.next.group)}, {status.next.condition}"
+        yield from (
+            f"trial {note.number}, {note.who}, was aborted and is made again: {note.text}"
+            for note in self.read_notes()
+            if note.kind == "aborted"
+        )
 
 
 _SHOWN = ("succeeded", "completion_s", "error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
-def new_experiment(file: str | Path, *, force: bool = False) -> Path:
+def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
     """Writes a protocol with comments, which runs as it is; the command is `trilat experiment new`.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
 
+    Args:
+        file: where it is written.
+        pair: true: of two people who hold a master each; false: of one.
+        force: whether it may replace a file.
+
     Raises:
         UsageError: the file exists.
     """
-    template = resources.files("trilat_net") / "scenarios" / "_experiment.txt"
+    template = resources.files("trilat_net") / "scenarios" / f"_experiment{'_pair' if pair else ''}.txt"
     write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
     return Path(file)
 

@@ -16,12 +16,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 import numpy as np
 from msgspec import Meta, field
+from msgspec.structs import replace
 
 from ...errors import ScenarioError, TrilatError, UsageError
-from ...fields import Frozen
+from ...fields import Frozen, Positive
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
+from ...scenario.operators.kernel_operators import find_live_hand
+from .questionnaires import Questionnaire, find_form
 from .synthetic_participant import ParticipantModel
 from .tasks import AnyTask, ReachTrial
 
@@ -30,6 +33,19 @@ Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
 """It becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
+Feedback = Literal["completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m"]
+
+
+class CatchTrials(Frozen, frozen=True):
+    """Trials of another condition among those of a block, so that nobody learns what to expect of it.
+
+    Attributes:
+        condition: which.
+        share: of the trials of a block that count, rounded; blocks of that condition have none.
+    """
+
+    condition: Name
+    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.1
 
 
 class Protocol(Frozen, frozen=True):
@@ -50,6 +66,12 @@ class Protocol(Frozen, frozen=True):
         conditions: the keys of the scenario that each sets, by name.
         task: what a participant does.
         model: the numbers of synthetic participants.
+        consent: what people agree to before their first trial; "" asks for nothing.
+        questionnaires: what people answer, and when.
+        rest_s: how long people rest at least between two blocks, s.
+        feedback: the measures that people are told after a trial.
+        force_limit_n: largest force of the live hands of participants who bear less, N, by pseudonym.
+        catch: trials of another condition among those of a block; they do not count.
     """
 
     name: Name
@@ -66,6 +88,12 @@ class Protocol(Frozen, frozen=True):
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 1
     task: AnyTask = field(default_factory=ReachTrial)
     model: ParticipantModel = field(default_factory=ParticipantModel)
+    consent: Annotated[str, Meta(max_length=20_000)] = ""
+    questionnaires: tuple[Questionnaire, ...] = ()
+    rest_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
+    feedback: tuple[Feedback, ...] = ()
+    force_limit_n: dict[Pseudonym, Positive] = field(default_factory=dict)
+    catch: CatchTrials | None = None
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
@@ -91,6 +119,7 @@ class PlannedTrial(NamedTuple):
         target: the number of its target; each block begins at another, which is drawn, so that what the
             direction of a target does is no learning.
         seed: of what is drawn in it.
+        catch: whether its condition is another than the block's, and it does not count.
     """
 
     number: int
@@ -102,12 +131,32 @@ class PlannedTrial(NamedTuple):
     before: int
     target: int
     seed: int
+    catch: bool = False
 
     @property
     def file(self) -> str:
         """The name of its log."""
         who = "-".join(self.group)
         return f"{self.number:05d}-{who}-b{self.block}-t{self.trial:02d}-{self.condition}.mcap"
+
+
+class Step(NamedTuple):
+    """Something that people do in an experiment.
+
+    Attributes:
+        kind: "consent", "trial" or "questionnaire".
+        planned: the trial that it is, comes before, or comes after.
+        form: what is answered, of a questionnaire.
+    """
+
+    kind: Literal["consent", "trial", "questionnaire"]
+    planned: PlannedTrial
+    form: Questionnaire | None = None
+
+    @property
+    def key(self) -> str:
+        """What it is called in notes and messages."""
+        return f"{self.kind} {self.planned.number}" + (f" {self.form.name}" if self.form else "")
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,13 +176,28 @@ class ExperimentPlan(Result):
         """Returns it as `trilat experiment check --json`."""
         protocol = self.protocol
         facts = {"name": protocol.name, "digest": self.digest, "groups": len(protocol.groups)}
-        counts = {"trials": len(self.trials), "counted": sum(not one.practice for one in self.trials)}
+        counted = sum(not (one.practice or one.catch) for one in self.trials)
+        counts = {"trials": len(self.trials), "counted": counted}
         return {**facts, **counts, "conditions": list(protocol.conditions), "orders": self.list_orders()}
+
+    def list_steps(self) -> Iterator[Step]:
+        """Yields what people do, in order."""
+        forms = self.protocol.questionnaires
+        for before, planned, after in zip(
+            (None, *self.trials), self.trials, (*self.trials[1:], None), strict=False
+        ):
+            if self.protocol.consent and (before is None or before.group != planned.group):
+                yield Step("consent", planned)
+            yield Step("trial", planned)
+            left = after is None or after.group != planned.group
+            if left or (after is not None and after.block != planned.block):
+                asked = [form for form in forms if left or form.after == "block"]
+                yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
 
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order of conditions of each group, by its name."""
         found: dict[str, list[str]] = {}
-        for trial in self.trials:
+        for trial in (one for one in self.trials if not one.catch):
             order = found.setdefault("-".join(trial.group), [])
             if trial.condition not in order:
                 order.append(trial.condition)
@@ -205,6 +269,18 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         yield f"foreperiod_s is from the shorter to the longer time, not {list(protocol.foreperiod_s)}"
     if len(set(names)) < len(names):
         yield "two participants have one pseudonym"
+    if unknown := protocol.force_limit_n.keys() - set(names):
+        yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
+    if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
+        yield f"catch.condition: there is no condition {protocol.catch.condition}"
+    forms = [form.name for form in protocol.questionnaires]
+    if len(set(forms)) < len(forms):
+        yield "two questionnaires have one name"
+    for form in protocol.questionnaires:
+        try:
+            find_form(form)
+        except UsageError as error:
+            yield str(error)
     if not 1 <= size <= 2 or len(set(protocol.users)) < size:
         yield f"users are one or two sites, not {', '.join(protocol.users)}"
     elif len(names) % size:
@@ -228,7 +304,31 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
                 "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",
             )
+    for group in protocol.groups:
+        limit_forces(scenario, protocol, group)
     return scenario
+
+
+def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -> dict[str, Any]:
+    """Returns the users' sites whose live hand is to be weaker than the scenario's, by `force_limit_n`.
+
+    Raises:
+        ScenarioError: a hand has no such limit, or a lower one already.
+    """
+    found = {}
+    for user, name in zip(protocol.users, group, strict=False):  # an odd one out is refused by itself
+        spec, most = scenario.sites[user], protocol.force_limit_n.get(name)
+        hand = find_live_hand(spec.hands, is_open=True)
+        if most is None or hand is None:
+            continue
+        if hand.mode == "joint" or hand.force_limit_n < most:
+            has = "none, N" if hand.mode == "joint" else f"{hand.force_limit_n:g} N"
+            raise ScenarioError(
+                f"{most:g} N: the live hand at {user} has a limit of {has}", path=f"force_limit_n.{name}"
+            )
+        limited = tuple(replace(one, force_limit_n=most) if one is hand else one for one in spec.hands)
+        found[user] = replace(spec, hands=limited)
+    return found
 
 
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
@@ -260,8 +360,19 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
     for n, group in enumerate(protocol.groups):
         for block, trial in itertools.product(range(len(protocol.conditions)), range(each)):
             condition, number = orders[n % len(orders)][block], number + 1
+            caught = trial in _draw_catches(protocol, condition, (n, block))
             drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
             seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
             first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
             counts = block + 1, trial + 1, practice, block * each + trial, int(first) + trial
-            yield PlannedTrial(number, group, condition, *counts, seed)
+            shown = protocol.catch.condition if protocol.catch is not None and caught else condition
+            yield PlannedTrial(number, group, shown, *counts, seed, caught)
+
+
+def _draw_catches(protocol: Protocol, condition: str, block: tuple[int, int]) -> set[int]:
+    """Returns which trials of a block, from 0, are catch trials."""
+    catch = protocol.catch
+    if catch is None or catch.condition == condition:
+        return set()
+    random, count = np.random.default_rng([protocol.seed, *block, 1]), round(catch.share * protocol.trials)
+    return set((protocol.practice + random.permutation(protocol.trials)[:count]).tolist())

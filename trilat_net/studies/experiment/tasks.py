@@ -22,6 +22,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     """A task, as a protocol has it; `begin` draws what is asked of one trial."""
 
     words: ClassVar[str] = ""
+    asks: ClassVar[str] = ""
 
     @property
     def longest_s(self) -> float:
@@ -93,6 +94,9 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     """
 
     words: ClassVar[str] = "reaching to a ring of targets"
+    asks: ClassVar[str] = (
+        "Bring the end effector of {slave} into the circle, and keep it there for {task.dwell_s:g} s."
+    )
 
     targets: Annotated[int, Meta(ge=2, le=36)] = 8
     distance_m: Metres = 0.2
@@ -142,6 +146,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     """
 
     words: ClassVar[str] = "tracking a path of sines"
+    asks: ClassVar[str] = "Keep the end effector of {slave} in the circle for {task.duration_s:g} s."
 
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     amplitude_m: Metres = 0.1

@@ -1,11 +1,12 @@
-"""One trial with synthetic participants in virtual time: its log, and what is measured of it.
+"""One trial: its scenario, how it is judged record by record, what its log says; and synthetic participants.
 
-Invariant: a trial is run twice by the same numbers: compiled, to find when it ends, and into its log, which
-then lasts just that long. The log is executed again before its numbers count.
+Invariant: what counts is a function of the log, whoever took part. It is executed again, and judged by every
+record of the slave in it. A synthetic trial is run twice by the same numbers: compiled, to find when it ends,
+and into its log, which then lasts just that long.
 """
 
 import hashlib
-import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from ...scenario import Scenario, parse_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from ...scenario.operators.program_hand import HandPlayer, HandSite
 from .movement_measures import mean_force_n, movement_time_s, path_length_m, peak_force_n, sparc
-from .protocol import PlannedTrial, Protocol
+from .protocol import PlannedTrial, Protocol, limit_forces
 from .synthetic_participant import SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
@@ -53,6 +54,7 @@ class TrialEntry(msgspec.Struct, frozen=True):
         sha256: digest of its log.
         succeeded: whether its task was done.
         measures: by name, units in the names.
+        people: whether people made it, and no models of them.
     """
 
     cell: int
@@ -60,6 +62,7 @@ class TrialEntry(msgspec.Struct, frozen=True):
     sha256: str
     succeeded: bool
     measures: dict[str, float]
+    people: bool = False
 
 
 def find_slave(scenario: Scenario) -> Slave:
@@ -69,93 +72,110 @@ def find_slave(scenario: Scenario) -> Slave:
     return Slave(site, scenario.arms[site])
 
 
-class SyntheticTrial:
-    """A trial of synthetic participants.
+class TrialJudge:
+    """Judges a trial by the records of its slave, one after the other.
 
     Attributes:
-        outcome: how it ended, once it has run.
+        goal: what is asked.
+        outcome: how it ended; None: it goes on.
     """
 
-    def __init__(self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str) -> None:
-        self._protocol, self._planned, task = protocol, planned, protocol.task
-        self.slave = find_slave(scenario)
+    def __init__(self, goal: TrialGoal, arm: Any) -> None:
+        self.goal, self._arm = goal, arm
+        self.outcome: Outcome | None = None
+
+    def take(self, t_s: float, q: Sequence[float]) -> Outcome | None:
+        """Takes in the joints' coordinates at a time of the run; returns the outcome, once there is one."""
+        if self.outcome is None:
+            self.outcome = self.goal.judge(t_s, np.array(self._arm.end_effector(q), dtype=np.float64))
+        return self.outcome
+
+
+class ExperimentTrial:
+    """A trial of the plan, of people or synthetic participants.
+
+    Attributes:
+        planned: its place in the plan.
+        slave: the arm that it is about.
+        scenario: its own, which lasts as long as the trial may.
+        appears_s, longest_s: when its target appears, and when it has ended at the latest, s.
+    """
+
+    def __init__(
+        self,
+        protocol: Protocol,
+        scenario: Scenario,
+        planned: PlannedTrial,
+        digest: str,
+        whose: str = "synthetic ",
+    ) -> None:
+        self.protocol, self.planned = protocol, planned
+        self.slave, self.people = find_slave(scenario), not whose
         spec = scenario.sites[self.slave.site]
         self._start_m = np.array(self.slave.arm.end_effector(spec.q0_rad), dtype=np.float64)
-        about = f"trial {planned.number} of {protocol.name}: {', '.join(planned.group)}, condition "
+        about = f"trial {planned.number} of {protocol.name}: {whose}{', '.join(planned.group)}, condition "
         about += (
             f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
         )
         drawn_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
-        self._appears_s = round(float(drawn_s), 3)
-        self._longest_s = self._appears_s + task.longest_s + 1.0 / HAND_HZ
-        lasts = replace(scenario, duration_s=self._longest_s + REST_S, seed=planned.seed, about=about)
-        self._scenario, self.outcome = lasts, Outcome(False, self._longest_s)
+        self.appears_s = round(float(drawn_s), 3)
+        self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
+        lasts_s, sites = self.longest_s + REST_S, limit_forces(scenario, protocol, planned.group)
+        self.scenario = replace(
+            scenario, duration_s=lasts_s, seed=planned.seed, about=about, sites={**scenario.sites, **sites}
+        )
 
-    def _goal(self) -> TrialGoal:
-        planned = self._planned
-        goal = self._protocol.task.begin(self._start_m, planned.target, planned.seed)
-        goal.appears_s = self._appears_s
+    def begin(self) -> TrialJudge:
+        """Returns what judges it, from its first record on."""
+        return TrialJudge(self.make_goal(), self.slave.arm)
+
+    def make_goal(self) -> TrialGoal:
+        """Returns what is asked."""
+        planned = self.planned
+        goal = self.protocol.task.begin(self._start_m, planned.target, planned.seed)
+        goal.appears_s = self.appears_s
         return goal
 
-    def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        found = {}
-        for user, name in zip(self._protocol.users, self._planned.group, strict=True):
-            hand = find_live_hand(scenario.sites[user].hands, is_open=True)
-            assert hand is not None  # see `plan_experiment`
-            at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
-            own = int.from_bytes(hashlib.sha256(f"{self._protocol.seed}/{name}".encode()).digest()[:4], "big")
-            model, before = self._protocol.model.draw(own), self._planned.before
-            act = SyntheticParticipant(
-                at.describe(), model, self._goal(), self.slave, before, self._planned.seed
-            )
-            found[user] = HandPlayer(at, act)
-        return found
+    def settle(self, path: Path) -> TrialEntry:
+        """Executes its log again and returns what that says of the trial.
 
-    def find_end(self) -> Outcome:
-        """Runs the trial, compiled, until it ends."""
-        scenario, goal = self._scenario, self._goal()
-        run = FusedRun(scenario, keep=1, hands=self._make_players(scenario))
-        run.plan([scenario.ticks(name) for name in scenario.names])
-        place, joints = scenario.names.index(self.slave.site), self.slave.arm.counts.joints
-        for step in range(1, math.ceil(self._longest_s * HAND_HZ) + 1):
-            run.step_to(tick_ns(step, HAND_HZ) - 1)
-            q = run.arrays(place).site[0]["q"][:joints]
-            at_m = np.array(self.slave.arm.end_effector(q), dtype=np.float64)
-            ended = goal.judge(step / HAND_HZ, at_m)
-            if run.diverged_s is not None:
-                ended = Outcome(False, step / HAND_HZ)
-            if ended is not None:
-                self.outcome = ended
-                break
-        return self.outcome
+        Raises:
+            LogError: its records are not those of a run, or they end before the trial does.
+        """
+        log = open_log(path)
+        if not verify(log).passed:
+            raise LogError(f"{path}: its records are not those of the run")
+        if (outcome := self._judge(log)) is None:
+            raise LogError(f"{path}: ends before its trial does")
+        planned, digest = self.planned, hashlib.sha256(path.read_bytes()).hexdigest()
+        measures = self._measure(log, outcome)
+        return TrialEntry(planned.number, planned.seed, digest, outcome.succeeded, measures, self.people)
 
-    def write(self, path: Path) -> str:
-        """Runs the trial into its log; returns the digest of the file, SHA-256."""
-        lasts = replace(self._scenario, duration_s=self.outcome.ended_s + REST_S)
-        hands = {name: player.track for name, player in self._make_players(lasts).items()}
-        with LogFile(path, force=True) as stream:
-            write_virtual_log(lasts, stream, hands=hands)
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+    def _judge(self, log: Log) -> Outcome | None:
+        judge, part = self.begin(), log[self.slave.site]
+        for t_s, q in zip(part.t_s.tolist(), part.q.tolist(), strict=True):
+            if (outcome := judge.take(t_s, q)) is not None:
+                return outcome
+        return None if log.diverged_s is None else Outcome(False, log.diverged_s)
 
-    def measure(self, log: Log) -> dict[str, float]:
+    def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Returns the measures of a trial, units in the names."""
-        found, ended_s = self._measure_motion(log), self.outcome.ended_s
-        aligned = align_records(log)
-        for place, user in enumerate(self._protocol.users, 1):
-            force = _hand_force_n(aligned[user], log.scenario, ended_s)
-            which = f"_user{place}" if len(self._protocol.users) > 1 else ""
+        found, aligned = self._measure_motion(log, outcome.ended_s), align_records(log)
+        for place, user in enumerate(self.protocol.users, 1):
+            force = _hand_force_n(aligned[user], log.scenario, outcome.ended_s)
+            which = f"_user{place}" if len(self.protocol.users) > 1 else ""
             found |= {
                 f"force_mean{which}_n": mean_force_n(force),
                 f"force_peak{which}_n": peak_force_n(force),
             }
-        own = log[self._protocol.users[0]]
+        own = log[self.protocol.users[0]]
         used, rate_hz = own.used[self.slave.site], log.scenario.sites[self.slave.site].rate_hz
         age_ms = (own.t_ns - used * NS_PER_S // rate_hz)[used >= 0] / 1e6
         return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
 
-    def _measure_motion(self, log: Log) -> dict[str, float]:
+    def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns what the slave did from when the target appears until the trial ends."""
-        goal, part, ended_s = self._goal(), log[self.slave.site], self.outcome.ended_s
+        goal, part = self.make_goal(), log[self.slave.site]
         rows = np.flatnonzero((part.t_s >= goal.appears_s) & (part.t_s <= ended_s))[::EVERY]
         t_s, rate_hz = part.t_s[rows], part.rate_hz / EVERY
         places = np.array([self.slave.arm.end_effector(q) for q in part.q[rows]], dtype=np.float64)
@@ -180,6 +200,47 @@ class SyntheticTrial:
         }
 
 
+class SyntheticTrial(ExperimentTrial):
+    """A trial of synthetic participants."""
+
+    def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
+        found = {}
+        for user, name in zip(self.protocol.users, self.planned.group, strict=True):
+            hand = find_live_hand(scenario.sites[user].hands, is_open=True)
+            assert hand is not None  # see `plan_experiment`
+            at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
+            own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
+            model, before = self.protocol.model.draw(own), self.planned.before
+            act = SyntheticParticipant(
+                at.describe(), model, self.make_goal(), self.slave, before, self.planned.seed
+            )
+            found[user] = HandPlayer(at, act)
+        return found
+
+    def find_end_s(self) -> float:
+        """Runs the trial, compiled, until it ends; returns when that is, s."""
+        scenario, judge, site = self.scenario, self.begin(), self.slave.site
+        run = FusedRun(scenario, keep=1, hands=self._make_players(scenario))
+        run.plan([scenario.ticks(name) for name in scenario.names])
+        place, joints = scenario.names.index(site), self.slave.arm.counts.joints
+        rate_hz, t_s = scenario.sites[site].rate_hz, 0.0
+        for tick in range(1, scenario.ticks(site)):
+            t_s = tick_ns(tick, rate_hz) / NS_PER_S
+            run.step_to(tick_ns(tick, rate_hz) - 1)  # then it is what the record of this tick will have
+            q = run.arrays(place).site[0]["q"][:joints]
+            if run.diverged_s is not None or judge.take(t_s, q) is not None:
+                break
+        return t_s
+
+    def write(self, path: Path) -> TrialEntry:
+        """Runs the trial into its log, and returns what that says."""
+        lasts = replace(self.scenario, duration_s=self.find_end_s() + REST_S)
+        hands = {name: player.track for name, player in self._make_players(lasts).items()}
+        with LogFile(path, force=True) as stream:
+            write_virtual_log(lasts, stream, hands=hands)
+        return self.settle(path)
+
+
 def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Array:
     """Returns the force of a participant's hand ON its arm, shape (K, 2) or (K, 3), N."""
     split = split_torque(own, scenario)
@@ -189,17 +250,10 @@ def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Ar
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
-    """Runs a trial, by the text of its scenario; keeps its log, and executes that again.
+    """Runs a trial, by the text of its scenario, and keeps its log.
 
     Raises:
         LogError: the log is not that of its run.
     """
     protocol, text, planned, digest, folder = task
-    trial = SyntheticTrial(protocol, parse_scenario(text), planned, digest)
-    outcome = trial.find_end()
-    path = folder / planned.file
-    sha256 = trial.write(path)
-    log = open_log(path)
-    if not verify(log).passed:
-        raise LogError(f"{path}: its records are not those of the run")
-    return TrialEntry(planned.number, planned.seed, sha256, outcome.succeeded, trial.measure(log))
+    return SyntheticTrial(protocol, parse_scenario(text), planned, digest).write(folder / planned.file)

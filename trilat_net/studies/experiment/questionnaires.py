@@ -1,0 +1,92 @@
+"""Questionnaires that people answer on the page: the published ones that ship, and one's own.
+
+Invariant: an answer is a number of the form's scale, or it is refused.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import resources
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, field
+from msgspec.structs import replace
+
+from ...errors import UsageError
+from ...fields import Frozen
+from .movement_measures import raw_tlx, sus_score
+
+Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+Words = Annotated[str, Meta(max_length=300)]
+
+
+class Questionnaire(Frozen, frozen=True):
+    """A questionnaire, as a protocol has it; one that ships needs its name alone.
+
+    Attributes:
+        name: of a shipped one (`tlx`, `sus`, `agency`), or of one's own.
+        after: when it is answered: after each block, or once after the last one.
+        title: above it.
+        items: what is rated, by its name in the table.
+        low, high: the words at the ends of the scale.
+        ends: other words at the ends, by item.
+        least, most, step: the numbers of the scale.
+    """
+
+    name: Name
+    after: Literal["block", "experiment"] = "block"
+    title: Words = ""
+    items: Annotated[dict[Name, Words], Meta(max_length=40)] = field(default_factory=dict)
+    low: Words = ""
+    high: Words = ""
+    ends: dict[Name, tuple[Words, Words]] = field(default_factory=dict)
+    least: int = 1
+    most: int = 7
+    step: Annotated[int, Meta(ge=1)] = 1
+
+    def read(self, values: Sequence[float]) -> dict[str, float]:
+        """Returns answers by item, in the order of these.
+
+        Raises:
+            UsageError: an answer is missing, or is none of the scale.
+        """
+        scale = range(self.least, self.most + 1, self.step)
+        if len(values) != len(self.items) or any(value not in scale for value in values):
+            raise UsageError(f"{self.name}: {len(self.items)} answers of {self.least} to {self.most}")
+        return dict(zip(self.items, values, strict=True))
+
+    def score(self, answers: Mapping[str, float]) -> float:
+        """Returns one number: raw NASA-TLX, the score of SUS, else the mean."""
+        if self.name == "tlx":
+            return raw_tlx(answers)
+        if self.name == "sus":
+            return sus_score([int(value) for value in answers.values()])
+        return float(np.mean(list(answers.values())))
+
+
+@cache
+def _read_shipped() -> dict[str, Any]:
+    source = resources.files("trilat_net") / "scenarios" / "_questionnaires.txt"
+    tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
+    return tables
+
+
+def find_form(asked: Questionnaire) -> Questionnaire:
+    """Returns a questionnaire with its items.
+
+    Raises:
+        UsageError: it has none, and none of its name ships; or its scale has less than two numbers.
+    """
+    shipped = _read_shipped()
+    if asked.items and asked.name in shipped:
+        raise UsageError(f"questionnaire {asked.name} ships with its items: give your own another name")
+    if not asked.items and asked.name not in shipped:
+        raise UsageError(f"questionnaire {asked.name} has no items; those that ship are {', '.join(shipped)}")
+    if not asked.items:
+        form = msgspec.convert({"name": asked.name, **shipped[asked.name]}, Questionnaire)
+        return replace(form, after=asked.after)
+    if asked.most < asked.least + asked.step or asked.most - asked.least > 100 * asked.step:
+        raise UsageError(f"questionnaire {asked.name}: a scale has 2 to 101 numbers from least to most")
+    return asked
