@@ -162,18 +162,13 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        if (
-            not isinstance(event, Event)
-            or event.kind not in ("admit", LAST)
-            or event.about not in self._sites
-        ):
+        if not isinstance(event, Event) or event.about not in self._sites:
             return
         boot = event.boots.get(event.about)
-        if boot == self._boots.get(event.about):
-            if event.kind == LAST:
-                self._sites[event.about].hear_of_start_before(event.ticks)
-            return
-        if boot is None or event.kind == LAST:
+        is_known = boot == self._boots.get(event.about)
+        if event.kind == LAST and is_known:
+            self._sites[event.about].hear_of_start_before(event.ticks)
+        if event.kind != "admit" or boot is None or is_known:
             return
         if self._scenario.sites_may_return and len(self._confirmed) < STARTS_KEPT:
             self._confirmed.add(boot)

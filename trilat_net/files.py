@@ -6,6 +6,7 @@ installs it.
 """
 
 import errno
+import hashlib
 import itertools
 import os
 import shutil
@@ -18,9 +19,9 @@ from functools import partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from .errors import LogRefused, UsageError
+from .errors import LogError, LogRefused, TrilatError, UsageError
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
@@ -80,6 +81,26 @@ def open_regular(path: Path, **how: Any) -> Any:
         stream.close()
         raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
     return stream
+
+
+@contextmanager
+def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
+    """Yields a file opened for reading.
+
+    Raises:
+        TrilatError: of this kind, the file cannot be read.
+    """
+    try:
+        with open_regular(path) as stream:
+            yield stream
+    except OSError as error:
+        raise kind(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def digest_file(path: Path) -> str:
+    """Returns the SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def find_rights_of_others(path: Path) -> int:

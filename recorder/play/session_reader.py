@@ -16,7 +16,7 @@ import msgspec
 
 from trilat_net import process
 from trilat_net.errors import LogError, ScenarioError, UsageError
-from trilat_net.files import open_regular
+from trilat_net.files import reading
 from trilat_net.log.log_layout import (
     ALL_CHANNELS,
     SCENARIO,
@@ -192,12 +192,8 @@ class SessionReader:
             LogError: a file is missing, no log of trilat-net, or of another session than the first.
         """
         for path in self._paths:
-            try:
-                with open_regular(path) as stream:
-                    reader = McapReader(stream, str(path), self._progress, kept=False)
-                    yield from self._read_file(path, reader)
-            except OSError as error:
-                raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+            with reading(path) as stream:
+                yield from self._read_file(path, McapReader(stream, str(path), self._progress, kept=False))
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
         epoch_ns: int | None = None

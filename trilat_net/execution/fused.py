@@ -260,7 +260,7 @@ class FusedRun:
             if t_ns > last_ns:
                 break
             self._step_until(t_ns - 1)
-            take_change(select_site(self._tables, i, self._layouts[i]), change, t_ns)
+            take_change(self.arrays(i), change, t_ns)
             self._changes.popleft()
         if self.diverged_s is None:
             self._step_until(last_ns)
@@ -294,15 +294,10 @@ class FusedRun:
             return NEVER_NS
         if k < self._acted.get(i, 0):
             return tick_ns(self._acted[i], rate_hz)
-        arrays, size = self.arrays(i), (acts.shape[2] - 1) // 2
-        block = hand.take_until(k, int(progress["ticks"]), arrays)
-        until = k + len(block)
-        own = (block.shape[1] - 3) // 2
-        target, rate = block[:, 3 : 3 + own], block[:, 3 + own :]
-        acts[i, k:until, 0], acts[i, k:until, 1 : 1 + own] = block[:, 0], target
-        acts[i, k:until, 1 + size : 1 + size + own] = target + rate
-        self._acted[i] = until
-        return tick_ns(until, rate_hz)
+        block = hand.take_until(k, int(progress["ticks"]), self.arrays(i))
+        _write_actions(acts[i], k, block)
+        self._acted[i] = k + len(block)
+        return tick_ns(self._acted[i], rate_hz)
 
     def _step_piece(self, last_ns: int) -> None:
         rows = (self._progress, self._taken, self._sent, self._inputs.feed, self._peaks, self._sums)
@@ -325,7 +320,7 @@ class FusedRun:
         progress = self._progress
         while (t_ns := int(progress["t_ns"].min())) <= last_ns and t_ns != NEVER_NS:
             for i in np.flatnonzero(progress["t_ns"] == t_ns).tolist():
-                own = select_site(tables, i, self._layouts[i])
+                own = self.arrays(i)
                 sense_site(i, *asked, tables, own.chain)
                 if isinstance(law := self._laws.get(i), PlainLaw):
                     law.compute(int(progress[i]["tick"]), t_ns)
@@ -592,12 +587,16 @@ def _stack_hands(log: Log, ticks: int) -> tuple[Array, IntArray]:
     hands = np.zeros((len(setups), ticks, 1 + 2 * size))
     for i, name in enumerate(log.scenario.names):
         if rows[i] >= 0:
-            own, acted = (setups[i].layout.hand - 3) // 2, log[name].hand
-            target, rate = acted[:, 3 : 3 + own], acted[:, 3 + own :]
-            hands[i, : len(acted), 0] = acted[:, 0]
-            hands[i, : len(acted), 1 : 1 + own] = target
-            hands[i, : len(acted), 1 + size : 1 + size + own] = target + rate
+            _write_actions(hands[i], 0, log[name].hand)
     return hands, np.array(rows)
+
+
+def _write_actions(acts: Array, k: int, block: Array) -> None:
+    """Writes what a hand does from tick k on, a row as `HandInForce`, as a feed has it."""
+    own, size = (block.shape[1] - 3) // 2, (acts.shape[1] - 1) // 2
+    target, part = block[:, 3 : 3 + own], acts[k : k + len(block)]
+    part[:, 0], part[:, 1 : 1 + own] = block[:, 0], target
+    part[:, 1 + size : 1 + size + own] = target + block[:, 3 + own :]
 
 
 def _find_live_row(setup: SiteSetup) -> int:

@@ -8,7 +8,6 @@ network of the log. Without changes both give the log, bit for bit. Both sides o
 same instants: records of the log that the rerun executed too.
 """
 
-import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from ..core.fingerprint import compute_fingerprint
 from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
 from ..errors import LogError
+from ..files import digest_file
 from ..log.log_file import LogFile
 from ..log.log_layout import EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER
 from ..log.log_reader import Log, open_log
@@ -334,11 +334,8 @@ def rerun(
 
 def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
     """Returns the session metadata that name the source log and the changes."""
-    digests = {}
-    for path in map(Path, log.sources):
-        if path.is_file():  # a log in memory has none
-            with path.open("rb") as stream:
-                digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+    files = filter(Path.is_file, map(Path, log.sources))  # a log in memory has none
+    digests = {path: digest_file(path) for path in files}
     return {
         "rerun_mode": request.mode,
         "rerun_of": " ".join(path.name for path in digests),

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, Mode, TickInput, TickRecord
+from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickInput, TickRecord
 from ..errors import LogError, ScenarioError, UsageError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
 from ..net.messages import LinkStats
 from ..net.timing import LoopStats
 from ..net.wire import encode_state
@@ -240,7 +239,7 @@ class RerunTick(NamedTuple):
 class RerunSite:
     """One site, executed again against its deliveries.
 
-    Samples of executed peers appear in `inputs` as they are computed.
+    Samples of executed peers appear in `samples` as they are computed.
 
     Attributes:
         first: the first difference from the log's records.
@@ -251,22 +250,22 @@ class RerunSite:
 
     def __init__(
         self,
-        scenario: Scenario,
-        part: SiteLog,
+        log: Log,
+        request: RerunRequest,
+        name: str,
         deliveries: Deliveries,
-        inputs: RecordedInputs[CoreChange],
-        *,
-        changed: bool,
+        samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        self.name = part.name
+        self.name, scenario, part = name, request.scenario, log[name]
         self.k = deliveries.first
         self.first: RecordDifference | None = None
         self.lacking = 0
         self.diverged = False
-        setup = scenario.setup(part.name)
+        setup = scenario.setup(name)
         self._site, self._channel = Site(setup), setup.channel
-        self._part, self._deliveries, self._changed, self._inputs = part, deliveries, changed, inputs
-        self._last = min(deliveries.last, scenario.ticks(part.name) - 1)
+        self._part, self._deliveries, self._changed = part, deliveries, bool(request.changes)
+        self._inputs = RecordedInputs(part, samples, log.last_ticks, log.commands(name), setup.links)
+        self._last = min(deliveries.last, scenario.ticks(name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
         self._recorded: list[int] = part.tick.tolist() if same_rate else []
         self._places = {tick: n for n, tick in enumerate(self._recorded)}
@@ -363,20 +362,7 @@ class RerunExecution:
         samples |= self._recent  # filled as they are computed
         self.deliveries = {name: self._find_deliveries(name) for name in request.replaced}
         self.sites = {
-            name: RerunSite(
-                request.scenario,
-                log[name],
-                self.deliveries[name],
-                RecordedInputs(
-                    log[name],
-                    samples,
-                    log.last_ticks,
-                    log.commands(name),
-                    request.scenario.setup(name).links,
-                ),
-                changed=bool(request.changes),
-            )
-            for name in request.replaced
+            name: RerunSite(log, request, name, found, samples) for name, found in self.deliveries.items()
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:

@@ -304,13 +304,8 @@ class _TwinRuns:
 
     def _collect(self) -> Twins:
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
-        kept = zip(
-            self._pushes, self._largest, self._last, self._scales, self._pushed, self._died, strict=True
-        )
-        paths = [
-            TwinPath(push, t_s, largest, last, scale, tuple(pushed), died)
-            for push, largest, last, scale, pushed, died in kept
-        ]
+        kept = zip(self._largest, self._last, self._scales, map(tuple, self._pushed), self._died, strict=True)
+        paths = [TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)]
         return Twins(paths, self._joints, self._speed, self._same)
 
 

@@ -7,11 +7,11 @@ resumes after it from two consecutive records, and records that cannot be judged
 reported as differences.
 """
 
-import hashlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
+from itertools import chain, zip_longest
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from ..core.site_setup import StaleAction
 from ..core.site_step import Site
 from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput, TickRecord
 from ..errors import LawFailed, ScenarioError
+from ..files import digest_file
 from ..log.accounting import MIN_COVERAGE, Coverage
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
@@ -32,7 +33,7 @@ from ..log.running_digest import Integrity
 from ..log.session_check import judge_integrity
 from ..log.site_log import SiteLog
 from ..net.messages import STATE_VECTORS, State
-from ..scenario import Scenario, parse_core_change
+from ..scenario import parse_core_change
 from ..scenario.code_consent import find_user_laws
 from ..scenario.run_changes import count_skipped_ticks
 from .resumption import ArrivalEntry, RecordedInputs, read_output
@@ -75,14 +76,11 @@ def describe_law_failure(failed: LawFailed) -> RecordDifference:
     return RecordDifference(failed.site, failed.tick or 0, "record", "is there", failed.problem)
 
 
+_vectors_of = attrgetter(*STATE_VECTORS, "mem")
+
+
 def _pack(a: State | TickRecord) -> bytes:
-    return array(
-        "d",
-        [
-            *(*a.q, *a.qd, *a.q_des, *a.qd_des, *a.tau, *a.tau_x, *a.theta_hat),
-            *(*a.x, *a.xd, *a.wrench, *a.ch, *a.hand, *a.bodies),
-        ],
-    ).tobytes()
+    return array("d", chain.from_iterable(_vectors_of(a))).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
@@ -94,7 +92,6 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
         and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
         and a.mode == b.mode.name.lower()
         and a.cmd == b.cmd
-        and array("d", a.mem).tobytes() == array("d", b.mem).tobytes()
     )
 
 
@@ -218,33 +215,29 @@ class SiteVerifier:
 
     def __init__(
         self,
-        scenario: Scenario,
-        site_log: SiteLog,
-        changes: Mapping[int, Sequence[str]],
+        log: Log,
+        site: str,
         by_tick: Mapping[str, Mapping[int, State]],
-        ends: Mapping[str, int],
         result: VerifyResult,
-        starts: Sequence[tuple[int, int]] = (),
-        absences: Sequence[tuple[int, int]] = (),
         resume_every: int = 0,
     ) -> None:
         self._resume_every, self._first = resume_every, 0
         self._taken: list[CoreChange] = []
-        self._setup = setup = scenario.setup(site_log.name)
+        self._setup = setup = log.scenario.setup(site)
         self._site, self._channel = Site(setup), setup.channel
-        self._starts = {boot: first for first, boot in starts}
-        self._absences = {last + 1: first for first, last in absences}
+        self._starts = {boot: first for first, boot in log.starts.get(site, ())}
+        self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
         reflects = setup.own is not None or any(setup.gains.k_f)
         self._apart = setup.on_stale.action is StaleAction.GLIDE and not reflects
         self._boot: int | None = None
         self._began = 0  # the place of the first record of this start
-        self._scenario, self._log, self._result = scenario, site_log, result
-        self._external = site_log.name in scenario.external
+        self._scenario, self._log, self._result = log.scenario, log[site], result
+        self._external = site in log.scenario.external
         self._law_failed = False
-        self._own_end = ends[site_log.name]
+        self._own_end = log.last_ticks[site]
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
-        self._inputs = RecordedInputs(site_log, by_tick, ends, changes, setup.links)
+        self._inputs = RecordedInputs(log[site], by_tick, log.last_ticks, log.changes(site), setup.links)
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
@@ -433,9 +426,7 @@ def _execute_sites(
     for name in withheld:
         result.coverage.expected.pop(name, None)
     for name in (name for name in sites if name not in withheld):
-        read = (log.scenario, log[name], log.changes(name), by_tick, log.last_ticks, result)
-        own = (log.starts.get(name, ()), log.absences.get(name, ()))
-        SiteVerifier(*read, *own, resume_every).run(report)
+        SiteVerifier(log, name, by_tick, result, resume_every).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
@@ -454,9 +445,7 @@ def open_rerun_source(log: Log) -> Log | None:
     files = [Path(log.sources[0]).with_name(Path(name).name) for name in names]
     if not files or len(files) != len(digests) or not all(map(Path.is_file, files)):
         return None
-    for path, digest in zip(files, digests, strict=True):
-        with path.open("rb") as stream:
-            if hashlib.file_digest(stream, "sha256").hexdigest() != digest:
-                return None
+    if [*map(digest_file, files)] != digests:
+        return None
     source = open_log(*files)
     return source if source.sites == log.sites else None

@@ -17,9 +17,8 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawInput
 from ..core.vectors import Array
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
-from .conditions import LawSituation, StabilityCondition, judge_position_exchange
+from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition, judge_position_exchange
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
-from .linear_form import LinearForm, LinearSituation
 
 
 @compiled

@@ -1,23 +1,22 @@
 """Positions and forces both ways: the four-channel law, and its relatives of fewer channels.
 
-    tau_i = G + K (q_des - q_i) + B (qd_des - qd_i) + c_a M(q_i) qdd_des + c_p felt + c_o tau_h,i
-
 q_des, qd_des, qdd_des and felt are weighted by dominance; tau_h is the torque ON an arm. With two sites, in
-Lawrence's symbols, c_p is C2 of the master and C3 of the slave, c_o is C6 and C5.
+Lawrence's symbols, C2 and C6 are gains of the master, C3 and C5 of the slave.
 
 Invariant: the acceleration that is sent is that of the arm's model under the torques of its tick.
 """
 
 from typing import Any, ClassVar
 
+import numpy as np
+
 from ..core.compiled_law import compiled
 from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import Joints, NotNegative, NotNegativeJoints, PositiveJoints, Share
-from .conditions import LawSituation, StabilityCondition
+from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, ControlLaw
-from .linear_form import LinearForm, LinearSituation
 
 _LLEWELLYN = (
     "transparent without delay only; with delay no bound is known that holds for every operator and "
@@ -61,7 +60,7 @@ class FourChannel(ControlLaw):
     def begin(self, facts: LawContext) -> None:
         """Makes room for the arm's model."""
         self.needs_model = self.acceleration > 0.0
-        self.limit = spread_limit(facts)
+        self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))  # M and the torque that accelerates it
 
     def torque(self, now: LawInput) -> None:
@@ -117,9 +116,3 @@ class FourChannel(ControlLaw):
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)
         return StabilityCondition(None, _LLEWELLYN)
-
-
-def spread_limit(facts: LawContext) -> list[float]:
-    """Returns the largest torque of each joint, N m."""
-    limit = facts.tau_limit_nm
-    return [float(limit)] * facts.joints if isinstance(limit, float | int) else list(limit)

@@ -22,8 +22,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page
-from .conditions import LawSituation, StabilityCondition
-from .linear_form import LinearForm, LinearSituation
+from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .sent_vectors import SentVectorSpecs, convert_sends
 
 GainRange = tuple[float, float, str] | tuple[float, float, str, str]

@@ -1,7 +1,5 @@
 """P+d whose coupling torque saturates, towards each peer by itself.
 
-    tau_i = G - sum_j alpha_ij P tanh(K (q_i - q_j(t - T)) / P) - d qd_i
-
 Invariant: no peer pulls with more than alpha_ij P, whatever it does.
 """
 

@@ -20,9 +20,8 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
-from .conditions import LawSituation, StabilityCondition
+from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
-from .linear_form import LinearForm, LinearSituation
 
 
 @compiled

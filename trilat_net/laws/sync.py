@@ -1,8 +1,5 @@
 """Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
 
-    tau_i = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum_j alpha_ij r_j(t - T) - r_i)
-    theta_hat' = -Gamma Y' r_i
-
 r has the absolute pose in it. With gravity every equilibrium has Y_G' r = 0, so the arms end at q = 0.
 
 Invariant: the estimate advances by the trapezoid rule, as that of the adaptive law.

@@ -29,9 +29,8 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
-from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
+from .conditions import PASSIVE_OUTSIDE, LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
-from .linear_form import LinearForm, LinearSituation
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
 """How waves are played, by number. `hold` repeats the last wave; it is not passive, and for comparison."""

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from ..errors import LogError, UsageError
-from ..files import find_rights_of_others, open_regular, refuse_existing, write_whole
+from ..files import find_rights_of_others, open_regular, reading, refuse_existing, write_whole
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
@@ -160,12 +160,9 @@ def _signed_bytes(chain: Mapping[str, str]) -> bytes:
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    try:
-        with open_regular(path) as stream:
-            reader = McapReader(stream, str(path), progress, kept=False)
-            deque(reader.messages(), maxlen=0)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    with reading(path) as stream:
+        reader = McapReader(stream, str(path), progress, kept=False)
+        deque(reader.messages(), maxlen=0)
     integrity = reader.judge_digest()
     if integrity.state is DigestState.INTACT and not reader.complete:
         integrity = Integrity(DigestState.OPEN, "the end of the file is missing")
@@ -173,11 +170,8 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, wanted: str) -> Any:
-    try:
-        with open_regular(path) as stream:
-            data = stream.read(_MOST_BYTES)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    with reading(path, UsageError) as stream:
+        data = stream.read(_MOST_BYTES)
     key: object = None
     with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
         key = _LOADERS[kind](data)

@@ -105,16 +105,14 @@ class LogWriter:
         }
         channels: dict[str, int | None] = {}
         for member in (*scenario.names, topics.RECORDER):
-            for name in (
-                log_layout.SITE_CHANNELS if member != topics.RECORDER else log_layout.RECORDER_CHANNELS
-            ):
+            is_site = member != topics.RECORDER
+            for name in log_layout.SITE_CHANNELS if is_site else log_layout.RECORDER_CHANNELS:
                 key, about = topics.key(session, member, name), {"member": member}
                 if name == topics.STATE:
                     about["rate_hz"] = str(scenario.sites[member].rate_hz)
-                taken = choice.takes(key)
-                channels[key] = (
-                    self._file.register_channel(f"/{key}", "msgpack", schemas[name], about) if taken else None
-                )
+                channels[key] = None
+                if choice.takes(key):
+                    channels[key] = self._file.register_channel(f"/{key}", "msgpack", schemas[name], about)
         return channels
 
     @property

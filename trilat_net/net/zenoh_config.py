@@ -272,18 +272,16 @@ class _Role(NamedTuple):
     """The channels of a kind of member.
 
     Attributes:
-        publishes: under its own name.
-        answers: questions to its own name.
-        hears: of everybody.
+        hears, asks: of everybody.
+        publishes, answers: under its own name.
         hears_own: what is addressed to its own name.
-        asks: of everybody.
         addresses: publishes under everybody's name: what is addressed to them.
     """
 
-    publishes: tuple[str, ...]
-    answers: tuple[str, ...]
     hears: tuple[str, ...]
     asks: tuple[str, ...]
+    publishes: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()
     hears_own: tuple[str, ...] = ()
     addresses: tuple[str, ...] = ()
 
@@ -295,27 +293,24 @@ SITE_ROLE = _Role(
     asks=(topics.INFO, topics.PING, topics.STOP),
     hears_own=(topics.STATE, topics.MEASURED, topics.HAND, topics.ENABLE),
 )
-RECORDER_ROLE = _Role(
-    publishes=(topics.EVENT, topics.STATS),
-    answers=(topics.INFO, topics.PING),
-    hears=(topics.STATE, topics.LINK, topics.EVENT),
-    asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
-)
-OPERATOR_ROLE = _Role(
-    publishes=(),
-    answers=(),
-    hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS, topics.VIEW),
-    asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
-    addresses=(topics.HAND, topics.ENABLE),
-)
-BRIDGE_ROLE = _Role(
-    publishes=(),
-    answers=(),
-    hears=(topics.STATE, topics.EVENT),
-    asks=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
-    addresses=(topics.HAND, topics.MEASURED),
-)
-ROLES = {RECORDER: RECORDER_ROLE, OPERATOR: OPERATOR_ROLE, BRIDGE: BRIDGE_ROLE}
+ROLES = {
+    RECORDER: _Role(
+        publishes=(topics.EVENT, topics.STATS),
+        answers=(topics.INFO, topics.PING),
+        hears=(topics.STATE, topics.LINK, topics.EVENT),
+        asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
+    ),
+    OPERATOR: _Role(
+        hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS, topics.VIEW),
+        asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
+        addresses=(topics.HAND, topics.ENABLE),
+    ),
+    BRIDGE: _Role(
+        hears=(topics.STATE, topics.EVENT),
+        asks=(topics.INFO, topics.PAST, topics.SET, topics.STOP),
+        addresses=(topics.HAND, topics.MEASURED),
+    ),
+}
 """Of members that are no sites."""
 
 

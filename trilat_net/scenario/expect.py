@@ -78,7 +78,8 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
                 yield key, limits
 
 
-_QUANTITIES = tuple(key for key in field_names(ExpectWindow) if key not in _WHERE)
+_WINDOW_KEYS = field_names(ExpectWindow)
+_QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in _WHERE)
 _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
@@ -91,7 +92,11 @@ def window_quantities(joints: int) -> tuple[str, ...]:
 def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
     """Returns the windows of a file with keys that name joints, as q_elbow_rad, written by their numbers.
 
-    `joint_names` has the names of the joints of each site's arm, in their order. What is no window stays.
+    `joint_names` has the names of the joints of each site's arm, in their order. What is no list of tables is
+    refused later.
+
+    Raises:
+        ScenarioError: a window has no such key, or has one twice.
     """
     if not isinstance(written, list):
         return written
@@ -105,7 +110,8 @@ def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]
             if known in numbered or (known != key and known in table):
                 raise ScenarioError(f"is {known} once more", path=f"expect.windows[{n}].{key}")
             numbered[known] = value
-        windows.append(numbered if isinstance(table, dict) else table)
+        window = numbered if isinstance(table, dict) else table
+        windows.append(check_keys(window, _WINDOW_KEYS, f"expect.windows[{n}]"))
     return windows
 
 
@@ -114,12 +120,6 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
         if key.startswith(f"{kind}_") and key.endswith(ending):
             return kind, ending, key.removeprefix(f"{kind}_").removesuffix(ending)
     return "", "", ""
-
-
-def check_window_keys(written: Any) -> None:
-    """Refuses keys that a window does not have; what is no list of tables is refused later."""
-    for n, table in enumerate(written if isinstance(written, list) else []):
-        check_keys(table, field_names(ExpectWindow), f"expect.windows[{n}]")
 
 
 def find_window_problem(window: ExpectWindow, sites: Mapping[str, int]) -> KeyProblem | None:

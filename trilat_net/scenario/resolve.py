@@ -40,7 +40,7 @@ from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_ar
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
 from .distributions import Draws
-from .expect import Expect, check_window_keys, number_window_joints
+from .expect import Expect, number_window_joints
 from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
@@ -112,7 +112,6 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     if "windows" in expect:
         joints = {name: _name_joints(site["arm"], urdf) for name, site in sites.items()}
         expect["windows"] = number_window_joints(expect["windows"], joints)
-        check_window_keys(expect["windows"])
     written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
     for name in sites:
         if name not in written:

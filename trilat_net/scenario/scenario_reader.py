@@ -7,7 +7,6 @@ what it has.
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,14 +18,12 @@ from ..files import open_regular
 from .code_consent import allow_own_code
 from .imported_code import name_law_classes
 from .override import apply_overrides, expand_overrides, parse_overrides, split_entries
-from .resolve import resolve_scenario
+from .resolve import SHIPPED_FOLDER, resolve_scenario
 from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
 
 MAX_KEY_PARTS = 32
 """Parts of a key, as in sites.m1.arm; a scenario needs four."""
-
-_FOLDER = resources.files("trilat_net") / "scenarios"
 
 
 def list_shipped() -> list[str]:
@@ -35,19 +32,19 @@ def list_shipped() -> list[str]:
     >>> "paper" in tn.list_shipped()
     True
     """
-    names = (entry.name for entry in _FOLDER.iterdir())
+    names = (entry.name for entry in SHIPPED_FOLDER.iterdir())
     return sorted(n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_"))
 
 
 def read_shipped(name: str) -> str:
     """Returns the TOML text of a shipped scenario, of one that is not listed too: its name begins with _."""
-    if name not in list_shipped() and not (len(name) < 80 and (_FOLDER / f"{name}.toml").is_file()):
+    if name not in list_shipped() and not (len(name) < 80 and (SHIPPED_FOLDER / f"{name}.toml").is_file()):
         raise ScenarioError(
             f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
             f"shipped are {', '.join(list_shipped())}; a file is named by its path, as in ./mine.toml",
             source=name,
         )
-    return (_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    return (SHIPPED_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
 
 
 def read_template() -> str:
@@ -56,7 +53,7 @@ def read_template() -> str:
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
     """
-    return (_FOLDER / "_template.toml").read_text(encoding="utf-8")
+    return (SHIPPED_FOLDER / "_template.toml").read_text(encoding="utf-8")
 
 
 def load_scenario(

@@ -28,7 +28,7 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel
-from .arms import Arm, ArmModel, Task, build_arm
+from .arms import Arm, ArmModel, Task, add_credible_box, build_arm, find_rest_gains
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
@@ -36,7 +36,6 @@ from .laws import ChosenLaw
 from .operators import Environment, Operator
 from .operators.kernel_operators import find_live_hand
 from .own_plant import OwnPlant
-from .resting_arm import add_credible_box, find_rest_gains
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):

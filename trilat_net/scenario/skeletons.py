@@ -6,14 +6,12 @@ is written runs as it is, and its test passes.
 
 import keyword
 import re
-from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
 
 from ..errors import UsageError
 from ..files import refuse_existing, write_whole
-
-_FOLDER = resources.files("trilat_net") / "scenarios"
+from .resolve import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
@@ -62,7 +60,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     if known is not None and not (known.origin and file.exists() and file.samefile(known.origin)):
         raise UsageError(f"{file}: Python has a module {module} already; choose another name")
     for one, template in files.items():
-        text = (_FOLDER / template).read_text(encoding="utf-8")
+        text = (SHIPPED_FOLDER / template).read_text(encoding="utf-8")
         named = text.replace(f"My{kind.title()}", name_skeleton_class(module, kind))
         write_whole(one, named.replace(f"my{kind}", module), force=force)
     return list(files)

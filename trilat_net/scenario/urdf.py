@@ -169,8 +169,8 @@ def read_urdf(text: str, base: str = "", tip: str = "", payload: UrdfPayload | N
     """
     root = _parse_xml(text)
     robot = _read_tree(root)
-    base = _find_base(robot, base)
-    tip = _find_tip(robot, base, tip)
+    base = _check_end(robot, "base", base) or _find_base(robot)
+    tip = _check_end(robot, "tip", tip) or _find_tip(robot, base)
     path = _find_path(robot, base, tip)
     joints: list[UrdfJoint] = []
     notes: list[str] = []
@@ -293,11 +293,13 @@ def _walk(robot: _Robot, top: str) -> Iterator[tuple[str, bool]]:
 # The chain
 
 
-def _find_base(robot: _Robot, base: str) -> str:
-    if base:
-        if base not in robot.links:
-            _refuse("base", f"there is no {_link(base)}{suggest_nearest(base, list(robot.links))}")
-        return base
+def _check_end(robot: _Robot, end: str, link: str) -> str:
+    if link and link not in robot.links:
+        _refuse(end, f"there is no {_link(link)}{suggest_nearest(link, list(robot.links))}")
+    return link
+
+
+def _find_base(robot: _Robot) -> str:
     roots = [name for name in robot.links if name not in robot.above]
     if len(roots) > 1:
         _refuse(
@@ -307,11 +309,7 @@ def _find_base(robot: _Robot, base: str) -> str:
     return roots[0]
 
 
-def _find_tip(robot: _Robot, base: str, tip: str) -> str:
-    if tip:
-        if tip not in robot.links:
-            _refuse("tip", f"there is no {_link(tip)}{suggest_nearest(tip, list(robot.links))}")
-        return tip
+def _find_tip(robot: _Robot, base: str) -> str:
     leaves = [name for name, moved in _walk(robot, base) if moved and not robot.below[name]]
     if not leaves:
         _refuse(_link(base), "no joint below it moves")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
 from ..core.vectors import Array
-from ..laws.linear_form import LinearForm, Place
+from ..laws.conditions import LinearForm, Place
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions

@@ -23,7 +23,7 @@ from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..files import find_page
-from ..laws.linear_form import LinearForm, LinearSituation
+from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.imported_code import ImportedLaw

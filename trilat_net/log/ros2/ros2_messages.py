@@ -17,8 +17,7 @@ from mcap.reader import make_reader
 
 from ...core.task_space import PLACE
 from ...core.ticks import Mode, TickRecord
-from ...errors import LogError
-from ...files import open_regular
+from ...files import reading
 from ...net.messages import Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
@@ -61,12 +60,7 @@ _LEVELS = {
     "refused": cdr.RosLogLevel.WARN,
     "clock fault": cdr.RosLogLevel.WARN,
 }
-_MODES = {mode.name.lower(): float(mode) for mode in Mode}
-
-
-def mode_number(mode: str | Mode) -> float:
-    """Returns the number of a mode of `core.ticks.Mode`; 0 for none of them."""
-    return float(mode) if isinstance(mode, Mode) else _MODES.get(mode, 0.0)
+_MODES = {name: float(mode) for mode in Mode for name in (mode, mode.name.lower())}
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
@@ -208,11 +202,7 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
     Raises:
         LogError: the file cannot be opened.
     """
-    try:
-        stream = open_regular(path)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
-    with stream:
+    with reading(path) as stream:
         try:
             summary = make_reader(stream).get_summary()
         except (McapError, EOFError, OSError, struct.error, ValueError, OverflowError):
@@ -251,4 +241,4 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]
-    return [*columns[: 4 * n], *error, *columns[4 * n :], [mode_number(mode) for mode in modes]]
+    return [*columns[: 4 * n], *error, *columns[4 * n :], [_MODES.get(mode, 0.0) for mode in modes]]
