@@ -44,7 +44,7 @@ trilat.pressed = performance.timeOrigin + event.timeStamp; }, true)"""
 
 
 def run() -> list[str]:
-    """Returns the figures of stops of one session of `play`, three sites at 1 kHz and a recorder."""
+    """Returns the figures of stops of sessions of `play`, three sites and a recorder."""
     with tempfile.TemporaryDirectory() as folder, mock.patch.dict(PLAIN, XDG_STATE_HOME=folder):
         stage = Stage(Path(folder))
         try:
