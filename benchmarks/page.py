@@ -55,9 +55,9 @@ def run() -> list[str]:
 
 
 @contextmanager
-def live_session(folder: Path) -> Iterator[tuple[str, int]]:
+def live_session(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
     """A session of `play` with a page: its address and its process; its log is whole at the end."""
-    options = ["--no-browser", "--force", "--out", str(folder)]
+    options = ("--no-browser", "--force", "--out", str(folder), *options)
     command = [sys.executable, "-m", "trilat_net", "live", "play", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None

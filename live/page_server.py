@@ -328,6 +328,11 @@ class PageServer:
                     self._ending.wait(RESTART_S)
             self._ready.set()
 
+    def tell_refused(self) -> None:
+        """Tells the people at the terminal what was refused."""
+        for reason, count in sorted((+self.refused).items()):
+            self._say(f"the page refused {count} messages or requests: {reason}")
+
     def _count_failure(self, of: str, error: Exception) -> None:
         """Counts a failure, and says it the first time: no failure of the page is one of the session."""
         reason = f"{of} failed: {type(error).__name__}"
@@ -560,11 +565,6 @@ class PageServer:
             return
         page.hands.move(order, pushes=site.hand.mode == "force")
 
-    def tell_refused(self) -> None:
-        """Says at the terminal what was refused, and how often."""
-        for reason, count in sorted((+self.refused).items()):
-            self._say(f"the page refused {count} messages or requests: {reason}")
-
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
         encode: Callable[[Any], bytes] = msgspec.json.encode
@@ -660,38 +660,32 @@ def _send_file(kind: str, content: bytes, policy: str, cache: str) -> Response:
     return Response(HTTPStatus.OK, "OK", Headers(headers), content)
 
 
-class PageAttendant:
+class PageAttendant(ExitStack):
     """The page of a session that is run here; a context, as the page outlives the session for its report."""
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
-        self._options, self._clock, self._open = options, clock, ExitStack()
+        super().__init__()
+        self._options, self._clock = options, clock
         self._page: PageServer | None = None
-
-    def __enter__(self) -> "PageAttendant":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
 
     @contextmanager
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
         """The `SessionAttendant` that serves the page, until that asks for the end of the session."""
-        bus = self._open.enter_context(closing(ZenohBus([], endpoints)))
+        bus = self.enter_context(closing(ZenohBus([], endpoints)))
         serving = serve_page(bus, self._clock, session, self._options, say, ends=True)
-        self._page = page = self._open.enter_context(serving)
-        yield page.end_requested.is_set
-        page.tell_refused()
+        self._page = self.enter_context(serving)
+        yield self._page.end_requested.is_set
+        self._page.tell_refused()
 
     def offer(self, paths: Iterable[Path]) -> None:
         """Offers files of the ended session to experimenters while their page is open, or until Ctrl-C.
 
         The address of a file cannot be guessed, and only these pages are told.
         """
-        page, clock, secret = self._page, self._clock, secrets.token_urlsafe()
-        if page is None:
-            return
+        page, secret, clock = self._page, secrets.token_urlsafe(), self._clock
+        assert page is not None  # a session was attended
         small = (path for path in paths if path.stat().st_size <= LARGEST_BYTES)
         page.results = {f"/{secret}/{path.name}": path for path in small}
         give_up_ns = clock.monotonic_ns() + OFFERED_NS

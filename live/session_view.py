@@ -184,13 +184,7 @@ class SessionView:
         return None if self.energy is None else self.energy.advance(complete)
 
     def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the tick of each peer that a site's user is shown at a tick that never goes back.
-
-        Args:
-            site: the site.
-            tick: of the site.
-            used: the peers' samples that it has in use then, which its user sees without a view of their own.
-        """
+        """Returns the tick of each peer that a site's user is shown; see `PictureDelay.at`."""
         assert self.scenario is not None
         if site not in self._pictures:
             self._pictures[site] = PictureDelay(self.scenario, site)

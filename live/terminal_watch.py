@@ -112,11 +112,11 @@ class SessionWatch:
         }
         record = view.sites[own].record if own in every else None
         for peer, tick in view.find_shown(own, record.tick, record.used).items() if record else ():
-            window, row = view.sites[peer].window, dict.fromkeys(HEADS, "") | {"site": peer}
+            window, seen = view.sites[peer].window, {"site": peer}
             if window.knows(tick):
-                row["time"] = f"{tick / window.rate_hz:.3f} s"
-                row["angles"] = describe_angles(window.rows(tick, tick).q[0].tolist())
-            every[peer] = row
+                angles = describe_angles(window.rows(tick, tick).q[0].tolist())
+                seen |= {"time": f"{tick / window.rate_hz:.3f} s", "angles": angles}
+            every[peer] = dict.fromkeys(HEADS, "") | seen
         return list(every.values())
 
 

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import signal
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -135,10 +136,18 @@ drawn.length;
 """
 
 
-@pytest.mark.parametrize("count", [150, pytest.param(1000, marks=pytest.mark.long)])
-def test_a_users_page_draws_what_its_site_has_in_use(count: int, stage: Stage) -> None:
+IN_USE = ("link.delay_ms=300",)
+PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss=0.2")
+
+
+@pytest.mark.parametrize(
+    ("count", "delays"),
+    [(150, IN_USE), (150, PICTURE), pytest.param(1000, IN_USE, marks=pytest.mark.long)],
+    ids=["in use", "picture", "in use, long"],
+)
+def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...], stage: Stage) -> None:
     """At 300 ms, while the user moves: every frame that the browser draws, held against the log."""
-    running = live(stage, "play", "--set", "rate_hz=250", "--set", "link.delay_ms=300")
+    running = live(stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays)))
     with browser_page(role_address(running, "user m1"), gl=False) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         page.evaluate(KEEP_DRAWN)
@@ -157,11 +166,11 @@ def test_a_users_page_draws_what_its_site_has_in_use(count: int, stage: Stage) -
     running.signal(signal.SIGINT)
     running.prints("checking the log")
     log = open_log(stage.folder / "out" / "run.mcap")
-    ages = []
+    ages, shown = [], log.shown("m1")
     for frame in drawn:
         own = frame["m1"][0]
         for name, (tick, points) in frame.items():
-            assert tick == (own if name == "m1" else log["m1"].states[own].used[name])
+            assert tick == (own if name == "m1" else shown[name][own])
             q = np.array([log[name].states[tick].q])
             assert points == np.round(joint_positions_m(log.scenario.arms[name], q)[0], 5).tolist()
         ages.append(own - frame["s"][0])

@@ -78,7 +78,7 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
     drawn_ns = due_ns if np.array_equal(alone.models, models) else alone.draw(count)
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
-    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, whole.copies)
+    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, int(whole.row.copies))
 
 
 class Arrivals(NamedTuple):

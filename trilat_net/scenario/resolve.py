@@ -394,9 +394,8 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
 def _resolve_views(sites: TomlTable, folder: Path | None) -> None:
     for name, site in sites.items():
         if "view" in site:
-            path = f"sites.{name}.view"
-            link = resolve_link(site["view"], {}, path)
-            site["view"] = _complete_link(link, f"view of {name}", path, folder)
+            link = resolve_link(site["view"], {}, f"sites.{name}.view")
+            site["view"] = _complete_link(link, name, f"sites.{name}.view", folder)
 
 
 def _complete_link(

@@ -29,7 +29,7 @@ class LinkSchedule:
 
     Attributes:
         models: the link's, in the order of their first stamps.
-        copies: duplicates that the link has made.
+        row: its state in the core.
     """
 
     def __init__(self, setup: LinkSetup, ordered: Sequence[LinkModel] = ()) -> None:
@@ -46,28 +46,23 @@ class LinkSchedule:
         row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(self.models)
         row.used, row.foreseen = -1, -1
         row.outage_first, row.outage_count = len(points), len(setup.outages)
-        self._row, self._block = row, np.empty(_BLOCK, dtype=np.int64)
-
-    @property
-    def copies(self) -> int:
-        """Duplicates that the link has made."""
-        return int(self._row.copies)
+        self.row, self._block = row, np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
         """Returns when the samples are due that follow those of the last call, up to one, ns; or LOST."""
-        first = int(self._row.foreseen) + 1
+        first = int(self.row.foreseen) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
         for start in range(first, end, _BLOCK):
             stop = min(start + _BLOCK, end)
-            schedule_deliveries(stop - 1, self._row, self.models, self._block, self._points)
+            schedule_deliveries(stop - 1, self.row, self.models, self._block, self._points)
             due_ns[start - first : stop - first] = self._block[np.arange(start, stop) % _BLOCK]
         return due_ns
 
     def draw_releases(self, end: int, own_hz: int) -> tuple[IntArray, IntArray]:
         """Returns those of the same samples that are not lost, and the receiver's ticks that release them."""
-        sample = np.arange(int(self._row.foreseen) + 1, end)
+        sample = np.arange(int(self.row.foreseen) + 1, end)
         due_ns = self.draw(end)
-        stamp_ns = sample * NS_PER_S // int(self._row.rate_hz)
+        stamp_ns = sample * NS_PER_S // int(self.row.rate_hz)
         ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), own_hz)
         return sample[due_ns != LOST], ticks[due_ns != LOST]
 
