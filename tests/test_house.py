@@ -32,8 +32,8 @@ def test_a_module_name_is_used_once() -> None:
 
 def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
-    assert len(lines) <= 316
-    assert sum(lines) <= 76_770
+    assert len(lines) <= 322
+    assert sum(lines) <= 77_450  # 69 300, and what the issues 28 to 30 allow: 2 000, 2 500, 3 800
 
 
 def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:

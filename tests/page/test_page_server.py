@@ -477,8 +477,8 @@ def test_report_and_log_are_the_experimenters_alone(
     server: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At an address that no other page is told and nobody guesses; the report's scripts reach nothing."""
-    monkeypatch.setattr(server._frames, "make", lambda: {"sites": {}})
-    monkeypatch.setattr(server._frames, "narrow", lambda *_, **__: {})
+    monkeypatch.setattr(server._frames, "make", lambda: {"sites": {}, "t": 0.0})
+    monkeypatch.setattr(server._frames, "narrow", lambda *_, **__: {"t": 0.0})
     report = tmp_path / "report.html"
     report.write_text("<p>a report</p>")
     server.results = {"/secret/report.html": report}
