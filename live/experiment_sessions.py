@@ -114,7 +114,7 @@ class ExperimentSessions:
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True
         for left in self._list_tries(planned)[-1:]:
-            if any(left.glob("run.mcap*")):
+            if any(left.glob("*.mcap*")):
                 self._note_aborted(planned, "the program was ended")
             else:  # its session had not begun
                 shutil.rmtree(left, ignore_errors=True)

@@ -117,6 +117,7 @@ function begin(hello) {
   if (!hello.running && hello.stage) {
     parts?.hands.letGo();
     alarms({ sites: {} });
+    $("stop").disabled = true; // there is no arm
     return state("between trials");
   }
   if (!hello.running) {

@@ -45,7 +45,8 @@ def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[bool, float, fl
     since = left[np.searchsorted(left, np.arange(len(inside)), side="right") - 1] + 1
     dwelt = inside & (part.t_s - part.t_s[np.minimum(since, len(inside) - 1)] >= task.dwell_s)  # type: ignore[union-attr]
     late = part.t_s >= goal.appears_s + task.longest_s
-    return bool(dwelt.any()), goal.appears_s, float(part.t_s[np.flatnonzero(dwelt | late)[0]])
+    ended = np.flatnonzero(dwelt | late)[0]
+    return bool(dwelt[ended]), goal.appears_s, float(part.t_s[ended])
 
 
 def assert_log_table_and_page_agree(folder: Path, people: list[Participant], running: Process) -> None:
