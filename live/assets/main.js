@@ -117,7 +117,8 @@ function begin(hello) {
   if (!hello.running && hello.stage) {
     parts?.hands.letGo();
     alarms({ sites: {} });
-    $("stop").disabled = true; // there is no arm
+    page.stops = false; // there is no arm
+    enable();
     return state("between trials");
   }
   if (!hello.running) {
