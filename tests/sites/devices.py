@@ -63,6 +63,7 @@ class HaplyService:
     Attributes:
         place_m, pressed: where its cursor is, and the buttons of its grip.
         asked: times, s, and the messages that came, decoded.
+        presses_anew: whether its user lets the buttons go and presses them anew twice a second.
         silent: while it is set, it answers nothing.
         raw: a text that it sends once in place of a state.
     """
@@ -70,6 +71,7 @@ class HaplyService:
     def __init__(self, port: int = 0, force_key: str = "vector") -> None:
         self.place_m: Callable[[], Vector] = lambda: (0.0, -0.12, 0.15)
         self.pressed: set[str] = set()
+        self.presses_anew = False
         self.asked: list[tuple[float, dict[str, Any]]] = []
         self.silent, self.raw, self._key = threading.Event(), "", force_key
         self.devices, self.answered_s = ["049D"], 0.0
@@ -123,7 +125,8 @@ class HaplyService:
         vectors = {"position": self.place_m(), "velocity": ZERO}
         state: dict[str, Any] = {f"cursor_{k}": dict(zip("xyz", v, strict=True)) for k, v in vectors.items()}
         state["current_cursor_force"] = dict(zip("xyz", force, strict=True))
-        buttons = {name: name in self.pressed for name in "abc"}
+        up = self.presses_anew and time.perf_counter() % 0.5 < 0.02
+        buttons = {name: name in self.pressed and not up for name in "abc"}
         grip = {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}, "buttons": buttons}
         return {
             "inverse3": [{"device_id": name, "state": state, **more} for name in self.devices],
