@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from trilat_net.analysis.aligned import AlignedRecords
-from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m, upright_axes
+from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows, joint_positions_m, upright_axes
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S
@@ -134,7 +134,7 @@ class ArmFrames:
         torque = split.operator
         if not self._spec.hands and np.abs(torque).max() < 1e-9 * (1.0 + np.abs(own.tau_x).max()):
             return np.zeros_like(split.end_effector.at)
-        return _find_force(split.end_effector.J, torque)
+        return split.end_effector.find_force(torque, _LEAST_SINGULAR_VALUE)
 
     def _find_pull(self, own: AlignedRecords, split: TorqueSplit) -> list[float]:
         """Returns the force with which the law pulls the end effector, which a user feels, at the end.
@@ -143,8 +143,9 @@ class ArmFrames:
         """
         if not self._spec.arm.known:
             return []
+        last = EndEffectorRows(*(rows[-1:] for rows in split.end_effector))
         torque = own.tau[-1:] - self._rows.gravity_torque(own.q[-1:])
-        return _rounded(_find_force(split.end_effector.J[-1:], torque)[0], 3)
+        return _rounded(last.find_force(torque, _LEAST_SINGULAR_VALUE)[0], 3)
 
     def _wall_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
         total = np.zeros_like(split.end_effector.at)
@@ -152,13 +153,6 @@ class ArmFrames:
             force = wall_force(wall, own.nominal_s, split.end_effector)
             total = total + force[:, np.newaxis] * np.array(wall.b)
         return total
-
-
-def _find_force(J: Array, torque: Array) -> Array:
-    """Returns the least force at the end effector that explains a torque, shape (K, 2) or (K, 3), N."""
-    inverse = np.linalg.pinv(J.transpose(0, 2, 1), rcond=_LEAST_SINGULAR_VALUE)
-    found: Array = np.einsum("kij,kj->ki", inverse, torque)
-    return found
 
 
 class SessionFrames:

@@ -36,8 +36,8 @@ from .site_parts import warm_up
 POLL_NS = 100_000_000
 START_S = 10
 """Time for a site to start, s, where many share a few processors."""
-WAIT_S = 600
-"""For so long sites wait for each other and for the recorder, s."""
+JOIN_S, WAIT_S = 60, 600
+"""For so long sites wait for each other and for the recorder, s; the second where people begin a session."""
 END_TIMEOUT_NS = 15 * NS_PER_S
 """Time for a child to end after its signal; then it is killed."""
 
@@ -101,12 +101,12 @@ def run_demo(
     folder: Path,
     console: Console,
     attend: SessionAttendant | None = None,
-    begins: Callable[[], bool] = lambda: True,
+    begins: Callable[[], bool] | None = None,
 ) -> SessionResult:
     """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
 
-    Its log is valid whenever the session began. Until `begins` returns true the sites wait for the recorder,
-    at most `WAIT_S`; so the session begins a second or two after that.
+    Its log is valid whenever the session began. Given `begins`, the sites wait for the recorder until it
+    returns true, at most `WAIT_S`; so the session begins a second or two after that.
 
     Raises:
         ScenarioError: an arm outside of the program lacks limits.
@@ -117,7 +117,9 @@ def run_demo(
     with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
         compile_core(scenario, display.say, interrupt)
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
-        sites, start_recorder = _start(scenario, folder, session, endpoints)
+        sites, start_recorder = _start(
+            scenario, folder, session, endpoints, JOIN_S if begins is None else WAIT_S
+        )
         recorder: list[_Child] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
@@ -128,7 +130,7 @@ def run_demo(
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, *recorder], result)):
-                    if not recorder and begins():
+                    if not recorder and (begins is None or begins()):
                         recorder.append(start_recorder())
                     monitor.poll()
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
@@ -156,14 +158,14 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 
 
 def _start(
-    scenario: Scenario, folder: Path, session: str, endpoints: list[str]
+    scenario: Scenario, folder: Path, session: str, endpoints: list[str], wait_s: int
 ) -> tuple[list[_Child], Callable[[], _Child]]:
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
     file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     connect = [["--connect", endpoint] for endpoint in endpoints]
-    patience = ["--join-timeout", str(max(WAIT_S, START_S * len(endpoints)))]
+    patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
     sites = [
         _Child(
             name,

@@ -148,6 +148,15 @@ class EndEffectorRows(NamedTuple):
     speed: Array
     J: Array
 
+    def find_force(self, torque: Array, least: float = 1e-15) -> Array:
+        """Returns the least force that explains torques of shape (K, n), N m: shape (K, 2) or (K, 3), N.
+
+        Directions in which the end effector moves less than `least` times the most are not told from none.
+        """
+        inverse = np.linalg.pinv(self.J.transpose(0, 2, 1), rcond=least)
+        found: Array = np.einsum("kij,kj->ki", inverse, torque)
+        return found
+
 
 class PlanarArmRows(NamedTuple):
     """The planar two-link arm over rows; `ChainArmRows` has the same functions.

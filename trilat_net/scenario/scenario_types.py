@@ -382,6 +382,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
     @property
+    def slave(self) -> str:
+        """The first site whose role is slave, else the last one."""
+        return next((name for name, spec in self.sites.items() if spec.role == "slave"), self.names[-1])
+
+    @property
     def outside(self) -> tuple[str, ...]:
         """The sites whose arms are outside of the program."""
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")

@@ -46,6 +46,8 @@ NEIGHBOURS = 1.0 / 6.0
 """Correlation of two segments under Hann's window that overlap by half, of what is white."""
 FARTHEST_CONDITION = 1e3
 """Of motions that are told apart by axis: the ratio of the largest to the least singular value."""
+KEYS = {"mass_kg": "M", "damping_n_s_m": "B", "stiffness_n_m": "K"}
+"""Of JSON, for what each letter stands."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
@@ -90,9 +92,8 @@ class HandImpedance(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat identify hand --json`, which `trilat linear --operators` takes."""
-        matrices = {"mass_kg": "M", "damping_n_s_m": "B", "stiffness_n_m": "K"}
-        found = {name: getattr(self, letter).tolist() for name, letter in matrices.items()}
-        halves = {f"{name}_half": self.halves[letter].tolist() for name, letter in matrices.items()}
+        found = {name: getattr(self, letter).tolist() for name, letter in KEYS.items()}
+        halves = {f"{name}_half": self.halves[letter].tolist() for name, letter in KEYS.items()}
         over = {"site": self.site, "segments": self.segments, "segment_s": self.segment_s}
         return {**over, **found, **halves, "hand": self.to_hand(), "sines": self.to_rows()}
 
@@ -180,9 +181,7 @@ def _find_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array
     for source in (one.actor for one in scenario.sites[records.site].hands):
         if source.acts in SCRIPTED_KINDS:
             torque += compute_operator_script(source, records.nominal_s, split.end_effector.J[0])
-    J = split.end_effector.J
-    force: Array = np.einsum("kij,kj->ki", np.linalg.pinv(J.transpose(0, 2, 1)), split.operator - torque)
-    return force, split.end_effector.at
+    return split.end_effector.find_force(split.operator - torque), split.end_effector.at
 
 
 def _find_phasors(
@@ -273,8 +272,7 @@ def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
     for file in files:
         try:
             told = json.loads(Path(file).read_text(encoding="utf-8"))
-            keys = "mass_kg", "damping_n_s_m", "stiffness_n_m"
-            matrices = [np.array(told[key], dtype=np.float64) for key in keys]
+            matrices = [np.array(told[key], dtype=np.float64) for key in KEYS]
             if len({one.shape for one in matrices}) > 1 or matrices[0].shape not in ((2, 2), (3, 3)):
                 raise ValueError("its matrices are not alike")
             if not np.isfinite(matrices).all():

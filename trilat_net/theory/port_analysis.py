@@ -207,7 +207,7 @@ def analyse_ports(
     check_band(band_hz)
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
-    of = of or next((n for n, one in scenario.sites.items() if one.role == "slave"), scenario.names[-1])
+    of = of or scenario.slave
     sites, delay_s = port_response.list_port_sites(loop), port_response.find_longest_delay_s(loop)
     Y = port_response.build_admittance(loop)
     w_rad_s = frequency_search.refine_frequencies(Y, frequency_search.build_frequency_grid(*band_hz, delay_s))

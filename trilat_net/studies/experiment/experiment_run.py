@@ -6,7 +6,6 @@ killed. The tables are a function of the journals. People and synthetic particip
 """
 
 import csv
-import hashlib
 import io
 import json
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...errors import UsageError
-from ...files import make_folder, make_results_folder, write_whole
+from ...files import digest_file, make_folder, make_results_folder, write_whole
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
@@ -343,5 +342,5 @@ def list_log_problems(experiment: Experiment) -> Iterator[str]:
             continue
         if not path.exists():
             yield f"{path}: is missing"
-        elif hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
+        elif digest_file(path) != entry.sha256:
             yield f"{path}: is not the log that the trial wrote"

@@ -22,6 +22,7 @@ from ...errors import LogError
 from ...execution.fused import FusedRun
 from ...execution.verify import verify
 from ...execution.virtual import write_virtual_log
+from ...files import digest_file
 from ...log.log_file import LogFile
 from ...log.log_reader import Log, open_log
 from ...scenario import Scenario, parse_scenario
@@ -66,10 +67,8 @@ class TrialEntry(msgspec.Struct, frozen=True):
 
 
 def find_slave(scenario: Scenario) -> Slave:
-    """Returns the first site whose role is slave, else the last one."""
-    slaves = [name for name in scenario.names if scenario.sites[name].role == "slave"]
-    site = (slaves or scenario.names)[0 if slaves else -1]
-    return Slave(site, scenario.arms[site])
+    """Returns the slave of a scenario, with its arm."""
+    return Slave(scenario.slave, scenario.arms[scenario.slave])
 
 
 class TrialJudge:
@@ -147,9 +146,9 @@ class ExperimentTrial:
             raise LogError(f"{path}: its records are not those of the run")
         if (outcome := self._judge(log)) is None:
             raise LogError(f"{path}: ends before its trial does")
-        planned, digest = self.planned, hashlib.sha256(path.read_bytes()).hexdigest()
-        measures = self._measure(log, outcome)
-        return TrialEntry(planned.number, planned.seed, digest, outcome.succeeded, measures, self.people)
+        planned, measures = self.planned, self._measure(log, outcome)
+        how = planned.seed, digest_file(path), outcome.succeeded, measures, self.people
+        return TrialEntry(planned.number, *how)
 
     def _judge(self, log: Log) -> Outcome | None:
         judge, part = self.begin(), log[self.slave.site]
@@ -244,9 +243,7 @@ class SyntheticTrial(ExperimentTrial):
 def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Array:
     """Returns the force of a participant's hand ON its arm, shape (K, 2) or (K, 3), N."""
     split = split_torque(own, scenario)
-    inverse = np.linalg.pinv(split.end_effector.J.transpose(0, 2, 1))
-    force: Array = np.einsum("kij,kj->ki", inverse, split.operator)
-    return force[own.t_s <= until_s]
+    return split.end_effector.find_force(split.operator)[own.t_s <= until_s]
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
