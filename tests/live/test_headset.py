@@ -33,6 +33,7 @@ MOVE = """([side, x, y, z]) => {
   headset.controllers[side].position.set(x, y, z);
   return trilat.parts.headset.frames;
 }"""
+HELD = "trilat.parts.headset.controllers.right.card !== null && trilat.frame.holds.includes('m1')"
 PRESS = "([side, button, value]) => headset.controllers[side].updateButtonValue(button, value)"
 SCENARIO = Path(__file__).parents[2] / "examples" / "headset.toml"
 SETTLED = 50
@@ -80,20 +81,30 @@ def ended(running: Process, stage: Stage) -> Log:
     return log
 
 
+def leads(page: Page, hands: Controllers) -> bool:
+    """Takes hold and leads the arm, with a jump there and back; False if the page got too late to keep hold."""
+    hands.press("right", "trigger", 0.0)
+    hands.place("right", 0.2, 1.2, -0.3)
+    shows(page, "!trilat.frame.holds.length")
+    dropped = page.evaluate("trilat.parts.headset.dropped")
+    hands.press("right", "trigger", 1.0)
+    shows(page, "trilat.frame.holds.includes('m1')")
+    way = [(0.2 - 0.004 * n, 1.2 + 0.006 * n, -0.3 - 0.01 * n) for n in range(1, 11)]
+    for at in (*way, (0.76, 1.26, -0.4), (0.16, 1.26, -0.4)):
+        hands.place("right", *at)
+        if not page.evaluate(HELD):
+            return False
+    assert page.evaluate("trilat.parts.headset.dropped") == dropped + 2
+    return True
+
+
 def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
     """By the log: half as far, ahead as x, left as y, up as z; what jumps by 0.6 m moves nothing."""
     running = served(stage)
     with browser_page(f"{page_address(running)}?flat", script=RUNTIME, **VIEW) as page:
         assert page.evaluate("isSecureContext && location.protocol === 'https:'")
         hands = enter(page)
-        hands.place("right", 0.2, 1.2, -0.3)
-        hands.press("right", "trigger", 1.0)
-        shows(page, "trilat.frame.holds.includes('m1')")
-        for n in range(1, 11):
-            hands.place("right", 0.2 - 0.004 * n, 1.2 + 0.006 * n, -0.3 - 0.01 * n)
-        hands.place("right", 0.76, 1.26, -0.4)
-        hands.place("right", 0.16, 1.26, -0.4)
-        assert page.evaluate("trilat.parts.headset.dropped") == 2
+        assert any(leads(page, hands) for _ in range(5))
         hands.press("right", "trigger", 0.0)
         shows(page, "!trilat.frame.holds.length")
         assert page.evaluate("trilat.parts.headset.scenes.length") == 3
@@ -101,7 +112,9 @@ def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
         shows(page, "trilat.parts.headset.session === null")
     log = ended(running, stage)
     part = log["m1"]
-    target = part.hand[part.hand[:, 2] > 0.0, 3:6]
+    free = np.flatnonzero(~(part.hand[:, 2] > 0.0))
+    begins, ends = free[np.flatnonzero(np.diff(free) > 1)[-1] :][:2]
+    target = part.hand[begins + 1 : ends, 3:6]  # of the last hold, which led all the way
     assert log.scenario.arms["m1"].counts.joints == 6
     led = target[-1] - target[SETTLED]
     assert led == pytest.approx([0.5 * 0.1, 0.5 * 0.04, 0.5 * 0.06], abs=1e-4)
