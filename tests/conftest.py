@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from .push_set import read_long_tests
+
 settings.register_profile("desk", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", settings.get_profile("desk"), derandomize=True, print_blob=True)
 settings.register_profile("push", settings.get_profile("ci"), max_examples=10)
@@ -40,8 +42,11 @@ LIKE_OTHERS = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Marks the tests that run such a scenario; on a push, ten examples are also the most of any property."""
+    """Marks tests that run such a scenario or are dear; on a push, a property has ten examples at most."""
+    dear = frozenset() if config.pluginmanager.hasplugin("tests.push_set") else read_long_tests()
     for item in items:
+        if item.nodeid in dear and not item.get_closest_marker("push"):
+            item.add_marker(pytest.mark.long)
         own = getattr(getattr(item, "function", None), "_hypothesis_internal_use_settings", None)
         if own is not None and own.max_examples > 10 and _on_a_push(config):  # a test's own number precedes
             item.function._hypothesis_internal_use_settings = settings(own, max_examples=10)

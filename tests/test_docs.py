@@ -218,6 +218,7 @@ def names_of(path: Path) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.push
 def test_a_test_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     files = {path.stem: path for path in (ROOT / "tests").rglob("*.py")}

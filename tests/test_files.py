@@ -141,6 +141,7 @@ def test_a_folder_without_sync_is_left_as_on_windows(tmp_path: Path, monkeypatch
     sync_folder(tmp_path)
 
 
+@pytest.mark.push
 def test_every_text_that_is_written_states_its_line_ends() -> None:
     """A stream of text translates them on Windows; `write_whole` and bytes do not."""
     found = []

@@ -4,6 +4,8 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 from . import house, reading_walk
 
 ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
@@ -36,6 +38,7 @@ def test_the_house_is_no_larger_than_it_may_be() -> None:
     assert sum(lines) <= 77_450  # 69 300, and what the issues 28 to 30 allow: 2 000, 2 500, 3 800
 
 
+@pytest.mark.push
 def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
     """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
     found = reading_walk.walk_to_judgement()
@@ -43,18 +46,21 @@ def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
     assert len(found.returns) <= 19
 
 
+@pytest.mark.push
 def test_no_test_imports_another() -> None:
     files = [path for top in ("tests", "benchmarks") for path in (house.ROOT / top).rglob("*.py")]
     found = [(path.name, *name) for path in files for name in house.imported_names(path)]
     assert not [name for name in found if any(part.startswith("test_") for part in name[1:])]
 
 
+@pytest.mark.push
 def test_no_body_is_longer_than_forty_lines() -> None:
     assert not [
         (path.name, *found) for path in house.files() for found in house.bodies(path) if found[1] > 40
     ]
 
 
+@pytest.mark.push
 def test_every_import_between_rooms_has_its_reason() -> None:
     """The table of docs/design.md names each pair, and no pair that is not there."""
     rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", DESIGN, re.MULTILINE)

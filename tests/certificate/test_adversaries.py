@@ -120,6 +120,7 @@ OPEN_SHARE = 0.08
     ("first", "count"),
     [(0, 40), *(pytest.param(n, BLOCK, marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
 )
+@pytest.mark.push
 def test_random_runs_do_not_fool_it(first: int, count: int) -> None:
     """What certify and a sweep say of runs of which a third are near an edge of stability."""
     judged = list(map(judge_experiment, range(first, first + count)))
@@ -144,6 +145,7 @@ def test_whatever_is_drawn_does_not_fool_it(first: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("first", range(WIDE_FROM, WIDE_FROM + 360, 90))
+@pytest.mark.push
 def test_whatever_is_drawn_does_not_fool_a_sweep(first: int) -> None:
     """The same by the compiled run alone, without a log; a chain of its own is one more layout to compile."""
     drawn = [(seed, draw_experiment(seed)) for seed in range(first, first + 90)]

@@ -62,6 +62,7 @@ def test_it_follows_the_equation_of_motion(q: Array, qd: Array, u: Array) -> Non
     assert errors(q, qd, u, 400)[0] < 1e-6
 
 
+@pytest.mark.push
 def test_its_order_is_four() -> None:
     """In the median of many states: in a single one leading terms may cancel."""
     chance = np.random.default_rng(4)

@@ -60,6 +60,7 @@ for scheme in ("second_order", "digital"):
 """
 
 
+@pytest.mark.push
 def test_without_the_compiler_a_run_has_the_same_bits() -> None:
     plain = printed(_PROGRAM, compiled=False)
     assert plain.count("\n") == 2 * 3 * 250

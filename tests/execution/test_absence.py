@@ -162,6 +162,7 @@ def refuses_all(changes: list[Callable], *, chained: bool, examples: int) -> Non
     check()
 
 
+@pytest.mark.push
 def test_no_change_of_a_log_passes_by_its_chain() -> None:
     refuses_all(ANY, chained=True, examples=150)
 

@@ -34,6 +34,7 @@ PUSHED = ("paper", "live-paper.mcap")
     "scenario",
     [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in BEFORE["sim"]],
 )
+@pytest.mark.push
 def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, tmp_path: Path) -> None:
     path = tmp_path / "sim.mcap"
     then = ["--duration", SHORTER_THEN[scenario]] if scenario in SHORTER_THEN else []

@@ -82,7 +82,7 @@ def ended(running: Process, stage: Stage) -> Log:
 
 
 def leads(page: Page, hands: Controllers) -> bool:
-    """Takes hold and leads the arm, with a jump there and back; False if the page got too late to keep hold."""
+    """Takes hold and leads the arm, with a jump there and back; False if a late page had to let go."""
     hands.press("right", "trigger", 0.0)
     hands.place("right", 0.2, 1.2, -0.3)
     shows(page, "!trilat.frame.holds.length")

@@ -218,6 +218,7 @@ def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_p
 @pytest.mark.parametrize(
     "kind", ["live", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("recovered", "bag"))]
 )
+@pytest.mark.push
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
     """A program of others under another license: run, never imported."""
     assert "passed" in printed(*PYMCAP, "doctor", "--strict-message-order", str(files[kind]))

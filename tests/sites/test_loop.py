@@ -148,6 +148,7 @@ SCENARIOS = {
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.push
 def test_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
     scenario = load_scenario(name, SCENARIOS[name])
     log = Session.whole(scenario, tmp_path).run()
