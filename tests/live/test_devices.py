@@ -72,6 +72,7 @@ def last_moved(log: Log) -> tuple[float, float]:
     return float(part.t_s[newest]), float(part.t_s[gone])
 
 
+@pytest.mark.long
 def test_a_haply_leads_an_arm_and_renders_its_reaction(held: Held) -> None:
     """The target turns as the device does, and the service got the reaction of the arm, within its limit."""
     held.service.presses_anew = True  # a busy machine may be silent, and let go, in between

@@ -74,7 +74,8 @@ def assert_log_table_and_page_agree(folder: Path, people: list[Participant], run
     assert "Traceback" not in running.text()
 
 
-@pytest.mark.parametrize("trials", [3, pytest.param(10, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("trials", [3, 10])
 def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) -> None:
     """Two browsers, two roles, real pointers: boundaries and measures are those of verified logs."""
     folder, conditions = stage.folder / "out", FAR if trials % 2 == 0 else ""
@@ -90,6 +91,7 @@ def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) ->
     assert {row["event"] for row in rows_of(folder, "events.csv")} == {"consent", "questionnaire"}
 
 
+@pytest.mark.long
 def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
     """SIGKILL within a trial and between two, a page reloaded within one: nothing twice, nothing lost."""
     folder = stage.folder / "out"

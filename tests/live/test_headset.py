@@ -98,6 +98,7 @@ def leads(page: Page, hands: Controllers) -> bool:
     return True
 
 
+@pytest.mark.long
 def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
     """By the log: half as far, ahead as x, left as y, up as z; what jumps by 0.6 m moves nothing."""
     running = served(stage)

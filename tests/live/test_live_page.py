@@ -142,7 +142,11 @@ PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss
 
 @pytest.mark.parametrize(
     ("count", "delays"),
-    [(150, IN_USE), (150, PICTURE), pytest.param(1000, IN_USE, marks=pytest.mark.long)],
+    [
+        (150, IN_USE),
+        pytest.param(150, PICTURE, marks=pytest.mark.long),
+        pytest.param(1000, IN_USE, marks=pytest.mark.long),
+    ],
     ids=["in use", "picture", "in use, long"],
 )
 def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...], stage: Stage) -> None:
