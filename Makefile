@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 
-.PHONY: help demo play setup test pytest compiled sessions live containers lint platforms test-long faults docs bench lock clean
+.PHONY: help demo play setup test pytest compiled sessions containers push-set lint platforms test-long faults docs bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -14,6 +14,7 @@ help:
 	@echo "make setup   make the virtual environment .venv from locked dependencies, and compile what the demo needs"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
+	@echo "make push-set     measure anew which tests make test leaves to make test-long"
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
@@ -55,7 +56,6 @@ test:
 	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp compiled
 	@$(MAKE) --no-print-directory -j2 pytest lint
 	@$(MAKE) --no-print-directory sessions # by itself: real sessions need the time of the cores
-	@$(MAKE) --no-print-directory live
 
 pytest: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal -m "not live and not long" # some wait
@@ -67,14 +67,12 @@ compiled: $(VENV)/runtime.stamp
 sessions: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
+push-set: $(VENV)/dev.stamp
+	$(BIN)/python -m tests.push_set
+
 test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
 	$(BIN)/python -m pytest -q -m live
-
-live: setup
-	rm -rf runs/check
-	$(BIN)/trilat demo paper --duration 5 --out runs/check
-	$(BIN)/trilat verify --virtual runs/check/run.mcap
 
 containers: setup
 	.ci/compose

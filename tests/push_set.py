@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LONG_TESTS = Path(__file__).with_name("long_tests.txt")
 DEAR_S = 0.25
 """Processor time of a test, children included, that makes it dear."""
-COSTLY = ("core", "execution", "log", "golden", "certificate")
+COSTLY = ("core", "execution", "log", "golden", "analysis", "certificate")
 COSTLY_DEAR_S = 1.0
 """The same where an error costs most: bits, logs and verdicts."""
 FEW = 3

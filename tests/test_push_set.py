@@ -1,0 +1,25 @@
+"""What a push leaves to the long tests: only what is dear, never a whole file, and nothing that is gone."""
+
+import re
+from pathlib import Path
+
+from .push_set import DEAR_S, FEW, MOST_S, ROOT, choose_long_tests, read_long_tests
+
+FILE = "tests/cli/test_a.py"
+
+
+def test_of_every_file_the_cheapest_few_stay() -> None:
+    times_s = {f"{FILE}::test_{n}": MOST_S - 0.1 * n for n in range(9)}
+    assert choose_long_tests(times_s) == sorted(f"{FILE}::test_{n}" for n in range(9 - FEW))
+
+
+def test_whatever_takes_too_long_is_left() -> None:
+    dear, cheap = f"{FILE}::test_dear", f"{FILE}::test_cheap"
+    assert choose_long_tests({dear: 1.01 * MOST_S, cheap: 0.5 * DEAR_S}) == [dear]
+
+
+def test_all_that_is_left_exists() -> None:
+    for name in read_long_tests():
+        path, _, case = name.partition("::")
+        text = Path(ROOT, path).read_text(encoding="utf-8")
+        assert re.search(rf"^def {re.escape(case.partition('[')[0])}\(", text, re.MULTILINE), name
