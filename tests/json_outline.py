@@ -11,6 +11,7 @@ from typing import Any
 
 import trilat_net as tn
 from tests.sites.visits import ping_publishers, ping_sites
+from tests.studies.experiment.experiments import write_protocol
 from trilat_net.results import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
@@ -66,6 +67,30 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
         tn.ping_benchmark("p_d_margin", duration_s=2),
         tn.ping_benchmark(EXTERNAL, duration_s=2),
     ],
+}
+SINES = [
+    {"kind": "multisine", "amplitude_nm": amplitude_nm, "frequencies_hz": frequencies_hz}
+    for amplitude_nm, frequencies_hz in (([2.0, 0.0], [0.5, 1.5, 3.0]), ([0.0, 2.0], [0.75, 1.75, 3.25]))
+]
+HAND = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
+OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
+    "identify hand": lambda _: [
+        tn.identify_hand(
+            tn.simulate("free", {"rate_hz": 250, "duration_s": 28.0, "sites.m1.hands": [HAND, *SINES]})
+        )
+    ],
+    "experiment check": lambda folder: [tn.check_experiment(write_protocol(folder))],
+    "experiment run": lambda folder: [
+        tn.run_experiment(write_protocol(folder), folder / "experiment", jobs=1)
+    ],
+    "experiment analyse": lambda folder: [
+        tn.analyse_experiment(folder / "experiment", exclude=left) for left in ({}, {"P2": "left"})
+    ],
+    "experiment power": lambda _: [tn.compute_experiment_power(0.5, people) for people in (None, 20)],
+}
+NOTES = {
+    "experiment run": "Also of `trilat experiment status`.",
+    "experiment analyse": "`mixed_models` has an entry by measure where statsmodels is installed.",
 }
 HEAD = """# JSON of the commands
 
@@ -126,11 +151,13 @@ def build_page() -> str:
         samples["metrics"].append(tn.metrics(log).to_dict())
         samples["certify"].append(tn.certify(log).to_dict())
     with tempfile.TemporaryDirectory() as folder:
-        samples |= {name: [one.to_dict() for one in find(Path(folder))] for name, find in OTHERS.items()}
+        others = {**OTHERS, **OF_PEOPLE}
+        samples |= {name: [one.to_dict() for one in find(Path(folder))] for name, find in others.items()}
     parts = [HEAD]
     for name, found in samples.items():
         lines = [f"{path}: {kind}" for path, kind in gather(found).items()]
-        parts.append("\n".join([f"## trilat {name}", "", "```text", *lines, "```", ""]))
+        note = [NOTES[name], ""] if name in NOTES else []
+        parts.append("\n".join([f"## trilat {name}", "", *note, "```text", *lines, "```", ""]))
     return "\n".join(parts)
 
 

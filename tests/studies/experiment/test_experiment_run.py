@@ -94,6 +94,13 @@ def test_pairs_and_paths_run_as_well(users: str, task: str, tmp_path: Path) -> N
     if "m2" in users:
         assert rows[0]["pair"] == "P1-P2"
         assert rows[0]["force_peak_user1_n"] > 0.1 < rows[0]["force_peak_user2_n"]
+        for row in rows:  # see `PairMeasures`
+            mean_n = [row["force_mean_user1_n"], row["force_mean_user2_n"]]
+            assert 0.0 < row["internal_share"] < 1.0
+            assert 0.0 < row["first_effort_share"] < 1.0
+            assert row["internal_rms_n"] < row["force_peak_user1_n"]
+            assert row["useful_rms_n"] < 2.0 * sum(mean_n) + row["force_peak_user1_n"]
+            assert row["first_work_j"] > -row["first_taken_j"]
     else:
         assert all(row["completion_s"] == pytest.approx(2.0, abs=0.03) for row in rows)
 

@@ -6,7 +6,7 @@ and into its log, which then lasts just that long.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,14 @@ from ...log.log_reader import Log, open_log
 from ...scenario import Scenario, parse_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from ...scenario.operators.program_hand import HandPlayer, HandSite
-from .movement_measures import mean_force_n, movement_time_s, path_length_m, peak_force_n, sparc
+from .movement_measures import (
+    mean_force_n,
+    measure_pair,
+    movement_time_s,
+    path_length_m,
+    peak_force_n,
+    sparc,
+)
 from .protocol import PlannedTrial, Protocol, limit_forces
 from .synthetic_participant import SyntheticParticipant
 from .tasks import Outcome, TrialGoal
@@ -160,17 +167,34 @@ class ExperimentTrial:
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Returns the measures of a trial, units in the names."""
         found, aligned = self._measure_motion(log, outcome.ended_s), align_records(log)
-        for place, user in enumerate(self.protocol.users, 1):
-            force = _hand_force_n(aligned[user], log.scenario, outcome.ended_s)
+        forces = [_hand_force_n(aligned[user], log.scenario, outcome.ended_s) for user in self.protocol.users]
+        for place, force in enumerate(forces, 1):
             which = f"_user{place}" if len(self.protocol.users) > 1 else ""
             found |= {
                 f"force_mean{which}_n": mean_force_n(force),
                 f"force_peak{which}_n": peak_force_n(force),
             }
+        if len(forces) > 1:
+            found |= self._measure_pair(aligned, forces, outcome.ended_s)
         own = log[self.protocol.users[0]]
         used, rate_hz = own.used[self.slave.site], log.scenario.sites[self.slave.site].rate_hz
         age_ms = (own.t_ns - used * NS_PER_S // rate_hz)[used >= 0] / 1e6
         return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
+
+    def _measure_pair(
+        self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
+    ) -> dict[str, float]:
+        """Returns what two users do to the slave, as if each pushed at its end effector."""
+        slave = aligned[self.slave.site]
+        rows = np.flatnonzero(slave.t_s <= ended_s)[::EVERY]
+        rate_hz, t_s = slave.rate_hz / EVERY, slave.t_s[rows]
+        places = np.array([self.slave.arm.end_effector(q) for q in slave.q[rows]], dtype=np.float64)
+        one, other = (
+            np.column_stack([np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T])
+            for user, force in zip(self.protocol.users, forces, strict=True)
+        )
+        found = measure_pair(one, other, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz)
+        return {name: value for name, value in found._asdict().items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns what the slave did from when the target appears until the trial ends."""
