@@ -10,7 +10,7 @@ T = TypeVar("T")
 STEP_NS = 2_000_000
 
 
-def until(condition: Callable[[], T], timeout_s: float = 10.0, clock: Clock | None = None) -> T:
+def until(condition: Callable[[], T], timeout_s: float = 30.0, clock: Clock | None = None) -> T:
     clock = clock or SystemClock()
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     while not (result := condition()):

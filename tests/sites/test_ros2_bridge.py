@@ -547,8 +547,8 @@ class Sites:
             self.anew.append(show_session(self._ends, 100.0, over.is_set, self.said.append))
 
         bridge = threading.Thread(target=show)
+        self.graph.came.clear()  # before the bridge takes its topics from it
         bridge.start()
-        self.graph.came.clear()
         until(lambda: self.ticks(7) or self.graph.came["t/s/joint_states"])  # type: ignore[func-returns-value]
         yield bridge
         over.set()
