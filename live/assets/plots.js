@@ -5,6 +5,7 @@ const SPAN_S = 20;
 const KEPT = 1500;
 const LEAST = { rad: 0.01, m: 0.001, "N m": 1, N: 1, ms: 10, J: 0.1 };
 const EVERY_MS = 66;
+const font = (ratio) => `600 ${11 * ratio}px system-ui, sans-serif`; // of labels
 
 class Plot {
   constructor(parent, title, unit, series, note = "", words = "") {
@@ -50,7 +51,11 @@ class Plot {
     }, this.data, this.box);
   }
 
-  room() { return 16 + 7.4 * Math.max(...this.series.map(({ label }) => label.length)); } // for the labels at the ends, px
+  room() { // for the labels at the ends, px
+    const ruler = document.createElement("canvas").getContext("2d");
+    ruler.font = font(1);
+    return 14 + Math.max(...this.series.map(({ label }) => ruler.measureText(label).width));
+  }
 
   label(u) { // a line is named at its end, so that no colour has to tell it
     const ratio = devicePixelRatio || 1;
@@ -65,7 +70,7 @@ class Plot {
     const over = ends.length ? ends.at(-1).at - (bbox.top + bbox.height) : 0;
     if (over > 0) for (let n = ends.length - 1, most = bbox.top + bbox.height; n >= 0; n--, most -= gap) ends[n].at = Math.min(ends[n].at, most);
     ctx.save();
-    ctx.font = `600 ${11 * ratio}px system-ui, sans-serif`;
+    ctx.font = font(ratio);
     ctx.textAlign = "left";
     ctx.textBaseline = "middle";
     const x = bbox.left + bbox.width;
