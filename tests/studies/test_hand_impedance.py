@@ -67,6 +67,16 @@ def test_spring_and_damper_of_the_kernel_are_found(spring: HandImpedance) -> Non
     assert (spring.segments, spring.segment_s) == (5, 8.0)
 
 
+def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
+    """A run that goes on for 12 s after its sines, with the same spring at the same arm."""
+    hand = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
+    changes = moved_from("m1", 2.0, 40.0)
+    changes["sites.m1.hands"] = [hand, *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"])]
+    found = identify_hand(tn.simulate("free", changes))
+    assert found.segments == spring.segments
+    assert np.allclose(found.K, spring.K, atol=1e-6)
+
+
 def test_found_hand_is_one_of_a_scenario(spring: HandImpedance) -> None:
     hand = spring.to_hand()
     scenario = tn.load_scenario("free", {"sites.m1.hands": [hand]})

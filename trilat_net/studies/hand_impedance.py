@@ -139,17 +139,18 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     log = log if isinstance(log, Log) else open_log(log)
     scenario = log.scenario
     find_site(scenario, site)
-    hz, start_s = _find_sines(scenario)
+    hz, start_s, end_s = _find_sines(scenario)
     records = align_records(log)[site]
     force, at = _find_hand_force(records, scenario)
     between = np.diff(np.concatenate([[0.0], hz]))
     segment_s = float(np.round(2.0 / between.min(), 9))
-    phasors = _find_phasors(records, np.hstack((force, at)), hz, start_s, segment_s)
+    acting = np.hstack((force, at))[records.t_s < end_s]
+    phasors = _find_phasors(records, acting, hz, start_s, segment_s)
     if len(phasors) < LEAST_SEGMENTS:
         needed_s = start_s + (0.5 * LEAST_SEGMENTS + 1.0) * segment_s
         raise UsageError(
             f"{site}: {len(phasors)} whole segments of {segment_s:g} s while the sines act, and intervals "
-            f"need {LEAST_SEGMENTS}: a run of at least {needed_s:g} s"
+            f"need {LEAST_SEGMENTS}: at least {needed_s:g} s of them"
         )
     F, X = np.split(np.array(phasors), [force.shape[1]], axis=2)
     whole, halves, unexplained = _fit_with_intervals(site, F, X, 2.0 * np.pi * hz)
@@ -162,8 +163,8 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     return HandImpedance(site, M, B, K, named, len(phasors), segment_s, responses)
 
 
-def _find_sines(scenario: Scenario) -> tuple[Array, float]:
-    """Returns the frequencies of all sines, Hz, in order, and from when on they all act, s."""
+def _find_sines(scenario: Scenario) -> tuple[Array, float, float]:
+    """Returns the frequencies of all sines, Hz, in order, and from when and until when they all act, s."""
     sines = [one for spec in scenario.sites.values() for one in spec.hands if isinstance(one, Multisine)]
     if not sines:
         raise UsageError(
@@ -171,7 +172,7 @@ def _find_sines(scenario: Scenario) -> tuple[Array, float]:
             "from what it does by itself (docs/ports.md)"
         )
     hz = np.unique([float(f) for one in sines for f in one.frequencies_hz])
-    return hz, max(one.start_s for one in sines)
+    return hz, max(one.start_s for one in sines), min(one.end_s for one in sines)
 
 
 def _find_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array, Array]:
