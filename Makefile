@@ -58,14 +58,17 @@ test:
 	@$(MAKE) --no-print-directory sessions # by itself: real sessions need the time of the cores
 
 pytest: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal -m "not live and not long" # some wait
+	nice -n 19 $(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal \
+		-m "not live and not long" # some wait
 
-compiled: $(VENV)/runtime.stamp
+compiled: $(VENV)/core.stamp
+
+$(VENV)/core.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*.py)
 	$(BIN)/python -m tests.compile_core
-	@touch $(VENV)/compiled.stamp
+	@touch $@ $(VENV)/compiled.stamp
 
 sessions: $(VENV)/dev.stamp
-	$(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
+	flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
 
 push-set: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.push_set
