@@ -155,7 +155,7 @@ def _numbers(
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """What a file, or the parts of one log, hold; see `describe_files`."""
+    """What a file, or the parts of one log, hold; see `info`."""
 
     facts: JsonObject
 
@@ -173,14 +173,19 @@ class FileOverview(Result):
         return [{"topic": topic, **channel} for topic, channel in self.facts["channels"].items()]
 
 
-def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
-    """Returns the facts of a file, or of the parts of one log, ready for JSON; keys end in their units.
+def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
+    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log info`.
 
     `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in `problem`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
+    >>> tn.info(path).to_dict()["sites"]["m"]["records"]
+    100
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
     """
+    paths = [Path(file) for file in files]
 
     def report(half: int) -> Progress | None:
         return progress and (lambda done, total: progress(half * total + done, 2 * total))
@@ -207,7 +212,7 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
         except LogError as error:
             facts["problem"] = str(error)
     facts["channels"] = inventory.channels(name, rates_hz, absences)
-    return facts
+    return FileOverview(facts)
 
 
 _PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")

@@ -252,10 +252,10 @@ def compare_command(
         for name in options.given_options(context):
             if name not in ("files", "--json"):
                 raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
-        from ..studies.log_comparison import compare_logs
+        from ..studies.log_comparison import compare
 
         logs = [terminal.open_with_progress(file) for file in files or []]
-        terminal.print_result(compare_logs(logs), as_json=as_json)
+        terminal.print_result(compare(*logs), as_json=as_json)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave the logs out, or --tune")

@@ -9,7 +9,7 @@ import hashlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -72,13 +72,19 @@ class LogCheckResult(CheckReport):
         return [{**row, "places": [at._asdict() for at in row["places"]]} for row in rows]
 
 
-def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogCheckResult:
-    """Checks every byte of a file, or of files that are parts of one log.
+def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
+    """Checks that a log is well-formed, complete and consistent; the command is `trilat log check`.
+
+    Every byte of its file is checked, or of its parts.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("sound.mcap")
+    >>> tn.check_file(path).passed
+    True
 
     Raises:
         LogError: a file cannot be read, or is of another session than the files before it.
     """
-    check = SessionCheck()
+    check, paths = SessionCheck(), [Path(file) for file in files]
     try:
         total, before = sum(path.stat().st_size for path in paths), 0
         for path in sorted(paths, key=lambda path: path.name):
