@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from ...analysis.aligned import AlignedRecords, align_records
+from ...analysis.aligned import align_records
+from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
 from ...core.ticks import NS_PER_S, tick_ns
-from ...core.vectors import Array
 from ...errors import LogError
 from ...execution.fused import FusedRun
 from ...execution.verify import verify
@@ -161,15 +161,15 @@ class ExperimentTrial:
         """Returns the measures of a trial, units in the names."""
         found, aligned = self._measure_motion(log, outcome.ended_s), align_records(log)
         for place, user in enumerate(self.protocol.users, 1):
-            force = _hand_force_n(aligned[user], log.scenario, outcome.ended_s)
+            split = split_torque(aligned[user], log.scenario)
+            whole_n = split.end_effector.find_force(split.operator)  # of the hand ON its arm
+            force = whole_n[aligned[user].t_s <= outcome.ended_s]
             which = f"_user{place}" if len(self.protocol.users) > 1 else ""
             found |= {
                 f"force_mean{which}_n": mean_force_n(force),
                 f"force_peak{which}_n": peak_force_n(force),
             }
-        own = log[self.protocol.users[0]]
-        used, rate_hz = own.used[self.slave.site], log.scenario.sites[self.slave.site].rate_hz
-        age_ms = (own.t_ns - used * NS_PER_S // rate_hz)[used >= 0] / 1e6
+        age_ms = sample_ages_ns(log, self.slave.site, self.protocol.users[0]) / 1e6
         return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
@@ -238,12 +238,6 @@ class SyntheticTrial(ExperimentTrial):
         with LogFile(path, force=True) as stream:
             write_virtual_log(lasts, stream, hands=hands)
         return self.settle(path)
-
-
-def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Array:
-    """Returns the force of a participant's hand ON its arm, shape (K, 2) or (K, 3), N."""
-    split = split_torque(own, scenario)
-    return split.end_effector.find_force(split.operator)[own.t_s <= until_s]
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
