@@ -107,18 +107,15 @@ def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: 
 
 
 def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
-    from rich.progress import Progress
-
     from ..studies.trials import run_trials
 
     to_do = Counter(trial.source for trial in batch)
-    with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:
-        task = progress.add_task("runs", total=len(batch))
+    with terminal.progress_bar("runs") as show:
 
         def done(result: "TrialResult") -> None:
-            progress.advance(task)
             source = result.trial.source
             to_do[source] -= 1
+            show(len(batch) - to_do.total(), len(batch))
             if not to_do[source] and not terminal.out.is_terminal:
                 terminal.print_text(f"{source}: ran")
 
