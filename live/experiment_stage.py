@@ -15,7 +15,7 @@ from trilat_net.core.ticks import NS_PER_S, tick_ns
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import Clock
 from trilat_net.studies.experiment.protocol import ExperimentPlan, Step
-from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry, find_slave
+from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry
 
 from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
@@ -64,7 +64,7 @@ class TrialWatch:
         return self._judge(view)
 
     def _judge(self, view: SessionView) -> list[str]:
-        slave, number, moments = view.sites[self.trial.slave.site], self.trial.planned.number, list[str]()
+        slave, number, moments = view.sites[self.trial.slave], self.trial.planned.number, list[str]()
         first, last = max(self._next, slave.window.first), slave.complete
         if last < first:
             return []
@@ -86,7 +86,7 @@ class TrialWatch:
         goal, trial = self.judge.goal, self.trial
         at = goal.place(t_s)
         return {
-            "target": {"site": trial.slave.site, "at": at.tolist(), "width_m": goal.width_m},
+            "target": {"site": trial.slave, "at": at.tolist(), "width_m": goal.width_m},
             "appeared": t_s >= goal.appears_s,
             "left_s": max(0.0, trial.longest_s - max(t_s, goal.appears_s)),
         }
@@ -195,7 +195,7 @@ class Stage:
             "key": step.key,
             "users": [{"site": at, "who": names[at], "state": state} for at, state in states.items()],
             "task": protocol.task.asks.format(
-                slave=find_slave(self._plan.scenarios[planned.condition]).site, task=protocol.task
+                slave=self._plan.scenarios[planned.condition].slave, task=protocol.task
             ),
             "trial": planned.trial,
             "trials": protocol.practice + protocol.trials,

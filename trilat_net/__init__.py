@@ -27,18 +27,15 @@ if _TYPE_CHECKING:
     from sites.running_session import session as session
     from sites.running_session import start as start
 
+    from .analysis.file_overview import info as info
     from .analysis.twin_growth import twin as twin
     from .api import bench as bench
     from .api import certify as certify
-    from .api import check_file as check_file
-    from .api import compare as compare
     from .api import export as export
-    from .api import info as info
     from .api import linear as linear
     from .api import make_env as make_env
     from .api import margin as margin
     from .api import metrics as metrics
-    from .api import recover as recover
     from .api import report as report
     from .api import simulate as simulate
     from .api import sweep as sweep
@@ -54,6 +51,8 @@ if _TYPE_CHECKING:
     from .log.log_reader import open_log as open_log
     from .log.log_signature import create_signing_keys as create_signing_keys
     from .log.log_signature import sign_log as sign_log
+    from .log.recover import recover as recover
+    from .log.session_check import check_file as check_file
     from .net.arm_client import ArmClient as ArmClient
     from .net.arm_client import SwitchClient as SwitchClient
     from .net.member_keys import create_keys as create_keys
@@ -78,6 +77,7 @@ if _TYPE_CHECKING:
     from .studies.experiment.experiment_run import open_experiment as open_experiment
     from .studies.experiment.experiment_run import run_experiment as run_experiment
     from .studies.hand_impedance import identify_hand as identify_hand
+    from .studies.log_comparison import compare as compare
     from .studies.trials import check as check
     from .studies.trials import trials as trials
 
@@ -91,15 +91,18 @@ _NAMES = {
     "sites.doctor": "doctor",
     "sites.network_benchmark": "ping_benchmark",
     "sites.running_session": "hand session start",
+    "trilat_net.analysis.file_overview": "info",
     "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify check_file compare export info linear make_env margin metrics recover "
-    "report simulate sweep tune verify view",
+    "trilat_net.api": "bench certify export linear make_env margin metrics report simulate sweep tune "
+    "verify view",
     "trilat_net.core.compiled_law": "compiled",
     "trilat_net.core.own_hand": "HandContext HandView",
     "trilat_net.core.user_law": "LawContext LawInput",
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
     "trilat_net.log.log_signature": "create_signing_keys sign_log",
+    "trilat_net.log.recover": "recover",
+    "trilat_net.log.session_check": "check_file",
     "trilat_net.net.arm_client": "ArmClient SwitchClient",
     "trilat_net.net.member_keys": "create_keys read_member_keys",
     "trilat_net.reporting.figures.registry": "figure",
@@ -114,6 +117,7 @@ _NAMES = {
     "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment open_experiment "
     "run_experiment",
     "trilat_net.studies.hand_impedance": "identify_hand",
+    "trilat_net.studies.log_comparison": "compare",
     "trilat_net.studies.trials": "check trials",
 }
 """By module what is offered of it."""

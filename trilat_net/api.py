@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .analysis.certificate.stability_certificate import Certificate
-from .analysis.file_overview import FileOverview, describe_files
 from .analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from .analysis.twin_growth import TWINS
 from .errors import UsageError
@@ -18,8 +17,6 @@ from .execution.virtual import SimulatedLog, simulate_scenario
 from .files import import_extra, make_results_folder
 from .log.accounting import MIN_COVERAGE
 from .log.log_reader import Log, open_log, open_logs
-from .log.recover import Recovery, recover_log
-from .log.session_check import LogCheckResult, check_log
 from .scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
@@ -27,7 +24,6 @@ if TYPE_CHECKING:
     from .studies.bench import BenchResults
     from .studies.executor import Workers
     from .studies.gym_environment import TeleoperationEnv
-    from .studies.log_comparison import LogComparison
     from .studies.sweep.margin_search import SweepMargins
     from .studies.sweep.sweep_results import SweepResults
     from .studies.tuning.tuning_plan import TuningResult
@@ -78,46 +74,6 @@ def simulate(
     log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
     log.warn_if_diverged()
     return log
-
-
-def info(*files: str | Path) -> FileOverview:
-    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log info`.
-
-    >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
-    >>> tn.info(path).to_dict()["sites"]["m"]["records"]
-    100
-
-    Raises:
-        LogError: a file cannot be read, or is no MCAP file.
-    """
-    return FileOverview(describe_files([Path(file) for file in files]))
-
-
-def check_file(*files: str | Path) -> LogCheckResult:
-    """Checks that a log is well-formed, complete and consistent; the command is `trilat log check`.
-
-    >>> path = tn.simulate("two_sites", duration_s=0.1).save("sound.mcap")
-    >>> tn.check_file(path).passed
-    True
-
-    Raises:
-        LogError: a file cannot be read.
-    """
-    return check_log([Path(file) for file in files])
-
-
-def recover(file: str | Path, out: str | Path | None = None, *, force: bool = False) -> Recovery:
-    """Makes a whole file of a torn or damaged one; the command is `trilat log recover`.
-
-    >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
-    >>> tn.recover(path, "whole.mcap").lossless
-    True
-
-    Raises:
-        LogError: the file cannot be read.
-        NothingSaved: nothing could be recovered.
-    """
-    return recover_log(Path(file), None if out is None else Path(out), force=force)
 
 
 def export(
@@ -201,22 +157,6 @@ def metrics(log: AnyLog) -> LogMetrics:
         LogError: the log cannot be read.
     """
     return compute_log_metrics(_open(log))
-
-
-def compare(*logs: AnyLog) -> "LogComparison":
-    """Compares logs side by side, with the differences of their experiments; the command is `trilat compare`.
-
-    >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
-    >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
-    2
-
-    Raises:
-        UsageError: there are fewer than two logs.
-        LogError: a log cannot be read.
-    """
-    from .studies.log_comparison import compare_logs
-
-    return compare_logs([_open(log) for log in logs])
 
 
 def report(

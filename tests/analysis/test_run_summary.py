@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import trilat_net
 from tests.log_editing import edited, recorded, without
-from trilat_net.analysis.file_overview import FileInventory, describe_files, summarise_run
+from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
 
 from . import logs
@@ -180,12 +180,12 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
     facts = inventory.channels("paper", RATES)[STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
     assert [file["finished"] for file in inventory.files] == [True, True]
-    assert describe_files(paths)["sites"]["m1"]["missing"] == 0
+    assert info(*paths).facts["sites"]["m1"]["missing"] == 0
 
 
 def test_progress_runs_once_through_all(tmp_path: Path) -> None:
     told: list[float] = []
-    describe_files([written(tmp_path, WHOLE)], lambda done, total: told.append(done / total))
+    info(written(tmp_path, WHOLE), progress=lambda done, total: told.append(done / total))
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.5 < told[-1] <= 1.0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.mcap_reader import McapReader
-from trilat_net.log.recover import Recovery, recover_log
+from trilat_net.log.recover import Recovery, recover
 from trilat_net.net.clock import SystemClock
 
 from .processes import Session, Stage
@@ -58,7 +58,7 @@ def killed(stage: Stage, after_s: float, *more: str) -> Killed:
     for name in SITES:
         assert session.processes[name].code() == 130
     torn = active_path(session.log)
-    recovery = recover_log(torn)
+    recovery = recover(torn)
     log = open_log(recovery.output)
     return Killed(
         recovery,

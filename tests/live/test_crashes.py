@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.recover import recover_log
+from trilat_net.log.recover import recover
 
 from .killing import SITES, killed
 from .processes import Session, Stage, executed_again
@@ -81,7 +81,7 @@ def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
         session.processes[name].signal(signal.SIGINT)
     assert again.code() == 0, again
     assert [session.processes[name].code() for name in SITES] == [130, 130, 130]
-    torn = recover_log(active_path(session.log))
+    torn = recover(active_path(session.log))
     assert torn.lossless
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)

@@ -8,7 +8,7 @@ import pytest
 from tests.faults.invariants import SILENT_TICKS
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
-from trilat_net.log.session_check import check_log
+from trilat_net.log.session_check import check_file
 
 from .processes import FOLLOWS, GLIDE, JOINS, PAPER, Session, Stage, engaged_after_s, pause, ticks_to_hold
 
@@ -58,7 +58,7 @@ def test_a_killed_site_started_again_follows_within_two_seconds(victims: Sequenc
     assert result.passed
     assert (result.differing, result.gaps) == (0, [])
     assert len(result.absences) == len(victims)
-    check = check_log([session.log])
+    check = check_file(session.log)
     assert check.passed, check.findings
 
 

@@ -14,13 +14,13 @@ import zstandard
 
 from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.log_editing import edited
-from trilat_net.analysis.file_overview import describe_files
+from trilat_net.analysis.file_overview import info
 from trilat_net.errors import TrilatError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
-from trilat_net.log.recover import recover_log
-from trilat_net.log.session_check import check_log
+from trilat_net.log.recover import recover
+from trilat_net.log.session_check import check_file
 
 LENGTHS = (0, 1, 7, 22, 255, 1 << 16, 1 << 20, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 NUMBERS = (
@@ -249,14 +249,14 @@ def _recovered(path: Path) -> None:
     output = path.with_name("made.mcap")
     output.unlink(missing_ok=True)
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):  # no disk is under test here
-        recover_log(path, output)
+        recover(path, output)
 
 
 READERS: dict[str, Callable[[Path], object]] = {
     "arrays": _arrays,
     "verify": _executed,
-    "info": lambda path: describe_files([path]),
-    "check": lambda path: check_log([path]),
+    "info": lambda path: info(path).facts,
+    "check": lambda path: check_file(path),
     "recover": _recovered,
     "replay": lambda path: preload_messages([path], PlaySelection(), 64 << 20),
 }

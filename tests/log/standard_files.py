@@ -8,7 +8,7 @@ from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
-from trilat_net.log.recover import recover_log
+from trilat_net.log.recover import recover
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.reporting.exports.ros2 import export_ros2
@@ -73,7 +73,7 @@ def made(folder: Path) -> dict[str, Path]:
     parts = sorted(folder.glob("parts-*.mcap"))
     torn = folder / "torn.mcap"
     torn.write_bytes((folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10])
-    recover_log(torn, folder / "recovered.mcap")
+    recover(torn, folder / "recovered.mcap")
     bag = folder / "live-ros2.mcap"
     export_ros2(open_log(folder / "live.mcap"), bag)
     found = (whole, folder / "live.mcap", parts[0], parts[-1], folder / "recovered.mcap")

@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 
 from tests.log.hostility import CHANGES, chunk, mangled, read_by_all
 from tests.log_editing import edited, opened, recorded
-from trilat_net.analysis.file_overview import describe_files
+from trilat_net.analysis.file_overview import info
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.verify import verify
 from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_chunk
@@ -191,4 +191,4 @@ def test_json_of_anything_is_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
     path.write_bytes(edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62}))
-    json.dumps(describe_files([path]), allow_nan=False)
+    json.dumps(info(path).facts, allow_nan=False)

@@ -26,7 +26,7 @@ from trilat_net.log.log_file import (
     LogFile,
 )
 from trilat_net.log.log_layout import active_path
-from trilat_net.log.recover import recover_log
+from trilat_net.log.recover import recover
 
 from .disks import Sent, SmallDisk, begun, file_on, sent
 
@@ -259,9 +259,9 @@ def test_without_room_for_the_end_whole_chunks_are_kept(error: int, tmp_path: Pa
         assert f"trilat log recover {active_path(path)}" in str(refusal.value)
         if not flushed:
             with pytest.raises(NothingSaved):
-                recover_log(active_path(path))
+                recover(active_path(path))
             continue
-        assert recover_log(active_path(path)).lossless
+        assert recover(active_path(path)).lossless
         assert messages(path) == flushed
         path.unlink()
 
@@ -333,7 +333,7 @@ def test_a_file_of_the_largest_size_is_cut_and_recovered(tmp_path: Path) -> None
     assert done.returncode == 5, done
     assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
     assert "split_size" in done.stdout
-    assert recover_log(active_path(path)).lossless
+    assert recover(active_path(path)).lossless
     assert [message[1] for message in messages(path)] == list(range(len(messages(path))))
     assert len(messages(path)) > 900
 
@@ -401,6 +401,6 @@ def test_what_was_flushed_survives_a_kill(tmp_path: Path) -> None:
     path, count = tmp_path / "run.mcap", 100
     done = subprocess.run([sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    result = recover_log(active_path(path))
+    result = recover(active_path(path))
     assert result.lossless
     assert [message[2] for message in messages(path)] == [b"%d" % n for n in range(count // 7 * 7)]

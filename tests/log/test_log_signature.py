@@ -22,7 +22,7 @@ from tests.log_editing import edited, recorded
 from trilat_net.errors import LogError, LogRefused, UsageError
 from trilat_net.log.log_signature import check_signatures, create_signing_keys, sign_log
 from trilat_net.log.mcap_reader import McapReader
-from trilat_net.log.recover import recover_log
+from trilat_net.log.recover import recover
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
     path.write_bytes(recorded("paper")[:-200])
     with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
         sign_log(path, private)
-    made = recover_log(path).output
+    made = recover(path).output
     assert problem(made, key) == f"there is no signature {made}.sig"
     sign_log(made, private)
     assert problem(made, key) == ""

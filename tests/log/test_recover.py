@@ -26,7 +26,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
-from trilat_net.log.recover import Recovery, recover_log, recovered_path
+from trilat_net.log.recover import Recovery, recover, recovered_path
 
 anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12)
 positions = st.floats(0, 1, exclude_max=True)
@@ -90,7 +90,7 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
         path.unlink()
     path = folder / name
     path.write_bytes(data)
-    result = recover_log(path)
+    result = recover(path)
     assert path.read_bytes() == data
     assert sorted(folder.iterdir()) == sorted({path, result.output})
     return result, result.output.read_bytes()
@@ -331,11 +331,11 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
     torn.write_bytes(log()[:-100])
     (tmp_path / "run.mcap").write_bytes(b"precious")
     with pytest.raises(UsageError, match=r"run\.mcap: exists"):
-        recover_log(torn)
+        recover(torn)
     with pytest.raises(UsageError, match="is the file itself"):
-        recover_log(torn, torn, force=True)
+        recover(torn, torn, force=True)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
-    recover_log(torn, force=True)
+    recover(torn, force=True)
     assert messages((tmp_path / "run.mcap").read_bytes()) == messages(log())
     assert torn.read_bytes() == log()[:-100]
 
@@ -345,10 +345,10 @@ def test_where_there_is_nothing_to_save_no_file_is_made(content: bytes, tmp_path
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(NothingSaved, match="there is nothing in it that could be saved"):
-        recover_log(path)
+        recover(path)
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(LogError, match="cannot be read"):
-        recover_log(tmp_path)
+        recover(tmp_path)
 
 
 # The command.

@@ -21,8 +21,8 @@ from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import MAGIC, RECORD_HEAD_BYTES, RecordFrame, RecordScanner, unpack_chunk
-from trilat_net.log.recover import recover_log
-from trilat_net.log.session_check import LogCheckResult, check_log
+from trilat_net.log.recover import recover
+from trilat_net.log.session_check import LogCheckResult, check_file
 
 WHOLE = recorded("paper")
 DATA = edited(WHOLE, chunk_bytes=8192)
@@ -35,7 +35,7 @@ def judged(folder: Path, *files: bytes) -> LogCheckResult:
     for n, data in enumerate(files):
         paths.append(folder / f"part{n}.mcap")
         paths[-1].write_bytes(data)
-    return check_log(paths)
+    return check_file(*paths)
 
 
 def failed(found: LogCheckResult) -> set[str]:
@@ -187,7 +187,7 @@ def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
     """Nothing is missing over the seams; what a site's memory filled is there, and executes like the rest."""
     parts = split(tmp_path, refilled=range(30, 50))
     assert len(parts) >= 3
-    found = check_log(parts)
+    found = check_file(*parts)
     assert found.passed, found.findings
     assert "20 came late" in next(f.text for f in found.findings if f.check == "sequence")
     verdict = verify(open_log(*parts))
@@ -197,8 +197,8 @@ def test_parts_and_what_came_late_are_whole_and_verify(tmp_path: Path) -> None:
 def test_a_part_alone_is_judged_from_where_it_begins(tmp_path: Path) -> None:
     """What came before is in the parts before; what it lacks itself is missing all the same."""
     parts = split(tmp_path, refilled=range(0))
-    assert check_log(parts[1:2]).passed
-    first_and_last = check_log([parts[0], parts[2]])
+    assert check_file(*parts[1:2]).passed
+    first_and_last = check_file(parts[0], parts[2])
     assert failed(first_and_last) == {"sequence", "accounts"}
     assert verify(open_log(parts[0], parts[2])).gaps
 
@@ -207,9 +207,9 @@ def test_a_recovered_file_is_sound_but_for_what_was_lost(tmp_path: Path) -> None
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(DATA[: len(DATA) // 2])
     with mock.patch("os.fsync"), mock.patch("os.fdatasync"):
-        made = recover_log(torn).output
-    assert "whole" in failed(check_log([torn]))
-    found = check_log([made])
+        made = recover(torn).output
+    assert "whole" in failed(check_file(torn))
+    found = check_file(made)
     assert failed(found) & BUILT == set(), found.findings
     assert "accounts" not in failed(found), found.findings
     verdict = verify(open_log(made))
@@ -247,7 +247,7 @@ def test_what_is_no_mcap_file_is_not_sound(data: bytes, tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
-        check_log([tmp_path / "none.mcap"])
+        check_file(tmp_path / "none.mcap")
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
-from trilat_net.log.session_check import check_log
+from trilat_net.log.session_check import check_file
 from trilat_net.net import topics
 
 from .relay import RelayClock
@@ -102,7 +102,7 @@ def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
     result = verify(log)
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     assert "missing 0" in log.account("s")
-    check = check_log([session.path])
+    check = check_file(session.path)
     assert check.passed, check.findings
 
 
@@ -122,7 +122,7 @@ def test_site_may_come_late_where_first_one_begins_without_it(tmp_path: Path) ->
     assert set(log["m1"].mode[:first]) == {"waiting"}
     assert {str(log[name].mode[-1]) for name in log.sites} == {"run"}
     assert verify(log).passed
-    assert check_log([session.path]).passed
+    assert check_file(session.path).passed
 
 
 @pytest.mark.parametrize("dies", ["m1", pytest.param("s", marks=pytest.mark.long)])
@@ -178,7 +178,7 @@ def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path
     assert log.missing("m") == away  # the memory of the first start went with it; the other site heard all
     assert len(log["s"]) == 1600
     assert log.missing("s") == 0
-    assert "agree with what is there" in [finding.text for finding in check_log([session.path]).findings]
+    assert "agree with what is there" in [finding.text for finding in check_file(session.path).findings]
 
 
 def test_a_sample_whose_record_died_leaves_few_ticks_open(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_a_start_dead_before_tick_0_leaves_its_place(dies_ms: int, again_ms: int
     assert len({event.boots["m"] for event in admitted}) == 2
     assert [last + 1 for _, last in log.absences["m"]] == [log.starts["m"][-1][0]]
     assert verify(log).passed
-    assert check_log([session.path]).passed
+    assert check_file(session.path).passed
 
 
 def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> None:
@@ -339,7 +339,7 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
     assert log.missing("m") == log.missing("s") == 0
     assert "missing 0" in log.account("m")
     assert verify(log).passed
-    assert check_log(parts).passed
+    assert check_file(*parts).passed
 
 
 def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None:

@@ -24,12 +24,13 @@ from numpy.typing import ArrayLike
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import open_regular
+from ..log.accounting import Account
 from ..log.log_layout import SESSION
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import ChannelInfo, McapReader, Progress, shift_progress
 from ..log.site_log import SiteLog
 from ..net import topics
-from ..net.topics import ticks_per_stats
+from ..net.topics import count_messages, number_message
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario.expect import END_WINDOW_S
 from .link_summary import (
@@ -141,21 +142,18 @@ def _numbers(
     of_a_site = where is not None and where.session == session and where.member in rates_hz
     if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
         return {"missing": None, "gaps": None, "duplicates": None}
-    every = ticks_per_stats(rates_hz[where.member]) if where.channel == topics.LINK else 1
-    came = sequence.astype(np.int64) // every
-    there, duplicates = np.unique(came), len(came) - len(np.unique(came))
+    account, channel, rate_hz = Account(), where.channel, rates_hz[where.member]
+    for tick in sequence.tolist():
+        account.take(number_message(channel, tick, rate_hz))
     for first, last in absences.get(where.member, ()):  # not made: they are not missing
-        there = np.union1d(there, np.arange(-(-first // every), -(-(last + 1) // every)))
-    steps = np.diff(there, prepend=-1)
-    before = np.flatnonzero(steps > 1)[:MOST_LISTED_GAPS]
-    gaps = [[int(there[n] - steps[n] + 1), int(there[n] - 1)] for n in before]
-    missing = int(there[-1]) + 1 - len(there) if len(there) else 0
-    return {"missing": missing, "gaps": gaps, "duplicates": duplicates}
+        account.begin_anew(*(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first)))
+    gaps = account.gaps[:MOST_LISTED_GAPS]
+    return {"missing": account.missing, "gaps": gaps, "duplicates": account.duplicate}
 
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """What a file, or the parts of one log, hold; see `describe_files`."""
+    """What a file, or the parts of one log, hold; see `info`."""
 
     facts: JsonObject
 
@@ -173,14 +171,19 @@ class FileOverview(Result):
         return [{"topic": topic, **channel} for topic, channel in self.facts["channels"].items()]
 
 
-def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> JsonObject:
-    """Returns the facts of a file, or of the parts of one log, ready for JSON; keys end in their units.
+def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
+    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log info`.
 
     `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in `problem`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
+    >>> tn.info(path).to_dict()["sites"]["m"]["records"]
+    100
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
     """
+    paths = [Path(file) for file in files]
 
     def report(half: int) -> Progress | None:
         return progress and (lambda done, total: progress(half * total + done, 2 * total))
@@ -207,7 +210,7 @@ def describe_files(paths: Sequence[Path], progress: Progress | None = None) -> J
         except LogError as error:
             facts["problem"] = str(error)
     facts["channels"] = inventory.channels(name, rates_hz, absences)
-    return facts
+    return FileOverview(facts)
 
 
 _PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")

@@ -15,11 +15,11 @@ _LOSSY_EXIT_CODE = 3
 @options.command("run.mcap")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
-    from ..analysis.file_overview import FileOverview, describe_files
+    from ..analysis.file_overview import info
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        facts = describe_files(files, progress)
-    terminal.print_result(FileOverview(facts), as_json=as_json)
+        found = info(*files, progress=progress)
+    terminal.print_result(found, as_json=as_json)
     for path in () if as_json else files:
         terminal.warn_if_unfinished(path)
 
@@ -37,10 +37,10 @@ def log_check_command(
     Exit code 0: sound; 1: not sound; 2: no such file. Of files of other programs only the structure is
     checked.
     """
-    from ..log.session_check import check_log
+    from ..log.session_check import check_file
 
     with terminal.progress_bar(f"checking {files[0]}") as progress:
-        found = check_log(files, progress)
+        found = check_file(*files, progress=progress)
     if key is not None:
         from ..log.log_signature import check_signatures
 
@@ -92,10 +92,10 @@ def log_recover_command(
     Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is listed; 1: nothing
     could be recovered.
     """
-    from ..log.recover import recover_log
+    from ..log.recover import recover
 
     with terminal.progress_bar(f"reading {file}") as progress:
-        result = recover_log(file, output, force=force, progress=progress)
+        result = recover(file, output, force=force, progress=progress)
     terminal.print_result(result, as_json=as_json)
     if not result.lossless:
         raise typer.Exit(_LOSSY_EXIT_CODE)

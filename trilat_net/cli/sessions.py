@@ -105,12 +105,7 @@ def ping_command(
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
     *,
     reach: options.Reach,
-    count: Annotated[
-        int,
-        value(
-            "--count", "N", "Round trips to each member.", callback=options.check_range(5, 10_000, "a number")
-        ),
-    ] = 50,
+    count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
         str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)

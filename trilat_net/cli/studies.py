@@ -107,18 +107,15 @@ def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: 
 
 
 def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
-    from rich.progress import Progress
-
     from ..studies.trials import run_trials
 
     to_do = Counter(trial.source for trial in batch)
-    with Progress(console=terminal.out, transient=True, disable=not terminal.out.is_terminal) as progress:
-        task = progress.add_task("runs", total=len(batch))
+    with terminal.progress_bar("runs") as show:
 
         def done(result: "TrialResult") -> None:
-            progress.advance(task)
             source = result.trial.source
             to_do[source] -= 1
+            show(len(batch) - to_do.total(), len(batch))
             if not to_do[source] and not terminal.out.is_terminal:
                 terminal.print_text(f"{source}: ran")
 
@@ -252,10 +249,10 @@ def compare_command(
         for name in options.given_options(context):
             if name not in ("files", "--json"):
                 raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
-        from ..studies.log_comparison import compare_logs
+        from ..studies.log_comparison import compare
 
         logs = [terminal.open_with_progress(file) for file in files or []]
-        terminal.print_result(compare_logs(logs), as_json=as_json)
+        terminal.print_result(compare(*logs), as_json=as_json)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave the logs out, or --tune")

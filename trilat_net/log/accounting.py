@@ -298,17 +298,17 @@ class SessionAccounts:
 
     Args:
         session: its name.
-        scenario: its scenario.
+        scenario: its scenario; None if it cannot be read.
         continued: True for a later part of a log, which is counted from its first message on.
         events: True if events have numbers.
     """
 
     def __init__(
-        self, session: str, scenario: Scenario, *, continued: bool = False, events: bool = True
+        self, session: str, scenario: Scenario | None, *, continued: bool = False, events: bool = True
     ) -> None:
         self._session, self._continued = session, continued
-        self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-        self._ticks = {name: scenario.ticks(name) for name in scenario.names}
+        self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()} if scenario else {}
+        self._ticks = {name: scenario.ticks(name) for name in scenario.names} if scenario else {}
         self._ends: dict[str, int] = {}
         self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
@@ -323,7 +323,7 @@ class SessionAccounts:
         """Opens the account of a channel, if it is a numbered one of the session."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is not None and key.session == self._session and key.channel in self._numbered:
-            self._accounts[topic] = Account()
+            self._accounts.setdefault(topic, Account())
 
     def take(self, topic: str, sequence: int, payload: bytes = b"") -> None:
         """Counts a message by its sequence number; the payload of an event may state the number of ticks."""
@@ -335,54 +335,58 @@ class SessionAccounts:
             event = decode(payload, Event, READABLE) if channel == topics.EVENT and payload else None
         number = number_message(channel, sequence, self._rates_hz.get(member, 0))
         if event is None:
-            self._count(topic, number)
+            self.count(topic, number)
         else:
             self.take_event(topic, number, event)
         if channel == topics.LINK:
             self._expect(member, topics.STATE, sequence + 1)
 
-    def take_event(self, topic: str, number: int, event: Event) -> None:
-        """Counts an event, and what it says of the ticks of a site."""
+    def take_event(self, topic: str, number: int, event: Event) -> bool:
+        """Counts an event, and what it says of the ticks of a site; returns False if it is there already."""
         starts = self._starts.setdefault(topic, {})
         if event.boot not in starts and len(starts) < MAX_STARTS:
             starts[event.boot] = Account() if starts else self._accounts[topic]
             self._accounts[topic] = starts[event.boot]
         account = starts.get(event.boot, self._accounts[topic])
-        if account is next(iter(starts.values())):
-            self._count(topic, number, account)
-        else:
-            account.take(number)
-        if event.member in self._rates_hz and 0 <= event.ticks < 1 << 32:
-            if event.kind == "end":
-                self.expect(event.member, event.ticks)
-                self._ends[event.member] = event.ticks
-            elif event.kind == "join":
-                made, rate_hz = self._ends.pop(event.member, 0), self._rates_hz[event.member]
-                for channel, gap in self._find_start_gaps(event.member, event.boot):
-                    base = self._bases.get(self._topic(event.member, channel), 0)
-                    gap.begin_anew(*(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made)))
-            elif event.kind == OVERRUN:
-                self._leave_out(event)
-            elif event.kind == LAST and event.about in self._rates_hz:
-                for channel, gap in self._find_start_gaps(event.about, event.boots.get(event.about, 0)):
-                    base = self._bases.get(self._topic(event.about, channel), 0)
-                    heard = number_message(channel, event.ticks, self._rates_hz[event.about])
-                    gap.hear_of(heard - base)
+        is_first = account is next(iter(starts.values()))
+        new = self.count(topic, number, account) if is_first else account.take(number)
+        self.hear(event)
+        return new
 
-    def _leave_out(self, event: Event) -> None:
-        rate_hz = self._rates_hz[event.member]
-        for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
-            for channel in (topics.STATE, topics.LINK):
-                topic, tick = self._topic(event.member, channel), int(last) + 1
-                if topic in self._accounts and int(first) < tick <= event.ticks:
-                    base = self._bases.get(topic, 0)
-                    numbers = skipped_numbers(channel, tick, tick - int(first), rate_hz)
-                    self._accounts[topic].begin_anew(*(number - base for number in numbers))
+    def hear(self, event: Event) -> None:
+        """Counts what an event says of the ticks of a site."""
+        if event.member not in self._rates_hz or event.ticks < 0:
+            return
+        if event.kind == "end":
+            self._ends[event.member] = min(event.ticks, self._ticks[event.member])
+            self.expect(event.member, self._ends[event.member])
+        elif event.kind == "join" and event.ticks <= self._ticks[event.member]:
+            made, rate_hz = self._ends.pop(event.member, 0), self._rates_hz[event.member]
+            for channel, gap in self._find_start_gaps(event.member, event.boot):
+                base = self._bases.get(self._topic(event.member, channel), 0)
+                gap.begin_anew(*(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made)))
+        elif event.kind == OVERRUN:
+            for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
+                if int(first) <= int(last) < event.ticks:
+                    self.leave_out(event.member, int(last) + 1, int(last) + 1 - int(first))
+        elif event.kind == LAST and event.about in self._rates_hz:
+            for channel, gap in self._find_start_gaps(event.about, event.boots.get(event.about, 0)):
+                base = self._bases.get(self._topic(event.about, channel), 0)
+                gap.hear_of(number_message(channel, event.ticks, self._rates_hz[event.about]) - base)
 
-    def _count(self, topic: str, number: int, account: Account | None = None) -> None:
+    def leave_out(self, site: str, tick: int, skipped: int) -> None:
+        """Counts nothing as missing of so many ticks before one, which a site did not make."""
+        for channel in (topics.STATE, topics.LINK):
+            topic = self._topic(site, channel)
+            if topic in self._accounts:
+                base = self._bases.get(topic, 0)
+                numbers = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
+                self._accounts[topic].begin_anew(*(number - base for number in numbers))
+
+    def count(self, topic: str, number: int, account: Account | None = None) -> bool:
+        """Counts a message by its number in its channel; returns False if it is there already."""
         base = self._bases.setdefault(topic, number if self._continued else 0)
-        if number >= base:
-            (account or self._accounts[topic]).take(number - base)
+        return number < base or (account or self._accounts[topic]).take(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         for channel in (topics.STATE, topics.LINK):
@@ -412,6 +416,15 @@ class SessionAccounts:
             for topic, account in self._accounts.items()
             if account.expected or topic.split("/")[-2] in self._rates_hz
         }
+
+    def list_starts(self, topic: str) -> list[Account]:
+        """Returns the accounts of a channel: of events one for each start of their sender."""
+        return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
+
+    def list_gaps(self, topic: str) -> list[tuple[int, int]]:
+        """Returns the missing numbers of a channel, as (first, last)."""
+        base = self._bases.get(topic, 0)
+        return [(base + first, base + last) for one in self.list_starts(topic) for first, last in one.gaps]
 
     def coverage(self) -> Coverage:
         """Returns the records that are there, of the ticks that each site made, else those of the run."""

@@ -17,7 +17,6 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +27,7 @@ import numpy as np
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
 from ..errors import LogError, ScenarioError, UnknownName, WireError
+from ..fields import suggest_nearest
 from ..files import open_regular
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
@@ -565,8 +565,7 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
     status = path.stat()  # raises what open would, in the same words
     links = _read_links(path, status.st_mtime_ns, status.st_size)
     if link not in links:
-        near = get_close_matches(link, list(links), n=1, cutoff=0.5)
-        hint = f"; did you mean {near[0]!r}?" if near else "."
+        hint = suggest_nearest(link, list(links)) or "."
         raise ValueError(f"has no link {link!r}{hint} Its links are {', '.join(links)}")
     if not links[link]:
         raise ValueError(f"nothing came over {link} in it")

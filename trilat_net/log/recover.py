@@ -127,26 +127,35 @@ def recovered_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}.recovered{path.suffix or '.mcap'}")
 
 
-def recover_log(
-    path: Path, output: Path | None = None, *, force: bool = False, progress: Progress | None = None
+def recover(
+    file: str | Path,
+    out: str | Path | None = None,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
 ) -> Recovery:
-    """Makes a finished file of one that is cut off or damaged.
+    """Makes a whole file of a torn or damaged one; the command is `trilat log recover`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
+    >>> tn.recover(path, "whole.mcap").lossless
+    True
 
     Args:
-        path: the file.
-        output: the file to be made; by default `recovered_path`.
+        file: the torn one.
+        out: the file to be made; by default `recovered_path`.
         force: True if it may replace one.
         progress: called after every record of the file.
 
     Raises:
         LogError: the file cannot be read.
-        NothingSaved: there is nothing in it that could be kept.
+        NothingSaved: nothing could be recovered.
         UsageError: the output exists, or cannot be made.
         LogRefused: the disk refused; nothing was made.
     """
+    path = Path(file)
     if not path.name:
         raise LogError(f"{path}: cannot be read: Is a directory")
-    made = output or recovered_path(path)
+    made = recovered_path(path) if out is None else Path(out)
     if not made.name:
         raise UsageError(f"{made}: is a directory; name a file with -o")
     if made.exists() and path.exists() and made.samefile(path):

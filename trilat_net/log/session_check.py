@@ -9,7 +9,7 @@ import hashlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,11 +20,11 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import messages, topics
-from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
+from ..net.topics import number_message
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
-from .accounting import LAST, Account, parse_counts
+from .accounting import Account, SessionAccounts, parse_counts
 from .findings import CheckReport, Finding, Findings
 from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
 from .log_reader import Log
@@ -33,6 +33,7 @@ from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_p
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 
+AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
 MAX_AHEAD_NS = 10 * NS_PER_S
 """No message is sent more than this after it came, whatever the clocks."""
 MAX_BOOTS = 64
@@ -71,13 +72,19 @@ class LogCheckResult(CheckReport):
         return [{**row, "places": [at._asdict() for at in row["places"]]} for row in rows]
 
 
-def check_log(paths: Sequence[Path], progress: Progress | None = None) -> LogCheckResult:
-    """Checks every byte of a file, or of files that are parts of one log.
+def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
+    """Checks that a log is well-formed, complete and consistent; the command is `trilat log check`.
+
+    Every byte of its file is checked, or of its parts.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("sound.mcap")
+    >>> tn.check_file(path).passed
+    True
 
     Raises:
         LogError: a file cannot be read, or is of another session than the files before it.
     """
-    check = SessionCheck()
+    check, paths = SessionCheck(), [Path(file) for file in files]
     try:
         total, before = sum(path.stat().st_size for path in paths), 0
         for path in sorted(paths, key=lambda path: path.name):
@@ -98,36 +105,36 @@ class ChannelCheck:
         about: metadata of the session.
         scenario: its scenario; None if it cannot be read.
         findings: receives the problems.
+        accounts: those of the session, which count its messages.
 
     Attributes:
         rate_hz: tick rate of the member; 0 of the recorder.
-        accounts: received and missing messages, by the member's boot.
+        received: number of messages, each number once.
+        boots: the member's starts.
         first, last: number and publish time of the messages with the lowest and the highest number.
-        ends: by boot how many ticks the member made, of those that have stated it.
-        joins: by boot the first tick, of those that joined the running session.
-        heard: by site and boot, how many ticks of the start before the member heard of.
-        skips: by boot the stretches of ticks that its records leave out: the tick after each, how many.
     """
 
     def __init__(
-        self, key: topics.KeyParts, about: Mapping[str, str], scenario: Scenario | None, findings: Findings
+        self,
+        key: topics.KeyParts,
+        about: Mapping[str, str],
+        scenario: Scenario | None,
+        findings: Findings,
+        accounts: SessionAccounts,
     ) -> None:
         self.member, self.kind = key.member, key.channel
+        self._topic = "/" + topics.key(key.session, key.member, key.channel)
         self.rate_hz, self._layout = 0, None
         if scenario is not None and key.member in scenario.sites:
             self.rate_hz = scenario.sites[key.member].rate_hz
             self._layout = scenario.layout(key.member)
-        self.accounts: dict[int, Account] = defaultdict(Account)
+        self.received, self.boots = 0, set[int]()
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
-        self.ends: dict[int, int] = {}
-        self.joins: dict[int, int] = {}
-        self.heard: dict[tuple[str, int], int] = {}
-        self.skips: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        self._findings = findings
+        self._findings, self._accounts = findings, accounts
         self._epoch_ns = _parse_number(about, "epoch_unix_ns")
         self._version = _parse_number(about, "schema_version")
-        self._in_file: dict[int, Account] = self.accounts
+        self._in_file: dict[int, Account] = {}  # by boot
         self._file, self._log_ns = "", 0
 
     @property
@@ -135,52 +142,9 @@ class ChannelCheck:
         """Its short name, as in "m1/state"."""
         return f"{self.member}/{self.kind}"
 
-    @property
-    def received(self) -> int:
-        """Number of messages, each number once."""
-        return sum(account.received for account in self.accounts.values())
-
-    @property
-    def missing(self) -> int:
-        """Number of missing messages."""
-        return sum(account.missing for account in self.accounts.values())
-
-    def gaps(self, *, whole: bool) -> list[tuple[int, int]]:
-        """Returns missing numbers, as (first, last); those before the first one only if `whole`."""
-        begins = 0 if whole or self.first is None else self.first[0]
-        all_gaps = (gap for account in self.accounts.values() for gap in account.gaps)
-        return [(max(first, begins), last) for first, last in all_gaps if last >= begins]
-
-    def expect(self, events: "ChannelCheck", most: int) -> None:
-        """Counts as missing what every start of the member sent, by its events, and is not there."""
-        for boot, account in self.accounts.items():
-            ends, first = events.ends, events.joins.get(boot, 0)
-            if len(self.accounts) == 1 or boot in ends:
-                stated = ends.get(boot, max(ends.values(), default=0))
-                account.expect(count_messages(self.kind, min(stated, most), self.rate_hz))
-            if 0 < first <= most:
-                account.begin_anew(count_messages(self.kind, first, self.rate_hz))
-
-    def hear_of(self, others: "ChannelCheck", joins: Mapping[int, int]) -> None:
-        """Counts as missing what starts of the member sent that another member heard of, and is not there."""
-        for (site, boot), ticks in others.heard.items():
-            first = joins.get(boot, 0)
-            before = [(joins.get(one, 0), one) for one in self.accounts if joins.get(one, 0) < first]
-            if site == self.member and first:
-                heard = number_message(self.kind, min(ticks, first), self.rate_hz)
-                account = self.accounts[max(before, default=(0, 0))[1]]
-                if heard - account.last - 1 > count_under_way(self.kind, self.rate_hz):
-                    account.expect(heard)
-
-    def leave_out(self, records: "ChannelCheck") -> None:
-        """Counts nothing as missing of ticks of which the member's records say that it did not make them."""
-        for boot, skips in records.skips.items():
-            for tick, skipped in skips:
-                self.accounts[boot].begin_anew(*skipped_numbers(self.kind, tick, skipped, self.rate_hz))
-
     def begin(self, file: str, channel: ChannelInfo) -> None:
         """Begins with another file, and checks how it describes the channel."""
-        self._in_file = defaultdict(Account) if self._file else self.accounts
+        self._in_file = defaultdict(Account)
         self._file, self._log_ns = file, 0
         if fault := self._find_schema_fault(channel):
             self._add("schema", None, fault)
@@ -217,21 +181,19 @@ class ChannelCheck:
             self._add("schema", offset, text)
         if sender != self.member:
             self._add("schema", offset, f"a message says that it is of {sender[:40]!r}")
-        if isinstance(message, messages.State) and (skipped := count_skipped_ticks(message.cmd)):
-            self.skips[message.boot].append((message.tick, skipped))
         if number >= 0:  # events have numbers from version 3 on
             if stored.sequence != sequence & 0xFFFFFFFF:
                 self._add("sequence", offset, f"number {sequence} is stored as {stored.sequence}")
-            self._count(message.boot, number, stored.publish_time_ns, offset)
+            self._count(message, number, stored.publish_time_ns, offset)
+        elif isinstance(message, messages.Event):
+            self._accounts.hear(message)
         self._check_times(stored, number, sent_ns, offset)
 
     def _add(self, check: str, offset: int | None, text: str) -> None:
         self._findings[check].add(self._file, offset, f"{self.name}: {text}")
 
-    def _identify(
-        self, message: messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
-    ) -> tuple[str, int, int, int | None]:
-        """Returns what a message says that it is, and notes what an event says of starts.
+    def _identify(self, message: AnyMessage) -> tuple[str, int, int, int | None]:
+        """Returns what a message says that it is.
 
         That is its sender, its number in its channel (-1 for none), the number that the file should state,
         and when it was sent, ns since the epoch; None if it does not state that.
@@ -244,29 +206,26 @@ class ChannelCheck:
                 number = number_message(self.kind, message.tick, self.rate_hz)
                 return message.site, number, message.tick, message.t_ns
             case messages.Event():
-                stated = {"end": self.ends, "join": self.joins}.get(message.kind, {})
-                if message.boot in stated or len(stated) < MAX_BOOTS:
-                    stated[message.boot] = message.ticks
-                of_start = message.about, message.boots.get(message.about, 0)
-                if message.kind == LAST and (of_start in self.heard or len(self.heard) < MAX_BOOTS):
-                    self.heard[of_start] = max(message.ticks, self.heard.get(of_start, 0))
                 # a recorder's own events are stamped as it hears them; before the epoch there is no time
                 stamped = message.t_ns >= 0 and message.member != topics.RECORDER
                 event_ns = message.t_ns if stamped else None
                 return message.member, message.n, max(0, message.n), event_ns
-        account = self.accounts.get(message.boot)
-        number = 0 if account is None else account.expected
+        number = self._in_file[message.boot].expected
         return topics.RECORDER, number, number, None
 
-    def _count(self, boot: int, number: int, publish_ns: int, offset: int) -> None:
-        if boot not in self.accounts and len(self.accounts) >= MAX_BOOTS:
+    def _count(self, message: AnyMessage, number: int, publish_ns: int, offset: int) -> None:
+        if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
             self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
             return
-        new = self.accounts[boot].take(number)
-        if self._in_file is not self.accounts:  # parts may repeat a message, a file may not
-            new = self._in_file[boot].take(number)
-        if not new:
+        self.boots.add(message.boot)
+        if not self._in_file[message.boot].take(number):  # parts may repeat a message, a file may not
             self._add("sequence", offset, f"number {number} is there twice")
+        if isinstance(message, messages.Event):
+            self.received += self._accounts.take_event(self._topic, number, message)
+        else:
+            self.received += self.kind == topics.STATS or self._accounts.count(self._topic, number)
+        if self.rate_hz and isinstance(message, messages.State) and message.cmd:
+            self._accounts.leave_out(self.member, message.tick, count_skipped_ticks(message.cmd))
         place = (number, publish_ns)
         self.first = place if self.first is None else min(self.first, place)
         self.last = place if self.last is None else max(self.last, place)
@@ -307,6 +266,7 @@ class SessionCheck:
         self._counts: Counter[str] = Counter()
         self._scenario: Scenario | None = None
         self._about: dict[str, str] = {}
+        self._counted = SessionAccounts("", None)
         self._accounts: dict[str, str] = {}  # of the last file
         self._first_part = False  # the files begin with the session
         self._views = self._version = 0
@@ -363,9 +323,16 @@ class SessionCheck:
         same = ("session", "epoch_unix_ns", "scenario_sha256")
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
             raise LogError(f"{self._file}: is of another session; look at it alone")
-        self.ours, self._about, self._version = True, about, _parse_number(about, "schema_version")
+        is_new, self.ours = not self.ours, True
+        self._about, self._version = about, _parse_number(about, "schema_version")
         self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
         self._check_scenario(reader.attachments[SCENARIO])
+        if is_new:
+            continued = not self._first_part
+            self._counted = SessionAccounts(about["session"], self._scenario, continued=continued)
+            for name in self._scenario.names if self._scenario else ():  # events may tell of them first
+                for channel in (topics.STATE, topics.LINK):
+                    self._counted.open("/" + topics.key(about["session"], name, channel))
 
     def _check_scenario(self, text: bytes) -> None:
         finding, about = self._findings["scenario"], self._about
@@ -401,7 +368,9 @@ class SessionCheck:
         if topic not in self.channels:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
                 finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
-            self.channels[topic] = ChannelCheck(key, self._about, self._scenario, self._findings)
+            self._counted.open(topic)
+            of = self._about, self._scenario, self._findings, self._counted
+            self.channels[topic] = ChannelCheck(key, *of)
         self.channels[topic].begin(self._file, channel)
         return self.channels[topic]
 
@@ -417,18 +386,6 @@ class SessionCheck:
             if "chain" in found:
                 yield found["chain"].tell("")
             return
-        told, records = (
-            {check.member: check for check in self.channels.values() if check.kind == kind}
-            for kind in (topics.EVENT, topics.STATE)
-        )
-        for check in self.channels.values():  # what a member published in the ticks that it stated
-            if check.kind in (topics.STATE, topics.LINK) and check.member in told:
-                most = self._scenario.ticks(check.member) if self._scenario and check.rate_hz else 0
-                check.expect(told[check.member], most)
-                for events in told.values():
-                    check.hear_of(events, told[check.member].joins)
-                if check.member in records:
-                    check.leave_out(records[check.member])
         yield self._check_sequence()
         yield self._check_accounts()
         yield found["chain"].tell(self._chain_text)
@@ -444,11 +401,13 @@ class SessionCheck:
     def _check_sequence(self) -> Finding:
         finding, missing, reordered = self._findings["sequence"], 0, 0
         gaps = []
-        for check in self.channels.values():
-            for first, last in check.gaps(whole=self._first_part):
+        for topic, check in self.channels.items():
+            if check.kind == topics.STATS:
+                continue
+            for first, last in self._counted.list_gaps(topic):
                 missing += last - first + 1
                 gaps.append(f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}")
-            reordered += sum(account.reordered for account in check.accounts.values())
+            reordered += sum(account.reordered for account in self._counted.list_starts(topic))
         received = sum(check.received for check in self.channels.values())
         text = f"{received} messages of {len(self.channels)} channels"
         if missing:
@@ -469,15 +428,17 @@ class SessionCheck:
         if not self._accounts:
             return finding.tell("there are none: the file was not finished")
         own = (check for check in self.channels.values() if check.member == topics.RECORDER)
-        if not self._first_part or len({boot for check in own for boot in check.accounts}) > 1:
+        if not self._first_part or len({boot for check in own for boot in check.boots}) > 1:
             return finding.tell("tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
             stated = parse_counts(self._accounts.get(topic, ""))
-            there = {"received": check.received, "missing": check.missing}
-            for word, count in stated.items():
-                if check.kind != topics.STATS and count != there[word]:
-                    text = f"{check.name}: {count} {word} by the account, {there[word]} by the file"
-                    finding.add("", None, text)
+            if check.kind != topics.STATS:
+                missing = sum(account.missing for account in self._counted.list_starts(topic))
+                there = {"received": check.received, "missing": missing}
+                for word, count in stated.items():
+                    if count != there[word]:
+                        text = f"{check.name}: {count} {word} by the account, {there[word]} by the file"
+                        finding.add("", None, text)
             if not stated and self._version >= _ACCOUNTS_SINCE:
                 finding.add("", None, f"{check.name}: has no account")
         return finding.tell("agree with what is there")

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, comparison_to_json
 from ..errors import UsageError
-from ..log.log_reader import Log
+from ..log.log_reader import Log, open_log
 from ..reporting.certificate_text import describe_judgement
 from ..reporting.result_text import Block, MarkedText, TextTable
 from ..results import Result
@@ -94,23 +94,28 @@ class LogComparison(Result):
         ]
 
 
-def compare_logs(logs: Sequence[Log]) -> LogComparison:
-    """Returns logs side by side, torn and short ones too.
+def compare(*logs: str | Path | Log) -> LogComparison:
+    """Compares logs side by side, with the differences of their experiments; the command is `trilat compare`.
+
+    >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
+    >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
+    2
 
     Raises:
-        UsageError: there are fewer than two.
-        LogError: a record cannot be read.
+        UsageError: there are fewer than two logs.
+        LogError: a log cannot be read.
     """
-    if len(logs) < 2:
+    opened = [log if isinstance(log, Log) else open_log(log) for log in logs]
+    if len(opened) < 2:
         raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
-    names = name_columns([Path(log.sources[0]) for log in logs])
+    names = name_columns([Path(log.sources[0]) for log in opened])
     remarks = {
         name: [describe_judgement(certify_run(log)), *check_final_posture(log)]
-        for name, log in zip(names, logs, strict=True)
+        for name, log in zip(names, opened, strict=True)
     }
-    found = compare_metrics(logs, names)
-    differences = list(compare_scenarios([log.scenario for log in logs]))
-    return LogComparison(tuple(logs), found, differences, average_repeats(logs, found), remarks)
+    found = compare_metrics(opened, names)
+    differences = list(compare_scenarios([log.scenario for log in opened]))
+    return LogComparison(tuple(opened), found, differences, average_repeats(opened, found), remarks)
 
 
 def name_columns(files: Sequence[Path]) -> list[str]:

@@ -6,11 +6,13 @@ Invariant: by that checksum a torn line is ignored, and so is one of another stu
 moment loses no earlier line and spoils no later one. A run that is in the journal is never made again.
 """
 
+import csv
 import errno
+import io
 import json
 import os
 import zlib
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -63,6 +65,15 @@ def describe_program() -> tuple[str, dict[str, str]]:
 def build_resume_hint(*words: str) -> str:
     """Returns how a command goes on with a study that the disk interrupted."""
     return f"what is done is kept: make room, and go on with: {format_command(*words)}"
+
+
+def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
+    """Returns rows as CSV with a line of heads: these columns, else all that rows have; None is empty."""
+    stream, heads = io.StringIO(), columns or list(dict.fromkeys(key for row in rows for key in row))
+    writer = csv.DictWriter(stream, heads, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 class JournalEntry(Protocol):

@@ -8,7 +8,6 @@ this folder draws belongs to it.
 
 import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +16,7 @@ from matplotlib.figure import Figure
 
 from ...analysis.twin_growth import PushedTwins, TwinGrowth
 from ...errors import UsageError
+from ...fields import suggest_nearest
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress
@@ -160,9 +160,8 @@ def _write(
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
     if name not in FIGURES:
-        near = get_close_matches(name, FIGURES, 1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(FIGURES)}"
-        raise UsageError(f"no figure {name!r}; {hint}")
+        hint = suggest_nearest(name, list(FIGURES)) or f"; there are {', '.join(FIGURES)}"
+        raise UsageError(f"no figure {name!r}{hint}")
     if why := FIGURES[name].absent(log):
         raise UsageError(f"{name}: nothing to show: {why}")
     return FIGURES[name]

@@ -4,8 +4,6 @@ Invariant: a function of the runs alone, without a clock: equal results give equ
 seeds has its 95 % interval, and every run that is not stable shows. No law is ranked.
 """
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +14,7 @@ from ...analysis.run_end import EndBehaviour, Stability
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ..intervals import MeanInterval, mean_interval, wilson_interval
+from ..study_folder import encode_csv
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, explain_no_cell
 
 LEAST_CONTACT_N = 1.0
@@ -193,7 +192,7 @@ class BenchResults(Result):
                 msgspec.to_builtins(one) | {"outcome": "settled"}
                 for one in {str(c.tuned): c.tuned for c in self.plan.cells}.values()
             ],
-            "places": list(map(_place_row, self.places)),
+            "places": self.to_rows(),
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
@@ -390,13 +389,12 @@ def encode_runs(results: BenchResults) -> str:
     """Returns a row per run as CSV."""
     cells = {cell.name: cell for cell in results.plan.cells}
     rows = [_place_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs]
-    return _encode_csv([*_PLACE, *BenchRun.__struct_fields__], rows)
+    return encode_csv(rows, [*_PLACE, *BenchRun.__struct_fields__])
 
 
 def encode_places(results: BenchResults) -> str:
     """Returns a row per cell as CSV: counts, the share of stable runs, and means with their intervals."""
-    rows = list(map(_place_row, results.places))
-    return _encode_csv(list(rows[0]), rows)
+    return encode_csv(results.to_rows())
 
 
 _GONE = ("reflected", "reflected_half", "observed", "least_j")
@@ -432,11 +430,3 @@ def _place_row(place: BenchPlace) -> dict[str, Any]:
         "refuted": sum(run.confirmed is False for run in place.runs),
     }
     return row
-
-
-def _encode_csv(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: "" if value is None else value for key, value in row.items()} for row in rows)
-    return text.getvalue()

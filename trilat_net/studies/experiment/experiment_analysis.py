@@ -4,8 +4,6 @@ Invariant: it is a function of the journals. Practice and catch trials do not co
 with the time that it had. Every number of a figure or a sentence is in a table.
 """
 
-import csv
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +18,7 @@ from ...errors import UsageError
 from ...files import find_version, make_folder, write_whole
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
+from ..study_folder import encode_csv
 from .condition_figures import draw_conditions, draw_learning
 from .experiment_run import Experiment, open_experiment
 from .movement_measures import measure_throughput
@@ -147,8 +146,8 @@ class ExperimentAnalysis(Result):
     def write(self, folder: Path) -> "ExperimentAnalysis":
         """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
         made = make_folder(folder)
-        write_whole(made / "conditions.csv", _encode_csv(self._list_means()), force=True)
-        write_whole(made / "comparisons.csv", _encode_csv(self.to_rows()), force=True)
+        for name, rows in (("conditions.csv", self._list_means()), ("comparisons.csv", self.to_rows())):
+            write_whole(made / name, encode_csv([dict(_flatten(row)) for row in rows]), force=True)
         write_whole(made / "methods.txt", self.methods + "\n", force=True)
         write_whole(made / "analysis.json", json.dumps(self.to_dict(), indent=1) + "\n", force=True)
         self.paths = [
@@ -310,14 +309,6 @@ def _number(value: float | None) -> str:
 
 def _span(interval: tuple[float, float] | None) -> str:
     return "-" if interval is None else f"[{interval[0]:.4g}, {interval[1]:.4g}]"
-
-
-def _encode_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    stream, flat = io.StringIO(), [dict(_flatten(row)) for row in rows]
-    writer = csv.DictWriter(stream, list(flat[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return stream.getvalue()
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

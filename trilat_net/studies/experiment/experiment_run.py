@@ -5,8 +5,6 @@ one that was interrupted is made anew, whole: nothing is there twice and nothing
 killed. The tables are a function of the journals. People and synthetic participants never share a folder.
 """
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterator
 from importlib import resources
@@ -21,7 +19,7 @@ from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..study_folder import RunJournal, build_resume_hint
+from ..study_folder import RunJournal, build_resume_hint, encode_csv
 from .protocol import ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
 from .questionnaires import find_form
 from .trial_run import TrialEntry, run_trial
@@ -195,11 +193,7 @@ class Experiment(Result):
         tables = {"questionnaires.csv": self.list_answers(), "events.csv": happened}
         for name, rows in {TRIALS_FILE: self.to_rows(), **tables}.items():
             if rows or name == TRIALS_FILE:
-                stream, heads = io.StringIO(), dict.fromkeys(key for row in rows for key in row)
-                writer = csv.DictWriter(stream, list(heads), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-                write_whole(self.folder / name, stream.getvalue(), force=True, remedy=self._remedy)
+                write_whole(self.folder / name, encode_csv(rows), force=True, remedy=self._remedy)
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:

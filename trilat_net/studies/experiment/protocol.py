@@ -24,11 +24,10 @@ from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
-from .questionnaires import Questionnaire, find_form
+from .questionnaires import Name, Questionnaire, find_form
 from .synthetic_participant import ParticipantModel
 from .tasks import AnyTask, ReachTrial
 
-Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
 """It becomes part of file names."""

@@ -63,16 +63,22 @@ class SyntheticParticipant:
         facts: of its site.
         model: its numbers.
         goal: the target that it sees.
-        slave: place of the slave among its peers, and its arm.
+        slave: the site of the slave, and its arm.
         trials: how many trials it has made before.
         seed: of the trial, for what it draws.
     """
 
     def __init__(
-        self, facts: HandContext, model: ParticipantModel, goal: TrialGoal, slave: Any, trials: int, seed: int
+        self,
+        facts: HandContext,
+        model: ParticipantModel,
+        goal: TrialGoal,
+        slave: tuple[str, Any],
+        trials: int,
+        seed: int,
     ) -> None:
         self._model, self._goal, self._trials, self._size = model, goal, trials, facts.size
-        self._peer, self._arm = facts.peers.index(slave.site), slave.arm
+        self._peer, self._arm = facts.peers.index(slave[0]), slave[1]
         self._random = np.random.default_rng([seed, facts.seed])
         self._from = self._to = np.zeros(facts.size)
         self._begins_s, self._takes_s, self._seen = -math.inf, 0.0, np.zeros(facts.size)

@@ -8,13 +8,14 @@ and into its log, which then lasts just that long.
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from ...analysis.aligned import AlignedRecords, align_records
+from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
@@ -46,13 +47,6 @@ HAND_HZ, HAND_DELAY_S, REST_S = 50, 0.02, 0.1
 """How often a synthetic participant acts; time from what it decides to what its arm does; after the end."""
 
 
-class Slave(NamedTuple):
-    """The arm that a task is about."""
-
-    site: str
-    arm: Any
-
-
 class TrialEntry(msgspec.Struct, frozen=True):
     """A trial that is done, in the journal.
 
@@ -71,11 +65,6 @@ class TrialEntry(msgspec.Struct, frozen=True):
     succeeded: bool
     measures: dict[str, float]
     people: bool = False
-
-
-def find_slave(scenario: Scenario) -> Slave:
-    """Returns the slave of a scenario, with its arm."""
-    return Slave(scenario.slave, scenario.arms[scenario.slave])
 
 
 class TrialJudge:
@@ -102,7 +91,7 @@ class ExperimentTrial:
 
     Attributes:
         planned: its place in the plan.
-        slave: the arm that it is about.
+        slave, arm: the site whose arm it is about, and that arm.
         scenario: its own, which lasts as long as the trial may.
         appears_s, longest_s: when its target appears, and when it has ended at the latest, s.
     """
@@ -116,9 +105,9 @@ class ExperimentTrial:
         whose: str = "synthetic ",
     ) -> None:
         self.protocol, self.planned = protocol, planned
-        self.slave, self.people = find_slave(scenario), not whose
-        spec = scenario.sites[self.slave.site]
-        self._start_m = np.array(self.slave.arm.end_effector(spec.q0_rad), dtype=np.float64)
+        self.slave, self.arm, self.people = scenario.slave, scenario.arms[scenario.slave], not whose
+        spec = scenario.sites[self.slave]
+        self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
         about = f"trial {planned.number} of {protocol.name}: {whose}{', '.join(planned.group)}, condition "
         about += (
             f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
@@ -133,7 +122,7 @@ class ExperimentTrial:
 
     def begin(self) -> TrialJudge:
         """Returns what judges it, from its first record on."""
-        return TrialJudge(self.make_goal(), self.slave.arm)
+        return TrialJudge(self.make_goal(), self.arm)
 
     def make_goal(self) -> TrialGoal:
         """Returns what is asked."""
@@ -158,7 +147,7 @@ class ExperimentTrial:
         return TrialEntry(planned.number, *how)
 
     def _judge(self, log: Log) -> Outcome | None:
-        judge, part = self.begin(), log[self.slave.site]
+        judge, part = self.begin(), log[self.slave]
         for t_s, q in zip(part.t_s.tolist(), part.q.tolist(), strict=True):
             if (outcome := judge.take(t_s, q)) is not None:
                 return outcome
@@ -176,19 +165,17 @@ class ExperimentTrial:
             }
         if len(forces) > 1:
             found |= self._measure_pair(aligned, forces, outcome.ended_s)
-        own = log[self.protocol.users[0]]
-        used, rate_hz = own.used[self.slave.site], log.scenario.sites[self.slave.site].rate_hz
-        age_ms = (own.t_ns - used * NS_PER_S // rate_hz)[used >= 0] / 1e6
+        age_ms = sample_ages_ns(log, self.slave, self.protocol.users[0]) / 1e6
         return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
 
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
         """Returns what two users do to the slave, as if each pushed at its end effector."""
-        slave = aligned[self.slave.site]
+        slave = aligned[self.slave]
         rows = np.flatnonzero(slave.t_s <= ended_s)[::EVERY]
         rate_hz, t_s = slave.rate_hz / EVERY, slave.t_s[rows]
-        places = np.array([self.slave.arm.end_effector(q) for q in slave.q[rows]], dtype=np.float64)
+        places = np.array([self.arm.end_effector(q) for q in slave.q[rows]], dtype=np.float64)
         one, other = (
             np.column_stack([np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T])
             for user, force in zip(self.protocol.users, forces, strict=True)
@@ -198,10 +185,10 @@ class ExperimentTrial:
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns what the slave did from when the target appears until the trial ends."""
-        goal, part = self.make_goal(), log[self.slave.site]
+        goal, part = self.make_goal(), log[self.slave]
         rows = np.flatnonzero((part.t_s >= goal.appears_s) & (part.t_s <= ended_s))[::EVERY]
         t_s, rate_hz = part.t_s[rows], part.rate_hz / EVERY
-        places = np.array([self.slave.arm.end_effector(q) for q in part.q[rows]], dtype=np.float64)
+        places = np.array([self.arm.end_effector(q) for q in part.q[rows]], dtype=np.float64)
         wanted = np.array([goal.place(t) for t in t_s])
         apart_m = np.linalg.norm(places - wanted, axis=1)
         speed = np.linalg.norm(np.gradient(places, 1.0 / rate_hz, axis=0), axis=1)
@@ -235,17 +222,17 @@ class SyntheticTrial(ExperimentTrial):
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
             model, before = self.protocol.model.draw(own), self.planned.before
             act = SyntheticParticipant(
-                at.describe(), model, self.make_goal(), self.slave, before, self.planned.seed
+                at.describe(), model, self.make_goal(), (self.slave, self.arm), before, self.planned.seed
             )
             found[user] = HandPlayer(at, act)
         return found
 
     def find_end_s(self) -> float:
         """Runs the trial, compiled, until it ends; returns when that is, s."""
-        scenario, judge, site = self.scenario, self.begin(), self.slave.site
+        scenario, judge, site = self.scenario, self.begin(), self.slave
         run = FusedRun(scenario, keep=1, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
-        place, joints = scenario.names.index(site), self.slave.arm.counts.joints
+        place, joints = scenario.names.index(site), self.arm.counts.joints
         rate_hz, t_s = scenario.sites[site].rate_hz, 0.0
         for tick in range(1, scenario.ticks(site)):
             t_s = tick_ns(tick, rate_hz) / NS_PER_S
