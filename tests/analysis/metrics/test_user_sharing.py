@@ -1,6 +1,6 @@
 """Metrics of users who share a slave, on records that are prescribed, against numbers worked out by hand."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -112,3 +112,31 @@ def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
 def test_two_sites_have_no_users_who_share() -> None:
     found = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
     assert {found[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {False}
+
+
+def test_shares_are_identified_from_motion() -> None:
+    """The slave moves by 0.6 and 0.4 of the samples in use, though dominance says otherwise."""
+    rates: dict[str, Callable[[int], list[float]]] = {
+        "m1": lambda k: [float(np.sin(0.1 * k)), 0.3],
+        "m2": lambda k: [0.2, float(np.cos(0.07 * k))],
+    }
+
+    def change(state: Any) -> Any:
+        if state.site in rates:
+            return msgspec.structs.replace(state, qd=rates[state.site](state.tick))
+        if min(state.used.values()) < 0:
+            return msgspec.structs.replace(
+                state, qd=[0.5, 0.5]
+            )  # the users are not heard yet: does not count
+        first, second = (np.array(rates[peer](state.used[peer])) for peer in ("m1", "m2"))
+        return msgspec.structs.replace(state, qd=(0.6 * first + 0.4 * second).tolist())
+
+    found = compute_log_metrics(rewritten(prescribed(), change=change))
+    assert found.sites["m1"]["motion_share"].value == pytest.approx(0.6)
+    assert found.sites["m2"]["motion_share"].value == pytest.approx(0.4)
+    assert not found.sites["s"]["motion_share"].applies
+
+
+def test_users_who_move_alike_are_not_told_apart() -> None:
+    log = rewritten(prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5]))
+    assert "move alike" in compute_log_metrics(log).sites["m1"]["motion_share"].why

@@ -13,6 +13,9 @@ from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_sha
 from ..run_view import RunView, SiteRun
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
+ALIKE = 0.05
+"""Users whose velocities differ by less of the slave's, RMS over RMS, are not told apart by its motion."""
+
 
 def _unasked(why: str) -> Metric:
     return Metric(None, why, applies=False)
@@ -28,9 +31,14 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     return find_user_shares(view.scenario, view.sites[slave].dominance.alpha)
 
 
-@measures("site", USERS, Quantity("authority_effort_nm2_s", "the hand's effort by share", "N²m²s", "sum"))
-def measure_authority_effort(view: RunView, site: str) -> MetricValues:
-    """Returns h sum_k a_k |tau_h,k|^2 of a user, a being its share in the slave's reference at that time."""
+@measures(
+    "site",
+    USERS,
+    Quantity("authority_effort_nm2_s", "the hand's effort by share", "N²m²s", "sum"),
+    Quantity("motion_share", "share in the slave's motion"),
+)
+def measure_authority(view: RunView, site: str) -> MetricValues:
+    """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its dominance a_k."""
     shared, (slave, users) = view.once(read_user_shares), find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
@@ -40,7 +48,30 @@ def measure_authority_effort(view: RunView, site: str) -> MetricValues:
     row, recorded = find_latest_rows(view.sites[slave].records, records.t_s)
     squares = shared.shares[row, users.index(site)] * np.square(torque.operator).sum(axis=1)
     effort = squares[records.known & recorded].sum() * records.h_s
-    return {"authority_effort_nm2_s": metric(float(effort))}
+    found = view.once(_identify_shares)
+    share = found if isinstance(found, Metric) else metric(found[users.index(site)])
+    return {"authority_effort_nm2_s": metric(float(effort)), "motion_share": share}
+
+
+def _identify_shares(view: RunView) -> list[float] | Metric:
+    """Returns by user the a that minimise sum_k |qd_k - sum_i a_i qd_i(used_k)|^2, their sum being 1.
+
+    qd is the slave's velocity, that of task space where it is, and used_k the sample of user i in use.
+    """
+    slave, users = find_users(view.scenario)
+    own = view.sites[slave].records
+    judged, rates = own.known & own.follows, []
+    for other in (view.sites[user].records for user in users):
+        row = own.used[other.site] - other.first
+        judged &= (row >= 0) & (row < len(other.known)) & other.known[row.clip(0, len(other.known) - 1)]
+        rates.append(other.shared_rate[row.clip(0, len(other.known) - 1)])
+    *others, last = (rate[judged].ravel() for rate in rates)
+    apart = np.column_stack([one - last for one in others])
+    moves = own.shared_rate[judged].ravel()
+    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] < ALIKE * np.linalg.norm(moves):
+        return Metric(None, "the users move alike, or nobody moves")
+    shares = np.linalg.lstsq(apart, moves - last)[0].tolist()
+    return [*shares, 1.0 - sum(shares)]
 
 
 @measures(
