@@ -140,3 +140,15 @@ def test_shares_are_identified_from_motion() -> None:
 def test_users_who_move_alike_are_not_told_apart() -> None:
     log = rewritten(prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5]))
     assert "move alike" in compute_log_metrics(log).sites["m1"]["motion_share"].why
+
+
+def test_slave_that_moves_otherwise_has_no_shares() -> None:
+    """It follows one user in one half of the run, and does the opposite in the other."""
+
+    def change(state: Any) -> Any:
+        sign = 1.0 if state.tick < 200 else -1.0
+        moves = {"m1": [1.0, 0.0], "m2": [0.0, 1.0], "s": [5.0 * sign, 0.0]}
+        return msgspec.structs.replace(state, qd=moves[state.site])
+
+    found = compute_log_metrics(rewritten(prescribed(), change=change))
+    assert "does not tell" in found.sites["m1"]["motion_share"].why

@@ -5,7 +5,10 @@ slave's reference is the largest. Torques are those of hands ON arms, without th
 they are forces at end effectors. Rows without a record do not count.
 """
 
+import math
+
 import numpy as np
+from scipy.special import stdtrit
 
 from ...core.task_space import PLACE
 from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
@@ -13,8 +16,8 @@ from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_sha
 from ..run_view import RunView, SiteRun
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
-ALIKE = 0.05
-"""Users whose velocities differ by less of the slave's, RMS over RMS, are not told apart by its motion."""
+PARTS, WIDEST = 8, 0.25
+"""Of a share in motion: parts of the run that the jackknife leaves out, and the widest half interval, 95 %."""
 
 
 def _unasked(why: str) -> Metric:
@@ -65,13 +68,19 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
         row = own.used[other.site] - other.first
         judged &= (row >= 0) & (row < len(other.known)) & other.known[row.clip(0, len(other.known) - 1)]
         rates.append(other.shared_rate[row.clip(0, len(other.known) - 1)])
-    *others, last = (rate[judged].ravel() for rate in rates)
-    apart = np.column_stack([one - last for one in others])
+    *firsts, last = (rate[judged].ravel() for rate in rates)
+    apart = np.column_stack([one - last for one in firsts])
     moves = own.shared_rate[judged].ravel()
-    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] < ALIKE * np.linalg.norm(moves):
+    least = np.linalg.svd(apart, compute_uv=False)[-1] if len(moves) else 0.0
+    if least <= 1e-9 * np.linalg.norm(moves):
         return Metric(None, "the users move alike, or nobody moves")
-    shares = np.linalg.lstsq(apart, moves - last)[0].tolist()
-    return [*shares, 1.0 - sum(shares)]
+    every = np.arange(len(moves))
+    rows = [every, *(np.delete(every, part) for part in np.array_split(every, PARTS))]
+    shares, *others = (np.linalg.lstsq(apart[row], (moves - last)[row])[0] for row in rows)
+    half = float(stdtrit(PARTS - 1, 0.975)) * math.sqrt((PARTS - 1) * np.var(others, axis=0).max())
+    if not half <= WIDEST:
+        return Metric(None, f"the motion does not tell: shares within +- {half:.2g}")
+    return [*shares.tolist(), 1.0 - float(shares.sum())]
 
 
 @measures(
