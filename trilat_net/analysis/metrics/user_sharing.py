@@ -17,7 +17,7 @@ from ..run_view import RunView, SiteRun
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
 PARTS, WIDEST = 8, 0.25
-"""Of a share in motion: parts of the run that the jackknife leaves out, and the widest half interval, 95 %."""
+"""Of a share in motion: parts that the jackknife leaves out in turn, and the widest half interval, 95 %."""
 
 
 def _unasked(why: str) -> Metric:
