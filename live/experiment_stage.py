@@ -14,6 +14,7 @@ import msgspec
 from trilat_net.core.ticks import NS_PER_S, tick_ns
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import Clock
+from trilat_net.net.messages import HALTED_MODES
 from trilat_net.studies.experiment.protocol import ExperimentPlan, Step
 from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry
 
@@ -55,7 +56,7 @@ class TrialWatch:
             return []
         modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
         self.diverged = "diverged" in modes.values()
-        halted = [name for name, mode in modes.items() if mode in ("stopped", "fault")]
+        halted = [name for name, mode in modes.items() if mode in HALTED_MODES]
         if away or halted:
             self.aborted = (
                 f"the page of {', '.join(away)} is gone" if away else f"{', '.join(halted)} stopped"

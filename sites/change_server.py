@@ -15,6 +15,7 @@ from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net.bus import Query, QueryInbox
+from trilat_net.net.messages import MODE_WORDS
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import (
@@ -126,8 +127,8 @@ class ChangeServer:
     def _order(self, k: int, order: SiteOrder) -> CoreChange:
         mode, needed = self._mode(), _NEEDED_MODES.get(order)
         if needed is not None and mode is not needed:
-            doing = mode.name.lower()
-            raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {needed.name.lower()}")
+            doing, only = MODE_WORDS[mode], MODE_WORDS[needed]
+            raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {only}")
         if needed is not None and not self._held():
             raise ScenarioError(f"the dead-man switch of {self._site} is not held; {order} it while it is")
         change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))

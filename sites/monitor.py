@@ -20,8 +20,8 @@ from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import read_events, read_messages, read_records
-from trilat_net.net.messages import LinkStats, State
+from trilat_net.net.membership import read_messages, read_records
+from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.scenario import Scenario
 
 AGES = "age of each peer's sample"
@@ -154,7 +154,7 @@ class SessionMonitor:
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._states:
                 self.latest[stats.site] = stats
-        for event in read_events(self._events):
+        for event in read_messages(self._events, Event):
             if event.kind in LOUD_EVENTS:
                 self._display.say(event.text)
         for name, states in self._states.items():

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.membership import EventPublisher, read_events
+from trilat_net.net.membership import EventPublisher, read_messages
 from trilat_net.net.messages import Event
 
 MEET_AGAIN_NS = 1_000_000_000
@@ -87,7 +87,7 @@ class PeerMonitor:
         """
         own = publisher.info.boot
         in_place = own
-        for event in read_events(inbox):
+        for event in read_messages(inbox, Event):
             if event.kind == "coming" and self._admits:
                 yield event
             elif event.boot != self.boots.get(event.member):
@@ -132,7 +132,7 @@ class PeerMonitor:
     def read_stored(self, ticks: int) -> bool:
         """Takes the recorders' events; True if one has just stored all `ticks` of this site."""
         before = len(self.stored)
-        for event in read_events(self._recorder_events):
+        for event in read_messages(self._recorder_events, Event):
             if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:
                 self.stored.add(str(event.boot))
         return len(self.stored) > before

@@ -22,8 +22,8 @@ from trilat_net.net.arm_client import ArmClient, Hand
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import find_members, list_past_events
-from trilat_net.net.membership import read_events, read_records
-from trilat_net.net.messages import Info
+from trilat_net.net.membership import read_messages, read_records
+from trilat_net.net.messages import Event, Info
 from trilat_net.net.ros2_graph import (
     Attachment,
     Refusals,
@@ -312,7 +312,7 @@ class Bridge:
             if record.site in self._sites:
                 self._sites[record.site].show(record, rate_hz)
         anew = False
-        for event in read_events(self._events):
+        for event in read_messages(self._events, Event):
             anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
             if event.member in self._sites:
                 self._sites[event.member].shares.take(event.command)

@@ -25,8 +25,8 @@ from trilat_net.net.discovery import (
     list_past_events,
     send_change,
 )
-from trilat_net.net.membership import read_events, read_records
-from trilat_net.net.messages import Info, State
+from trilat_net.net.membership import read_messages, read_records
+from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
@@ -327,7 +327,7 @@ class RunningSession:
 
             def find() -> dict[str, float]:
                 nonlocal now_ns
-                for event in read_events(events):
+                for event in read_messages(events, Event):
                     history.take(event.command)
                 now_ns = max([now_ns, *(record.t_ns for record in read_records(records))])
                 return dict(zip(scenario.peers(site), history.at(now_ns), strict=True))

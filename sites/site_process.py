@@ -31,7 +31,7 @@ from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
 from trilat_net.net.known_sites import make_site_known
 from trilat_net.net.membership import Epoch, EventPublisher, LateSites, describe_member
-from trilat_net.net.messages import Event
+from trilat_net.net.messages import MODE_WORDS, Event
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.session import SessionJoin
@@ -358,7 +358,7 @@ class RunningSite:
         torque_nm, stats = max(map(abs, output.tau)), self._parts.stats
         dropped = sum(stats.dropped.values())
         return (
-            f"t = {output.t_ns / NS_PER_S:.0f} s, {output.mode.name.lower()}, |e| {apart:.3g} {unit}, torque "
+            f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, |e| {apart:.3g} {unit}, torque "
             f"{torque_nm:.3g} N m, {stats.overruns} ticks late, {dropped} messages dropped"
         )
 
@@ -390,7 +390,7 @@ class RunningSite:
             return
         says_lost = rule.degrades and mode is Mode.RETURN
         lost = parts.site.layout.find_lost(output.mem, parts.site.peers) if says_lost else ()
-        shown = (parts.options.session, parts.name, mode.name.lower(), output.mem, len(output.q_des), lost)
+        shown = (parts.options.session, parts.name, MODE_WORDS[mode], output.mem, len(output.q_des), lost)
         if (alarm := find_alarm(*shown)) is not None:
             parts.say(f"*** {alarm}")
 

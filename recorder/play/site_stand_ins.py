@@ -18,9 +18,9 @@ from trilat_net.log.record_columns import Ints
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import describe_member, liveliness_token, read_events
-from trilat_net.net.messages import Event, Info
-from trilat_net.net.pinging import RepeatedQuery, answer_backfill, answer_pings
+from trilat_net.net.membership import MemberQuery, describe_member, liveliness_token, read_messages
+from trilat_net.net.messages import Event
+from trilat_net.net.pinging import answer_backfill, answer_pings
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
 from trilat_net.net.wire import decode, encode
 
@@ -113,7 +113,7 @@ class SiteStandIns:
         self._boots: dict[str, tuple[int, int]] = {}
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
-        self._recorder_query = RepeatedQuery(bus, clock, topics.key(session, topics.RECORDER, topics.INFO))
+        self._recorder_query = MemberQuery(bus, clock, session, topics.RECORDER)
         self._infos = {
             site: describe_member(site, boot, clock, header.scenario_text, fingerprint=header.fingerprint)
             for site, boot in header.boots.items()
@@ -148,7 +148,7 @@ class SiteStandIns:
                 query.answer(self._identity(site))
         for parts, alive in topics.read_presence(self._presence):
             (self.recorders.add if alive else self.recorders.discard)(parts.boot)
-        for event in read_events(self._recorder_events):
+        for event in read_messages(self._recorder_events, Event):
             if event.kind == "stored":
                 self._stored.setdefault(str(event.boot), set()).add(event.about)
         for site, (_, backfill_queries) in self._queries.items():
@@ -169,13 +169,7 @@ class SiteStandIns:
 
     def recorders_listen(self) -> bool:
         """Asks the present recorders for their identities; True once all have answered."""
-        while (reply := self._recorder_query.poll()) is not None:
-            try:
-                self._met.add(str(decode(reply[2], Info).boot))
-            except WireError:
-                continue  # a stranger's
-        if self.recorders - self._met:
-            self._recorder_query.repeat()
+        self._met |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._met
 
     def stored(self, recorders: Collection[str]) -> bool:

@@ -5,23 +5,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.analysis.timeline import (
-    FOLLOWING_MODES,
     find_mode_intervals,
     list_changes,
     list_stated_models,
     recorded_end_s,
 )
 from trilat_net.errors import LogError
+from trilat_net.net.messages import MODES
 
 from . import logs
 
-MODES = ("run", "hold", "brake", "return", "diverged")
 
-
-@given(st.lists(st.sampled_from(MODES), max_size=60))
+@given(st.lists(st.sampled_from(list(MODES)), max_size=60))
 def test_spans_are_ticks_at_which_site_did_not_follow(modes):
     part = logs.in_modes(modes)
-    away = [(mode, k) for k, mode in enumerate(modes) if mode not in FOLLOWING_MODES]
+    away = [(mode, k) for k, mode in enumerate(modes) if not MODES[mode].follows]
     found = [
         (span.mode, k)
         for span in find_mode_intervals(part)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.analysis.aligned import RESTING_MODES
 from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
 from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.messages import RESTING_MODES
 from trilat_net.scenario import Scenario, parse_scenario, to_core_change
 from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.scenario.run_changes import make_site_order

@@ -18,7 +18,7 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
-from trilat_net.net.membership import Epoch, EventPublisher, read_events
+from trilat_net.net.membership import Epoch, EventPublisher, read_messages
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.requests import Backfill, BackfillRequest
 from trilat_net.net.timing import LoopStats
@@ -155,7 +155,7 @@ class Desk:
         return self.recording.over(self.clock.monotonic_ns())
 
     def said(self) -> list[Event]:
-        return list(read_events(self._heard))
+        return list(read_messages(self._heard, Event))
 
     def stored(self) -> list[tuple[str, int]]:
         heard = self.said()

@@ -8,7 +8,7 @@ from sites.peer_monitor import PeerMonitor
 from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.parties import told
 from trilat_net.net import topics
-from trilat_net.net.membership import EventPublisher, liveliness_token, read_events
+from trilat_net.net.membership import EventPublisher, liveliness_token, read_messages
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
 
@@ -37,7 +37,7 @@ class Desk:
 
     def told(self) -> Sequence[tuple[str, str]]:
         self.company.watch(self._publisher, 0)
-        return [(event.kind, event.about) for event in read_events(self._heard)]
+        return [(event.kind, event.about) for event in read_messages(self._heard, Event)]
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
+from ..net.messages import RESTING_MODES
 from ..scenario import Scenario
 from ..scenario.scenario_types import Limits
 
@@ -29,10 +30,8 @@ RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _TASK_COLUMNS = ("x", "xd", "wrench")
 _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
-RESTING_MODES = ("waiting", "hold", "fault", "stopped")
-"""Modes in which, under the rule `glide`, the torque is not that of the law alone."""
 RESUMING_S = 2.0 * BLEND_S
-"""For so long after these it may not be that either."""
+"""For so long after one of the `RESTING_MODES` the torque may not be that of the law alone either."""
 
 
 class AlignedRecords(NamedTuple):

@@ -15,12 +15,10 @@ from ..core.ticks import find_alarm
 from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
+from ..net.messages import MODES, ModeMeaning
 from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
 from ..scenario.scenario_types import Change
-
-FOLLOWING_MODES = ("run", "diverged")
-"""Modes in which a site is not away from its peers because of a stale one."""
 
 
 class AppliedChange(NamedTuple):
@@ -57,6 +55,11 @@ class ModeInterval(NamedTuple):
     mode: str
     from_s: float
     to_s: float
+
+    @property
+    def meaning(self) -> ModeMeaning:
+        """What the mode means."""
+        return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
@@ -103,14 +106,14 @@ def recorded_end_s(log: Log) -> float:
 def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
     """Returns the intervals in which a site held, braked or returned, in order."""
     modes: list[str] = part.mode.tolist()
-    if all(mode in FOLLOWING_MODES for mode in modes):
+    if all(MODES[mode].follows for mode in modes):
         return []
     found = []
     times = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
     first = 0
     for mode, group in groupby(modes):
         last = first + len(list(group))
-        if mode not in FOLLOWING_MODES:
+        if not MODES[mode].follows:
             found.append(ModeInterval(mode, times[first], times[last]))
         first = last
     return found

@@ -8,6 +8,7 @@ network of the log. Without changes both give the log, bit for bit. Both sides o
 same instants: records of the log that the rerun executed too.
 """
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ from .rerun_execution import (
 )
 from .resumption import read_output
 from .verify import RecordDifference
-from .virtual import SiteChannels, SiteEntry, describe_accounts, open_in_memory
+from .virtual import SiteChannels, SiteEntry, describe_accounts
 from .virtual_network import Deliveries
 
 
@@ -198,7 +199,10 @@ class Rerun(Result):
     @cached_property
     def after(self) -> Log:
         """The rerun as a log: the executed sites, and the others as recorded."""
-        return open_in_memory(self.write)
+        stream = io.BytesIO()
+        self.write(stream)
+        stream.seek(0)
+        return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
         """Writes the rerun as a log into a stream, which stays open; see `LogWriter` for the views.

@@ -27,7 +27,6 @@ from ..net.wire import encode_state
 from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
 from ..scenario.describe import describe_law, describe_value, flatten_table
 from .resumption import (
-    ArrivalEntry,
     ReceivedMotion,
     RecordedInputs,
     find_recorded_hand,
@@ -283,11 +282,6 @@ class RerunSite:
         """Nominal time of its next tick, ns since the epoch."""
         return self.k * NS_PER_S // self._site.rate_hz
 
-    @property
-    def entries(self) -> Sequence[ArrivalEntry]:
-        """Arrivals of its next tick."""
-        return self._deliveries.at.get(self.k, ())
-
     def advance(self) -> RerunTick:
         """Executes one tick.
 
@@ -297,9 +291,8 @@ class RerunSite:
         n = self._places.get(self.k)
         try:
             if n is not None and not self._certain and self._inputs.can_resume(n):
-                for _, change in self._inputs.take_changes(self.k - 1):
-                    self._site.order(change, self.t_ns)
-                self._inputs.resume(self._site, n)
+                missed = self._inputs.take_changes(self.k - 1)
+                self._inputs.resume(self._site, n, [change for _, change in missed])
                 self._certain = True
             made = self._execute(n) if self._certain or n is None else self._keep(n)
         except (ValueError, OverflowError) as error:
@@ -313,12 +306,12 @@ class RerunSite:
         return made
 
     def _execute(self, n: int | None) -> RerunTick:
-        arrivals, missing = self._inputs.arrivals(self.entries)
+        arrivals, missing = self._inputs.arrivals(self._deliveries.at.get(self.k, ()))
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)
         changes = [change for _, change in self._inputs.take_changes(self.k)]
         fits = self._site.layout.hand == self._part.layout.hand
-        hand = find_recorded_hand(self._part, self.t_ns) if fits else ()
+        hand = find_recorded_hand(self._part, self._site, self.k) if fits else ()
         output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes, hand=hand))
         stats = self._stats.take(output) if self._stats.due(self.k) else None
         same = False
@@ -387,13 +380,14 @@ class RerunExecution:
 
         A site that left its limits makes no more ticks. With changes, the others end with it.
         """
-        order = {name: n for n, name in enumerate(self.sites)}
-        pending = sorted((s.t_ns, order[s.name], s) for s in self.sites.values() if not s.done)
+        sites = list(self.sites.values())
         total = sum(found.last + 1 - found.first for found in self.deliveries.values())
+        pending = sorted((site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done)
         done, last_ns = 0, None
         while pending and (last_ns is None or pending[0][0] <= last_ns):
-            place = next((n for n, (_, _, site) in enumerate(pending) if self._is_ready(site)), 0)
-            t_ns, _, site = pending.pop(place)
+            first = next((n for n, (_, at, k) in enumerate(pending) if self._is_ready(at, k)), 0)
+            t_ns, place, _ = pending.pop(first)
+            site = sites[place]
             made = site.advance()
             output, recent = site.output, self._recent[site.name]
             recent[output.tick] = make_arrival(0, output.tick, output)
@@ -403,15 +397,16 @@ class RerunExecution:
             if site.diverged and self._request.changes:
                 last_ns = t_ns
             if not site.done:
-                bisect.insort(pending, (site.t_ns, order[site.name], site))
+                bisect.insort(pending, (site.t_ns, place, site.k))
             done += 1
             if progress is not None and done % PROGRESS_EVERY == 0:
                 progress(done, total)
 
-    def _is_ready(self, site: RerunSite) -> bool:
-        """True if every sample of a site's next tick has been computed, or never will be."""
-        peers = self._log[site.name].peers
-        for peer, tick, _ in site.entries:
+    def _is_ready(self, place: int, k: int) -> bool:
+        """True if every sample of a site's next tick, k, has been computed, or never will be."""
+        receiver = self._request.replaced[place]
+        peers = self._log[receiver].peers
+        for peer, tick, _ in self.deliveries[receiver].at.get(k, ()):
             sender = self.sites.get(peers[peer])
             if sender is not None and not sender.done and tick >= sender.k:
                 return False

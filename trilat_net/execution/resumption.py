@@ -15,17 +15,14 @@ import numpy as np
 from ..core.delay import MAX_DELAY_US
 from ..core.site_setup import LinkSetup
 from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord
+from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, TickRecord
 from ..log.site_log import SiteLog
-from ..net.messages import State
+from ..net.messages import MODES, RESTING_MODES, State
 
 _LOOK_BACK = 100
 """Records before a gap in which to look for the newest sample that had arrived."""
 
 Change = TypeVar("Change")
-
-APART_MODES = ("hold", "waiting", "fault", "stopped")
-"""Modes of the rule `glide` in which what peers sent does not enter the reference."""
 
 ArrivalEntry = Sequence[int]
 """As in a record's `rx`: index of the peer, tick of its sample, us."""
@@ -41,8 +38,7 @@ _REST = attrgetter("x", "xd", "wrench", "ch", "hand", "bodies")
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     """Returns a record in the form in which `Site.step` returned it."""
-    modes = {mode.name.lower(): mode for mode in Mode}
-    begin = state.tick, state.t_ns, modes.get(state.mode, Mode.DIVERGED)
+    begin = state.tick, state.t_ns, MODES.get(state.mode, MODES["diverged"]).mode
     taken = [state.used.get(peer, -1) for peer in peers], state.rx_crc, state.cmd
     mem = state.mem if len(state.mem) > len(state.q_des) else []
     return TickRecord._make([*begin, *_MOTION(state), *taken, mem, *_REST(state)])
@@ -63,10 +59,10 @@ def take_parts(arrivals: Sequence[Arrival], links: Sequence[LinkSetup]) -> list[
     ]
 
 
-def find_recorded_hand(part: SiteLog, t_ns: int) -> list[float]:
-    """Returns what a live hand did at a time, by the latest record until then; [] without a live hand."""
-    place = int(np.searchsorted(part.t_ns, t_ns, side="right")) - 1 if part.layout.hand else -1
-    found: list[float] = part.hand[place].tolist() if place >= 0 else []
+def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
+    """Returns what a live hand did at a tick, by the latest record until then; [] without a live hand."""
+    until = np.searchsorted(part.t_ns, k * NS_PER_S // site.rate_hz, side="right") if part.layout.hand else 0
+    found: list[float] = part.hand[int(until) - 1].tolist() if until else []
     return found
 
 
@@ -130,13 +126,15 @@ class RecordedInputs(Generic[Change]):
         if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
             return False
         in_use = read_output(states[n - 1], self._part.peers).used
-        if apart and states[n - 1].mode in APART_MODES:
+        if apart and states[n - 1].mode in RESTING_MODES:
             return True
         return all(used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True))
 
-    def resume(self, site: Site, n: int) -> None:
-        """Brings a site into its state at record n, if it `can_resume` there."""
+    def resume(self, site: Site, n: int, changes: Sequence[CoreChange] = ()) -> None:
+        """Brings a site into its state at record n, after `changes`, if it `can_resume` there."""
         states, peers = self._part.states, self._part.peers
+        for change in changes:
+            site.order(change, states[n].t_ns)
         before, last = (read_output(states[m], peers) for m in (n - 2, n - 1))
         in_use: list[Arrival | None] = []
         waiting: list[Arrival] = []

@@ -32,7 +32,7 @@ from ..log.mcap_reader import Progress
 from ..log.running_digest import Integrity
 from ..log.session_check import judge_integrity
 from ..log.site_log import SiteLog
-from ..net.messages import STATE_VECTORS, State
+from ..net.messages import MODE_WORDS, STATE_VECTORS, State
 from ..scenario import parse_core_change
 from ..scenario.code_consent import find_user_laws
 from ..scenario.run_changes import count_skipped_ticks
@@ -90,7 +90,7 @@ def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) ->
         _pack(a) == _pack(b)
         and a.used == dict(zip(peers, b.used, strict=True))
         and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
-        and a.mode == b.mode.name.lower()
+        and a.mode == MODE_WORDS[b.mode]
         and a.cmd == b.cmd
     )
 
@@ -115,7 +115,7 @@ def find_first_difference(
 def _compare_fields(
     logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality, channel: LawChannel
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    mode = computed.mode.name.lower()
+    mode = MODE_WORDS[computed.mode]
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
     yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns
     yield "mode", logged.mode, mode, logged.mode == mode
@@ -262,9 +262,8 @@ class SiteVerifier:
                     self._start_afresh(n, state)
                 resumes = not self._certain and not self._law_failed and n - 2 >= self._began
                 if resumes and self._inputs.can_resume(n, apart=self._apart):
-                    for change in self._parse_changes(state.tick - 1)[0]:  # ordered in the gap
-                        self._site.order(change, state.t_ns)
-                    self._inputs.resume(self._site, n)
+                    missed, _ = self._parse_changes(state.tick - 1)  # ordered in the gap
+                    self._inputs.resume(self._site, n, missed)
                     self._certain = True
                 if self._certain and not self._law_failed:
                     self._verify_record(n, state)

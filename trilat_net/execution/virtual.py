@@ -33,9 +33,9 @@ from ..errors import CodeFailed
 from ..log.accounting import Account
 from ..log.log_file import LogFile
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
-from ..log.log_reader import Log, open_log
+from ..log.log_reader import Log
 from ..log.log_writer import LogWriter
-from ..log.mcap_reader import LogContents, read_contents
+from ..log.mcap_reader import read_contents
 from ..log.mcap_writer import Sink
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..net import topics
@@ -363,12 +363,14 @@ class SimulatedLog(Log):
     """The log of a run in virtual time, which `save` makes a file of.
 
     Args:
-        contents: the log.
-        make: makes it once more, into a stream and with views at a rate, Hz.
+        make: makes it, into a stream and with views at a rate, Hz.
     """
 
-    def __init__(self, contents: LogContents, make: Callable[[Sink, float], object]) -> None:
-        super().__init__(contents)
+    def __init__(self, make: Callable[[Sink, float], object]) -> None:
+        stream = io.BytesIO()
+        make(stream, 0.0)
+        stream.seek(0)
+        super().__init__(read_contents(stream, "log", own=True))
         self._make = make
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
@@ -391,15 +393,4 @@ def simulate_scenario(scenario: Scenario, *, hands: HandTracks = {}) -> Simulate
     def make(stream: Sink, views_hz: float) -> None:
         write_virtual_log(scenario, stream, views_hz=views_hz, hands=hands)
 
-    stream = io.BytesIO()
-    make(stream, 0.0)
-    stream.seek(0)
-    return SimulatedLog(read_contents(stream, "log", own=True), make)
-
-
-def open_in_memory(write: Callable[[io.BytesIO], object]) -> Log:
-    """Opens the log that a function writes into memory."""
-    stream = io.BytesIO()
-    write(stream)
-    stream.seek(0)
-    return open_log(stream)
+    return SimulatedLog(make)

@@ -18,7 +18,6 @@ from ..core.ticks import NS_PER_S, PlantState, TickRecord
 from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
-from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
@@ -159,7 +158,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     }
     with process.pause_gc():
         ordered = {name: log.commands(name) for name in scenario.names}
-        hands = {name: partial(_recorded_hand, log[name]) for name in scenario.names}
+        hands = {name: partial(find_recorded_hand, log[name]) for name in scenario.names}
 
         def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
             ticks = virtual.execute_virtual(scenario, network, ordered, arms, log.last_ticks, hands)
@@ -175,10 +174,6 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
         else:
             plain = compare_records(log, execute(None, total // 2), arrivals=False)
         return VirtualComparison(fed, plain, find_absent_samples(log))
-
-
-def _recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    return find_recorded_hand(part, k * NS_PER_S // site.rate_hz)
 
 
 def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:

@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.site_setup import Layout
-from ..core.ticks import Mode
 from ..core.vectors import Array
 from ..errors import WireError
-from ..net.messages import READABLE, Stamp, State, TickNumber
+from ..net.messages import MODES, READABLE, Stamp, State, TickNumber
 from ..net.wire import MAX_BYTES, decode
 
 Ints = NDArray[np.int64]
 Strings = NDArray[np.object_]
 
-_MODE: Any = Literal.__getitem__(tuple(mode.name.lower() for mode in Mode))
+_MODE: Any = Literal.__getitem__(tuple(MODES))
 _TYPES: dict[str, Any] = {
     "v": int,
     "tick": TickNumber,

@@ -31,8 +31,8 @@ from . import topics
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection, secure_connection
-from .membership import new_boot, read_events
-from .messages import State
+from .membership import new_boot, read_messages
+from .messages import Event, State
 from .requests import ArmEnable, ArmMeasurement, HandMessage, Request
 from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
@@ -133,7 +133,7 @@ class SiteClient:
                 continue  # a stranger's
             if self._follows_last(record, message[1]):
                 self._record, self._came_ns = record, message[1]
-        for event in read_events(self._events):
+        for event in read_messages(self._events, Event):
             if event.kind == "end" and self._record is not None and event.boot == self._record.boot:
                 self._gone = True
         for _, alive in topics.read_presence(self._presence):

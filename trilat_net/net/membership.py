@@ -54,11 +54,6 @@ def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
             continue  # a stranger's; the sites and the recorder count them
 
 
-def read_events(inbox: Inbox) -> Iterator[Event]:
-    """Yields the events that wait in a ring; skips other payloads."""
-    return read_messages(inbox, Event)
-
-
 def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
     """Yields the records that wait in a ring; skips other payloads, and of a block what follows one."""
     while (message := inbox.poll()) is not None:
@@ -105,9 +100,9 @@ class EventPublisher:
 class MemberQuery:
     """Asks the members of a session for their identities, again and again; notes why one is unreadable."""
 
-    def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
+    def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
         self.unreadable: dict[str, str] = {}
-        self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.INFO))
+        self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
 
     def poll(self) -> Iterator[Info]:
         """Yields the answers that have arrived; repeats the query when it is due."""

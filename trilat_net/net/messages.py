@@ -7,13 +7,14 @@ format. Units stand in the field names or in the schema (`x-unit`); SI and radia
 import ast
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
 from ..core.chain import MAX_JOINTS
 from ..core.site_setup import Layout
+from ..core.ticks import Mode
 from ..core.user_law import MAX_LAW_MEMORY
 
 VERSION = 4
@@ -30,6 +31,41 @@ Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
 MOST_PEERS = 32
 """A scenario has no more sites."""
+
+
+class ModeMeaning(NamedTuple):
+    """What a mode of a site means to whoever reads its records.
+
+    Attributes:
+        does, did: what the site does, as verbs.
+        follows: False if the site is away from its peers.
+        rests: True if, under the rule `glide`, the arm comes to rest: its torque is not that of the law
+            alone, and what peers sent does not enter its reference.
+        halted: True if the site takes up its work again only when somebody asks it to.
+    """
+
+    mode: Mode
+    does: str
+    did: str
+    follows: bool = False
+    rests: bool = False
+    halted: bool = False
+
+
+MODES = {
+    "run": ModeMeaning(Mode.RUN, "follows", "followed", follows=True),
+    "hold": ModeMeaning(Mode.HOLD, "holds", "held", rests=True),
+    "brake": ModeMeaning(Mode.BRAKE, "brakes", "braked"),
+    "return": ModeMeaning(Mode.RETURN, "returns", "returned"),
+    "waiting": ModeMeaning(Mode.WAITING, "waits", "waited", rests=True),
+    "fault": ModeMeaning(Mode.FAULT, "is in fault", "in fault", rests=True, halted=True),
+    "stopped": ModeMeaning(Mode.STOPPED, "is stopped", "stopped", rests=True, halted=True),
+    "diverged": ModeMeaning(Mode.DIVERGED, "diverges", "diverged", follows=True),
+}
+"""The table of modes, by the words that records and messages have for them."""
+MODE_WORDS = {meaning.mode: word for word, meaning in MODES.items()}
+HALTED_MODES = tuple(word for word, meaning in MODES.items() if meaning.halted)
+RESTING_MODES = tuple(word for word, meaning in MODES.items() if meaning.rests)
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:

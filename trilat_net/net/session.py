@@ -26,7 +26,7 @@ from .membership import (
     LateSites,
     Membership,
     liveliness_token,
-    read_events,
+    read_messages,
 )
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
@@ -184,7 +184,7 @@ class SessionJoin:
 
     def _read_events(self) -> Epoch | None:
         """Takes events; returns the epoch of the announcement that is started."""
-        for event in read_events(self._events):
+        for event in read_messages(self._events, Event):
             if event.boots.get(event.member) != event.boot:
                 continue  # the announcement is not for its sender
             if event.kind == "epoch":

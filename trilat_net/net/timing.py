@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from ..core.site_step import Site
 from ..core.ticks import NS_PER_S, TickRecord
-from .messages import VERSION, LinkStats, PeerSample
+from .messages import MODE_WORDS, VERSION, LinkStats, PeerSample
 from .offset import (
     DRIFT_LIMIT,
     OffsetEstimate,
@@ -415,7 +415,7 @@ class LoopStats:
             boot=self._boot,
             tick=output.tick,
             t_ns=output.t_ns,
-            mode=output.mode.name.lower(),
+            mode=MODE_WORDS[output.mode],
             age_us=age_us,
             **by_peer,
             dropped=dict(self.dropped),

@@ -18,9 +18,10 @@ import msgspec
 
 from ..core.chain import MAX_JOINTS
 from ..core.site_setup import Layout
-from ..core.ticks import Arrival, Mode, TickRecord
+from ..core.ticks import Arrival, TickRecord
 from ..errors import WireError
 from .messages import (
+    MODE_WORDS,
     STATE_VECTORS,
     VERSION,
     Event,
@@ -45,7 +46,6 @@ _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
-_MODE_NAMES = {mode: mode.name.lower() for mode in Mode}
 
 
 @cache
@@ -89,7 +89,7 @@ def encode_state(
         "boot": boot,
         "tick": tick,
         "t_ns": t_ns,
-        "mode": _MODE_NAMES[mode],
+        "mode": MODE_WORDS[mode],
         "q": q,
         "qd": qd,
         "q_des": q_des,

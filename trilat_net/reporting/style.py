@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
+from ..core.ticks import Mode
 from ..core.vectors import Array
 from ..files import write_whole
 from ..log.log_reader import Log
@@ -317,14 +318,6 @@ SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
 _AWAY, _BACK = 0.22, 0.09
 _LETTERS_PER_IN = 120.0
 """Of 1 pt type, on the average."""
-_MODE_VERBS = {
-    "hold": "holds",
-    "brake": "brakes",
-    "return": "returns (lighter)",
-    "waiting": "waits",
-    "fault": "is in fault",
-    "stopped": "is stopped",
-}
 _CHANGE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
 _NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
@@ -409,9 +402,9 @@ class TimeFigure:
             words.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
-        modes = {interval.mode for intervals in self._modes.values() for interval in intervals}
+        modes = {interval.meaning for intervals in self._modes.values() for interval in intervals}
         if modes:
-            doing = ", ".join(text for mode, text in _MODE_VERBS.items() if mode in modes)
+            doing = ", ".join(one.does + " (lighter)" * (one.mode is Mode.RETURN) for one in sorted(modes))
             lines += textwrap.wrap(f"Shaded in the color of a site: it {doing}", letters)
         if lines:
             text = typeset("\n".join(lines))

@@ -92,16 +92,9 @@ def format_change_lines(log: Log) -> list[str]:
 def format_mode_lines(log: Log) -> list[str]:
     """Returns a line per site that held, braked or returned."""
     lines = []
-    doing = {
-        "hold": "held",
-        "brake": "braked",
-        "return": "returned",
-        "waiting": "waited",
-        "fault": "in fault",
-    }
     for site in log.sites:
         if found := find_mode_intervals(log[site]):
-            words = [f"{doing.get(s.mode, s.mode)} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]]
+            words = [f"{s.meaning.did} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]]
             more = [f"and {len(found) - MOST_LINES} more"] if len(found) > MOST_LINES else []
             lines.append(f"{site}: {', '.join([*words, *more])}")
     return lines

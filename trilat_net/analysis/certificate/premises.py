@@ -17,6 +17,7 @@ from ...log.accounting import Coverage
 from ...log.log_reader import Log
 from ...log.running_digest import Integrity
 from ...log.session_check import judge_integrity
+from ...net.messages import HALTED_MODES
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses
@@ -266,7 +267,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
     log = run.log
     found = {site: find_mode_intervals(log[site]) for site in log.sites}
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
-    stops = any(one.mode in ("fault", "stopped") for intervals in found.values() for one in intervals)
+    stops = any(one.mode in HALTED_MODES for intervals in found.values() for one in intervals)
     for site in log.sites:
         held = ~find_unlimited(log.scenario.sites[site].limits, log[site].qd_des)
         if held.any():

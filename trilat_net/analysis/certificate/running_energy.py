@@ -14,11 +14,10 @@ import numpy as np
 
 from ...core.ticks import CoreChange
 from ...core.vectors import Array
-from ...net.messages import TASK_VECTORS, State
+from ...net.messages import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
 from ..aligned import (
     RECORD_COLUMNS,
-    RESTING_MODES,
     RESUMING_S,
     AlignedRecords,
     PeerTrajectory,

@@ -16,9 +16,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from ...core.task_space import PLACE
-from ...core.ticks import Mode, TickRecord
+from ...core.ticks import TickRecord
 from ...files import reading
-from ...net.messages import Event, LinkStats, State
+from ...net.messages import MODE_WORDS, Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..site_log import find_task_errors
@@ -60,7 +60,7 @@ _LEVELS = {
     "refused": cdr.RosLogLevel.WARN,
     "clock fault": cdr.RosLogLevel.WARN,
 }
-_MODES = {name: float(mode) for mode in Mode for name in (mode, mode.name.lower())}
+_MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mode, word)}
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
