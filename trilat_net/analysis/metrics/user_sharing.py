@@ -8,7 +8,6 @@ they are forces at end effectors. Rows without a record do not count.
 import math
 
 import numpy as np
-from scipy.special import stdtrit
 
 from ...core.task_space import PLACE
 from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
@@ -18,6 +17,9 @@ from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, p
 
 PARTS, WIDEST = 8, 0.25
 """Of a share in motion: parts that the jackknife leaves out in turn, and the widest half interval, 95 %."""
+
+STUDENT_T = 2.3646
+"""The 0.975 quantile of Student's t with one degree of freedom less than parts, 7."""
 
 
 def _unasked(why: str) -> Metric:
@@ -77,7 +79,7 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     every = np.arange(len(moves))
     rows = [every, *(np.delete(every, part) for part in np.array_split(every, PARTS))]
     shares, *others = (np.linalg.lstsq(apart[row], (moves - last)[row])[0] for row in rows)
-    half = float(stdtrit(PARTS - 1, 0.975)) * math.sqrt((PARTS - 1) * np.var(others, axis=0).max())
+    half = STUDENT_T * math.sqrt((PARTS - 1) * np.var(others, axis=0).max())
     if not half <= WIDEST:
         return Metric(None, f"the motion does not tell: shares within +- {half:.2g}")
     return [*shares.tolist(), 1.0 - float(shares.sum())]
