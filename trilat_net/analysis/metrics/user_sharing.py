@@ -17,7 +17,6 @@ from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, p
 
 PARTS, WIDEST = 8, 0.25
 """Of a share in motion: parts that the jackknife leaves out in turn, and the widest half interval, 95 %."""
-
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with one degree of freedom less than parts, 7."""
 
