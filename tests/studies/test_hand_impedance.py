@@ -18,6 +18,8 @@ ALONG_X, ALONG_Y = ((0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5), (0.75, 1.25, 1.75, 2.25
 """Frequencies of the sines on the first and on the second joint, Hz: 8 s tell them apart."""
 ARMS = {f"sites.{site}.q0_rad": [0.6, 1.2] for site in ("m1", "m2", "s")}
 
+SPRING = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
+
 
 def moved_from(site: str, amplitude_nm: float, duration_s: float = 28.0) -> dict[str, Any]:
     sines = [
@@ -54,9 +56,8 @@ def covered(true: HandMatrices, found: HandImpedance) -> Array:
 @pytest.fixture(scope="module")
 def spring() -> HandImpedance:
     """A spring of the kernel that the sines of its own site move."""
-    hand = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
     changes = moved_from("m1", 2.0)
-    changes["sites.m1.hands"] = [hand, *changes["sites.m1.hands"]]
+    changes["sites.m1.hands"] = [SPRING, *changes["sites.m1.hands"]]
     return identify_hand(tn.simulate("free", changes))
 
 
@@ -69,9 +70,8 @@ def test_spring_and_damper_of_the_kernel_are_found(spring: HandImpedance) -> Non
 
 def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
     """A run that goes on for 12 s after its sines, with the same spring at the same arm."""
-    hand = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
     changes = moved_from("m1", 2.0, 40.0)
-    changes["sites.m1.hands"] = [hand, *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"])]
+    changes["sites.m1.hands"] = [SPRING, *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"])]
     found = identify_hand(tn.simulate("free", changes))
     assert found.segments == spring.segments
     assert np.allclose(found.K, spring.K, atol=1e-6)

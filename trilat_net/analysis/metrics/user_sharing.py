@@ -67,13 +67,13 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     judged, rates = own.known & own.follows, []
     for other in (view.sites[user].records for user in users):
         row = own.used[other.site] - other.first
-        judged &= (row >= 0) & (row < len(other.known)) & other.known[row.clip(0, len(other.known) - 1)]
-        rates.append(other.shared_rate[row.clip(0, len(other.known) - 1)])
+        there = row.clip(0, len(other.known) - 1)
+        judged &= (row == there) & other.known[there]
+        rates.append(other.shared_rate[there])
     *firsts, last = (rate[judged].ravel() for rate in rates)
     apart = np.column_stack([one - last for one in firsts])
     moves = own.shared_rate[judged].ravel()
-    least = np.linalg.svd(apart, compute_uv=False)[-1] if len(moves) else 0.0
-    if least <= 1e-9 * np.linalg.norm(moves):
+    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] <= 1e-9 * np.linalg.norm(moves):
         return Metric(None, "the users move alike, or nobody moves")
     every = np.arange(len(moves))
     rows = [every, *(np.delete(every, part) for part in np.array_split(every, PARTS))]
