@@ -13,7 +13,7 @@ help:
 	@echo "             OPTIONS='--duration 5' gives options to either"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, and compile what the demo needs"
 	@echo "make test    everything that CI checks"
-	@echo "make test-long    all of that and the rest: every seed, every live session, endurance"
+	@echo "make test-long    all of that and the rest: every test, every live session, endurance"
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"

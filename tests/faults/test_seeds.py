@@ -11,7 +11,7 @@ from .fault_schedule import KINDS, SHORT, SITES, WHOLE, Fault, draw_faults
 from .judged_seed import Judged, judge_faults, judge_seed
 from .planted_bugs import PLANTED
 
-ON_PUSH, BLOCK, ALL = 6, 100, 2000
+ON_PUSH = 6
 FINDS_WITHIN = 200
 
 
@@ -26,10 +26,10 @@ def test_invariants_hold_whatever_goes_wrong(first: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("first", range(0, ALL, BLOCK))
-def test_invariants_hold_in_two_thousand_sessions(first: int) -> None:
+def test_invariants_hold_in_a_hundred_whole_sessions() -> None:
+    """`make faults` judges two thousand, in hours of processor time."""
     visited: Counter[str] = Counter()
-    for seed in range(first, min(first + BLOCK, ALL)):
+    for seed in range(100):
         judged = judge_seed(seed)
         assert_holds(judged)
         visited += judged.visited
