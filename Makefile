@@ -4,6 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
+LOCKED := --quiet --require-hashes --only-binary :all: -r
+# uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
+INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
 .PHONY: help demo play setup test pytest compiled sessions containers push-set lint platforms test-long faults docs bench lock clean
 
@@ -34,9 +37,13 @@ $(VENV)/bin/python:
 		{ echo "Python's venv module is missing; on Debian and Ubuntu: apt install python3-venv"; exit 2; }
 	@$(PYTHON) -m venv $(VENV)
 
-$(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/bin/python
+$(VENV)/uv.stamp: requirements/uv.lock | $(VENV)/bin/python
+	@$(PIP) $(LOCKED) $< || echo "there is no uv for this machine: pip installs, more slowly"
+	@touch $@
+
+$(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/uv.stamp
 	@echo "installing locked dependencies into $(VENV)"
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/runtime.lock
+	$(INSTALL)
 	@$(PIP) --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
@@ -45,11 +52,11 @@ $(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*.py)
 	@touch $@
 
 $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/dev.lock
+	$(INSTALL)
 	@touch $@
 
 $(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/long.lock
+	$(INSTALL)
 	@touch $@
 
 test:
@@ -95,7 +102,7 @@ faults: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.faults --seeds 2000 --write
 
 $(VENV)/docs.stamp: requirements/docs.lock $(VENV)/runtime.stamp
-	@$(PIP) --quiet --require-hashes --only-binary :all: -r requirements/docs.lock
+	$(INSTALL)
 	@touch $@
 
 docs: $(VENV)/docs.stamp
@@ -106,14 +113,16 @@ docs: $(VENV)/docs.stamp
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks
 
-lock:
-	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+lock: $(VENV)/uv.stamp
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		--group setup -o requirements/uv.lock
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		pyproject.toml --group build -o requirements/runtime.lock
-	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		pyproject.toml --extra frames --group build --group dev -c requirements/runtime.lock -o requirements/dev.lock
-	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group long -c requirements/dev.lock -o requirements/long.lock
-	uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group docs -c requirements/dev.lock -o requirements/docs.lock
 
 clean:
