@@ -88,6 +88,7 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
         for peer, name in zip(view.peers, scenario.peers("m2"), strict=True):
             assert peer.tick == log["m2"].states[view.k - 1].used[name] <= view.k - 1 - 200
             assert np.array_equal(peer.q, log[name].q[peer.tick])
+            assert np.array_equal(peer.tau_x, log[name].tau_x[peer.tick])
             assert peer.age_s == pytest.approx(1e-3 * (view.k - peer.tick))
         assert np.array_equal(view.q, log["m2"].q[view.k])
         assert np.array_equal(view.tau_x, log["m2"].tau_x[view.k - 1])

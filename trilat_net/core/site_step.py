@@ -100,6 +100,7 @@ class Site:
         rest = s["q_rest"][0], s["qd_rest"][0]
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
+        self._keeps_forces = self._reflects or self._hand is not None  # a hand of one's own sees them
 
     def _plug_law(self, setup: SiteSetup) -> None:
         """Makes the law of a setup that has its own."""
@@ -360,7 +361,7 @@ class Site:
                 self._tick_arrays = (*self._arrays, *self._buffers)
             self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
             offset += self._arrival_size
-        if self._reflects:
+        if self._keeps_forces:
             for n, arrival in enumerate(arrivals):
                 self._buffers.forces[n] = arrival.tau_x or 0.0
         if self._received_counts:
