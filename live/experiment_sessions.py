@@ -118,7 +118,7 @@ class ExperimentSessions:
                 self._note_aborted(planned, "the program was ended")
             else:  # its session had not begun
                 shutil.rmtree(left, ignore_errors=True)
-        rest_s = plan.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
+        rest_s = plan.rest_before_s(planned)
         while not self._try(step, trial, path, rest_s):
             if self.ends():
                 return False

@@ -72,22 +72,24 @@ class TrialWatch:
         if self._next == 0:
             moments.append(f"trial {number} begins")
         self._next, rows = last + 1, slave.window.rows(first, last)
-        for tick, known, q in zip(range(first, last + 1), rows.known.tolist(), rows.q.tolist(), strict=True):
+        told = rows.known.tolist(), rows.q.tolist(), rows.tau_x.tolist()
+        for tick, known, q, tau_x in zip(range(first, last + 1), *told, strict=True):
             t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
             if not self._appeared and t_s >= self.trial.appears_s:
                 self._appeared = True
                 moments.append("target appears")
-            if known and (outcome := self.judge.take(t_s, q)) is not None:
+            if known and (outcome := self.judge.take(t_s, q, tau_x)) is not None:
                 self._ended_ns = self._clock.monotonic_ns()
                 return [*moments, f"trial {number} {'succeeded' if outcome.succeeded else 'failed'}"]
         return moments
 
-    def describe(self, t_s: float) -> Json:
-        """Returns what a page draws at a time of its arms, s."""
-        goal, trial = self.judge.goal, self.trial
-        at = goal.place(t_s)
+    def describe(self, t_s: float, site: str) -> Json:
+        """Returns what a page draws at a time of its arms, s; a user's page as that user is shown it."""
+        goal, trial, users = self.judge.goal, self.trial, self.trial.protocol.users
+        at, way = goal.place(t_s, users.index(site) if site in users else None), goal.find_corridor(t_s)
         return {
             "target": {"site": trial.slave, "at": at.tolist(), "width_m": goal.width_m},
+            **({} if way is None else {"way": {"from": way[0].tolist(), "width_m": way[1]}}),
             "appeared": t_s >= goal.appears_s,
             "left_s": max(0.0, trial.longest_s - max(t_s, goal.appears_s)),
         }
@@ -142,7 +144,10 @@ class Stage:
     def tell(self, entry: TrialEntry | None, why: str = "") -> None:
         """Shows the feedback on a trial, as far as the protocol has any; or why it is made again."""
         names = self._plan.protocol.feedback if entry is not None else ()
-        self._told = {"why": why, "measures": {name: entry.measures[name] for name in names if entry}}
+        self._told = {
+            "why": why,
+            "measures": {name: entry.measures[name] for name in names if entry and name in entry.measures},
+        }
         if entry is not None and names:
             self._told["succeeded"] = entry.succeeded
 
@@ -195,9 +200,7 @@ class Stage:
         found |= {
             "key": step.key,
             "users": [{"site": at, "who": names[at], "state": state} for at, state in states.items()],
-            "task": protocol.task.asks.format(
-                slave=self._plan.scenarios[planned.condition].slave, task=protocol.task
-            ),
+            "task": protocol.task.ask(self._plan.scenarios[planned.condition].slave),
             "trial": planned.trial,
             "trials": protocol.practice + protocol.trials,
             "block": planned.block,
@@ -207,10 +210,11 @@ class Stage:
         if asked is not None:
             found["rest_s"] = max(0.0, (asked.from_ns - self._clock.monotonic_ns()) / NS_PER_S)
         if watch is not None and t_s is not None:
-            found |= watch.describe(t_s)
+            found |= watch.describe(t_s, site)
         if role == "experimenter":
             found |= {"number": planned.number, "of": len(self._plan.trials)}
-            found |= {"condition": planned.condition + (", a catch trial" if planned.catch else "")}
+            also = f", {planned.phase}" if planned.phase else ", a catch trial" if planned.catch else ""
+            found |= {"condition": planned.condition + also}
         if site in names and role == "user":
             found |= {"who": names[site], "done": site in replies, "second": self._holders.get(site) != page}
             if step.kind == "consent":

@@ -4,7 +4,7 @@ import { css, WORDS_MS } from "./arms.js";
 
 const MEASURES = {
   completion_s: ["time", "s", 2], movement_s: ["time in motion", "s", 2], reaction_s: ["reaction", "s", 2],
-  error_end_mm: ["error at the end", "mm", 1], error_rms_mm: ["mean error", "mm", 1], path_m: ["way", "m", 2],
+  wall_force_n: ["force at the wall", "N", 1], error_end_mm: ["error at the end", "mm", 1], error_rms_mm: ["mean error", "mm", 1], path_m: ["way", "m", 2],
 };
 const PHASES = {
   consent: "Users are asked for consent", trial: "The trial begins once all users are ready", starting: "The arms are being set up",
@@ -39,7 +39,10 @@ export class Stage {
     this.running = shown.left_s !== undefined;
     for (const card of arms?.cards || []) {
       const target = this.running && shown.target.site === card.name ? shown.target : null;
-      card.extra = target && ((g, ratio, tip) => this.circle(card, target, g, ratio, tip));
+      card.extra = target && ((g, ratio, tip) => {
+        if (shown.way) this.corridor(card, target, shown.way, g);
+        this.circle(card, target, g, ratio, tip);
+      });
       card.needs = target ? [target.at] : [];
     }
     this.fill(this.bar, "bar", [shown.phase, this.running, shown.key, shown.users, shown.appeared, shown.second], () => this.head(shown, page.hello));
@@ -207,6 +210,21 @@ export class Stage {
     const place = () => { input.className = ""; set(input.valueAsNumber); };
     input.addEventListener("input", place);
     input.addEventListener("click", place);
+  }
+
+  corridor(card, { at }, { from, width_m: width }, g) {
+    const [left, to] = [card.project(from), card.project(at)];
+    const edge = card.project(at.map((v, n) => v + (n === 0 ? width : 0)));
+    g.strokeStyle = css("--accent");
+    g.lineWidth = Math.hypot(edge[0] - to[0], edge[1] - to[1]);
+    g.lineCap = "round";
+    g.globalAlpha = 0.1;
+    g.beginPath();
+    g.moveTo(...left);
+    g.lineTo(...to);
+    g.stroke();
+    g.globalAlpha = 1;
+    g.lineCap = "butt";
   }
 
   circle(card, { at, width_m: width }, g, ratio, tip) {

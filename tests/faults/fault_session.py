@@ -218,12 +218,12 @@ class FaultSession(Session):
     def _stranger(self, fault: Fault) -> None:
         """The newest samples of a site as of another start, and far ahead, and what is no sample at all."""
         (name,) = fault.of
-        loads = []
-        for load in self._recent[name][-50:]:
+        loads, junk = [], (b"", b"\xff" * 2000)
+        for load in [load for load in self._recent[name] if load not in junk][-50:]:
             sample = msgpack.unpackb(load)
             loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "q": [9.0, 9.0]}))
             loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "tick": sample["tick"] + 9700}))
-        self._publish(topics.key(SESSION, name, topics.SAMPLE), [*loads, b"", b"\xff" * 2000])
+        self._publish(topics.key(SESSION, name, topics.SAMPLE), [*loads, *junk])
 
     def _wall_clock(self, fault: Fault) -> None:
         self.clocks[fault.of[0]].wall_ahead_ns = round(fault.size * 1e9)

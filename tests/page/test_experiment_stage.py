@@ -15,7 +15,7 @@ from tests.live.page_client import page_client
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
-from tests.studies.experiment.experiments import write_protocol
+from tests.studies.experiment.experiments import APART, REACH, write_protocol
 from trilat_net.analysis.certificate.running_energy import RecordWindow
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, UsageError
@@ -276,6 +276,22 @@ def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> A
         window.take(record)
     site = SimpleNamespace(window=window, complete=last, record=SimpleNamespace(mode=mode))
     return SimpleNamespace(running=True, sites={"s": site})
+
+
+def test_each_user_is_shown_its_own_target_and_the_corridor(tmp_path: Path, clock: ManualClock) -> None:
+    def shown(task: str, site: str) -> Any:
+        (folder := tmp_path / task[-3:] / (site or "-")).mkdir(parents=True)
+        plan = begin_experiment(write_protocol(folder, '["m1", "m2"]', task), folder / "out").plan
+        trial = ExperimentTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
+        return TrialWatch(trial, clock).describe(trial.appears_s + 0.5, site)
+
+    first, second, middle = (shown(APART, site)["target"]["at"] for site in ("m1", "m2", ""))
+    assert first[0] - second[0] == pytest.approx(0.1)
+    assert middle[0] == pytest.approx(0.5 * (first[0] + second[0]))
+    carried = shown(f"{REACH}\ncorridor_m = 0.03", "m1")
+    assert carried["way"]["width_m"] == 0.03
+    assert carried["way"]["from"] != carried["target"]["at"]
+    assert "way" not in shown(REACH, "m1")
 
 
 def test_watch_judges_as_the_log_does(watched: Any, clock: ManualClock) -> None:

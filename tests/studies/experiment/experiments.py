@@ -29,11 +29,21 @@ dominance.s = {{ m1 = 0.7, m2 = 0.3 }}
 {task}
 """
 REACH = 'kind = "reach"\ntargets = 4\ndistance_m = 0.1\nwidth_m = 0.05\ntimeout_s = 6.0\ndwell_s = 0.2'
+HANDOVER = f"{REACH}\nhandover_s = 3.0"
+CONTACT = 'kind = "contact"\ndistance_m = 0.04\nforce_n = 4.0'
+APART = 'kind = "track"\nduration_s = 3.0\namplitude_m = 0.05\napart_m = 0.1'
+WALL = "{ kind = 'wall', point_m = [1.69, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 1000.0 }"
 TRACK = 'kind = "track"\nduration_s = 2.0\namplitude_m = 0.05'
 
 
-def write_protocol(folder: Path, users: str = '["m1"]', task: str = REACH) -> Path:
+def write_protocol(
+    folder: Path, users: str = '["m1"]', task: str = REACH, more: str = "", first: float = 0.7
+) -> Path:
+    """Writes it; `more` follows its task, and `first` is the first user's share of the slave."""
     file = folder / "short.toml"
-    design = "fixed" if "m2" in users else "williams"
-    file.write_text(TEXT.format(users=users, task=task, design=design), encoding="utf-8")
+    text = TEXT.format(users=users, task=task, design="fixed" if "m2" in users else "williams") + more
+    if "contact" in task:
+        text = text.replace("sites.s = { ", f"sites.s = {{ environment = [{WALL}], ")
+    text = text.replace("{ m1 = 0.7, m2 = 0.3 }", f"{{ m1 = {first}, m2 = {1.0 - first:.1f} }}")
+    file.write_text(text, encoding="utf-8")
     return file

@@ -6,11 +6,8 @@ import pytest
 from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.movement_measures import (
     TLX_SCALES,
-    Throughput,
     energy_j,
-    log_dimensionless_jerk,
     mean_force_n,
-    mean_throughput,
     measure_pair,
     measure_throughput,
     movement_time_s,
@@ -30,7 +27,6 @@ BELL = np.exp(-5.0 * T_S**2)
 
 def test_smoothness_has_the_numbers_of_its_authors() -> None:
     assert f"{sparc(BELL, 100.0):.5f}" == "-1.41403"
-    assert f"{log_dimensionless_jerk(BELL, 100.0):.5f}" == "-5.81636"
 
 
 def _minimum_jerk(duration_s: float, rate_hz: float) -> np.ndarray:
@@ -41,16 +37,14 @@ def _minimum_jerk(duration_s: float, rate_hz: float) -> np.ndarray:
 def test_smoothness_ignores_amplitude_and_falls_with_submovements() -> None:
     one = _minimum_jerk(1.0, 200.0)
     two = np.concatenate([one, one])
-    for measure in (sparc, log_dimensionless_jerk):
-        assert measure(7.0 * one, 200.0) == pytest.approx(measure(one, 200.0), abs=1e-9)
-        assert measure(two, 200.0) < measure(one, 200.0) - 0.2
+    assert sparc(7.0 * one, 200.0) == pytest.approx(sparc(one, 200.0), abs=1e-9)
+    assert sparc(two, 200.0) < sparc(one, 200.0) - 0.2
     assert sparc(_minimum_jerk(2.0, 100.0), 100.0) == pytest.approx(sparc(one, 200.0), abs=0.02)
 
 
 def test_rest_has_neither_smoothness_nor_movement_time() -> None:
     rest = np.zeros(50)
-    assert sparc(rest, 100.0) is log_dimensionless_jerk(rest, 100.0) is movement_time_s(rest, 100.0) is None
-    assert log_dimensionless_jerk(np.ones(50), 100.0) is None
+    assert sparc(rest, 100.0) is movement_time_s(rest, 100.0) is None
 
 
 def test_movement_lasts_while_speed_is_above_its_threshold() -> None:
@@ -116,13 +110,6 @@ def test_end_points_without_spread_have_no_throughput() -> None:
     starts, targets, _, times_s = _published()
     assert measure_throughput(starts, targets, targets, times_s) is None
     assert measure_throughput(starts[:1], targets[:1], targets[:1] + 1.0, times_s[:1]) is None
-
-
-def test_mean_throughput_gives_each_user_the_same_weight() -> None:
-    slow, fast = Throughput(0.1, 0.3, 2.0, 1.0), Throughput(0.1, 0.3, 4.0, 1.0)
-    assert mean_throughput({"p1": [slow], "p2": [fast, fast, fast]}) == pytest.approx(3.0)
-    with pytest.raises(UsageError, match="has no sequence"):
-        mean_throughput({"p1": []})
 
 
 def test_internal_and_useful_force_make_up_both_forces() -> None:

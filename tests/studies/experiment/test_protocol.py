@@ -97,6 +97,26 @@ def test_digest_knows_what_was_planned() -> None:
             "a scale has 2 to 101 numbers",
         ),
         ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
+        ({"task": {"kind": "reach", "handover_s": 2.0}}, "a handover and users .* need two users"),
+        ({"task": {"kind": "track", "apart_m": 0.1}}, "who are shown different targets need two users"),
+        ({"training": {"lead": {"near": [1.0, 0.0]}}}, "training.lead: is a pair .* of near, far"),
+        (
+            {
+                "users": ["m1", "m2"],
+                "training": {"lead": {"near": [1.0, 0.0], "far": [1.0, 0.0]}},
+                "catch": {"condition": "far"},
+            },
+            "a training has no catch trials",
+        ),
+        (
+            {
+                "users": ["m1", "m2"],
+                "task": {"kind": "reach", "handover_s": 2.0},
+                "set": {**LIVE, "dominance.s": {"m1": 1.0}},
+            },
+            "dominance.s.*both users are to have a share",
+        ),
+        ({"task": {"kind": "contact"}}, "sites.s.environment.*there is no wall to press"),
         (
             {"conditions": {"a": {"link.delay_ms": -1}, "b": {"control.K": 1}}},
             "condition a: .*; condition b: ",

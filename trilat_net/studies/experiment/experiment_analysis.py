@@ -39,7 +39,8 @@ from .statistics import (
 
 MEASURES = (
     "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
-    "force_mean_user1_n", "force_mean_user2_n", "succeeded",
+    "force_mean_user1_n", "force_mean_user2_n", "wall_force_n", "error_force_n", "error_handover_mm",
+    "first_settled", "succeeded",
 )  # fmt: skip
 """What is compared, as far as trials have it, and differ in it."""
 FOLDER = "analysis"
@@ -49,7 +50,8 @@ class ExperimentAnalysis(Result):
     """The statistics of an experiment.
 
     Attributes:
-        rows: the trials that count; `throughput_rows` has one for each participant and condition.
+        rows: the trials that count, after a training if there is one; `learning_rows` has all of its phases.
+        throughput_rows, gain_rows: a row for each participant, or pair, and condition.
         means: by measure, for each condition.
         comparisons: by measure, of every two conditions.
         methods: the paragraph of a paper.
@@ -67,16 +69,18 @@ class ExperimentAnalysis(Result):
             )
         kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
         counted = [row for row in kept if not (row["practice"] or row["catch"])]
-        self.rows = sorted(counted, key=lambda row: order(row["condition"]))
+        self.learning_rows = sorted(counted, key=lambda row: order(row["condition"]))
+        self.rows = [row for row in self.learning_rows if row.get("phase", "after") == "after"]
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
-        self.throughput_rows = list(self._find_throughput())
+        self.throughput_rows, self.gain_rows = list(self._find_throughput()), list(self._find_gains())
         scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
         self._scores = [row for row in scores if row[self.unit] not in exclude]
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.means: dict[str, list[ConditionMean]] = {}
         self.comparisons: dict[str, list[Comparison]] = {}
-        for measure in (*MEASURES, *forms):
+        gains = [key for key in self.gain_rows[0] if key.startswith("gain")] if self.gain_rows else []
+        for measure in (*MEASURES, *forms, *gains):
             rows = self.of(measure)
             if len({row.get(measure) for row in rows}) > 1:
                 self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
@@ -87,6 +91,8 @@ class ExperimentAnalysis(Result):
         """Returns the rows that have a measure."""
         if measure.startswith("throughput"):
             return self.throughput_rows
+        if measure.startswith("gain_"):
+            return self.gain_rows
         return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
@@ -104,6 +110,23 @@ class ExperimentAnalysis(Result):
                 found = measure_throughput(left, aims, ends, [row["completion_s"] for row in done])
                 if found is not None:
                     yield {self.unit: who, "condition": condition, "throughput_bits_s": found.bits_s}
+
+    def _find_gains(self) -> Iterator[dict[str, Any]]:
+        """Yields by how much each pair has become better by a training: at once (transfer), and later."""
+        task = self._experiment.plan.protocol.task
+        by: dict[tuple[str, str], dict[str, list[float]]] = {}
+        for row in self.learning_rows:
+            phases = by.setdefault((row[self.unit], row["condition"]), {})
+            phases.setdefault(row.get("phase", ""), []).append(row[task.learnt])
+        for (who, condition), phases in by.items():
+            means = {phase: float(np.mean(values)) for phase, values in phases.items()}
+            gains = {
+                f"gain_{phase}_{task.learnt}": means["before"] - means[phase]
+                for phase in ("after", "retention")
+                if {"before", phase} <= means.keys()
+            }
+            if gains:
+                yield {self.unit: who, "condition": condition, **gains}
 
     def _write_methods(self) -> str:
         plan = self._experiment.plan
@@ -127,6 +150,7 @@ class ExperimentAnalysis(Result):
             **pairs,
             "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
             **({"exclusions": reasons} if reasons else {}),
+            **({"training": protocol.training.describe()} if protocol.training else {}),
             "design": protocol.design,
             "blocks": len(protocol.conditions),
             "trials": protocol.trials,
@@ -157,9 +181,10 @@ class ExperimentAnalysis(Result):
             path = made / f"{measure}.png"
             draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)
             self.paths.append(path)
-        if len({row["trial"] for row in self.rows}) > 1:
+        if len({row["trial"] for row in self.learning_rows}) > 1:
+            learnt = self._experiment.plan.protocol.task.learnt
             self.paths.append(made / "learning.png")
-            draw_learning(self.rows, "completion_s", unit=self.unit).savefig(self.paths[-1], dpi=200)
+            draw_learning(self.learning_rows, learnt, unit=self.unit).savefig(self.paths[-1], dpi=200)
         return self
 
     def fit_models(self) -> Iterator[MixedModel]:

@@ -140,6 +140,7 @@ class Experiment(Result):
                 "block": planned.block,
                 "trial": planned.trial,
                 "practice": int(planned.practice),
+                **({"phase": planned.phase} if planned.phase else {}),
                 "catch": int(planned.catch),
                 "people": int(entry.people),
                 "succeeded": int(entry.succeeded),

@@ -74,19 +74,6 @@ def sparc(
     return -float(np.hypot(np.diff(arc), 1.0 / (arc.size - 1)).sum())
 
 
-def log_dimensionless_jerk(speed: ArrayLike, rate_hz: float) -> float | None:
-    """Returns -ln(T^3 / v_peak^2 * integral of v''^2 dt) of a speed of shape (K,); None if it has no jerk.
-
-    It falls with noise where `sparc` hardly does: speeds need a filter first. Source: as of `sparc`.
-    """
-    samples = _read("speed", speed, 1)
-    jerk = np.diff(samples, 2) * rate_hz**2
-    if not jerk.any():
-        return None
-    duration_s, peak = samples.size / rate_hz, np.abs(samples).max()
-    return -float(np.log(duration_s**3 / peak**2 * (jerk @ jerk) / rate_hz))
-
-
 def path_length_m(places: ArrayLike) -> float:
     """Returns the length of a path through places, m, shape (K, D)."""
     return float(np.linalg.norm(np.diff(_read("places", places, 2), axis=0), axis=1).sum())
@@ -182,13 +169,6 @@ def measure_throughput(
     if width <= 1e-12 * float(lengths.max()) or distance <= 0.0:
         return None
     return Throughput(width, distance, float(np.log2(distance / width + 1.0)), float(times.mean()))
-
-
-def mean_throughput(found: Mapping[str, Sequence[Throughput]]) -> float:
-    """Returns the mean of means, bit/s: of each user over its sequences, then over users; same source."""
-    if not found or not all(found.values()):
-        raise UsageError("throughput: a user has no sequence; leave users without one out")
-    return float(np.mean([np.mean([one.bits_s for one in each]) for each in found.values()]))
 
 
 # --- a pair ----------------------------------------------------------------------------------------------

@@ -25,14 +25,18 @@ from ...results import Result
 from ...scenario import Scenario, load_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from .questionnaires import Name, Questionnaire, find_form
-from .synthetic_participant import ParticipantModel
+from .synthetic_participant import ParticipantModel, Share
 from .tasks import AnyTask, ReachTrial
 
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
 Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
 """It becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
-Feedback = Literal["completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m"]
+Counted = Annotated[int, Meta(ge=0, le=1000)]
+Rest = Annotated[float, Meta(ge=0.0, le=1e6)]
+Feedback = Literal[
+    "completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m", "wall_force_n"
+]
 
 
 class CatchTrials(Frozen, frozen=True):
@@ -45,6 +49,41 @@ class CatchTrials(Frozen, frozen=True):
 
     condition: Name
     share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.1
+
+
+class Training(Frozen, frozen=True):
+    """Authority that moves from the first user, an expert, to the second one, who learns.
+
+    Attributes:
+        lead: by condition the expert's part of what both share at the slave, in the first and last trial.
+        before: trials of a block before that, which the second user makes alone.
+        after: trials alone right afterwards: what was learned.
+        retention: trials alone later, after a rest: what is left of it.
+        rest_s: that rest, s.
+    """
+
+    lead: dict[Name, tuple[Share, Share]]
+    before: Counted = 2
+    after: Counted = 2
+    retention: Counted = 0
+    rest_s: Rest = 600.0
+
+    def describe(self) -> str:
+        """Returns it in a sentence of a methods paragraph."""
+        parts = ", ".join(f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items())
+        later = f", and {self.retention} more after {self.rest_s:g} s" if self.retention else ""
+        return (
+            f"In these the expert's part of the authority went from {parts}; {self.before} trials before and "
+            f"{self.after} after them{later} were made without it and are compared"
+        )
+
+    def list_phases(self, condition: str, trials: int) -> list[tuple[str, float]]:
+        """Returns the phase of every trial of a block and the expert's part in it."""
+        first, last = self.lead[condition]
+        parts = np.linspace(first, last, trials).tolist()
+        alone = [("before", self.before), ("after", self.after), ("retention", self.retention)]
+        before, after, later = ([(phase, 0.0)] * count for phase, count in alone)
+        return [*before, *(("training", part) for part in parts), *after, *later]
 
 
 class Protocol(Frozen, frozen=True):
@@ -71,6 +110,7 @@ class Protocol(Frozen, frozen=True):
         feedback: the measures that people are told after a trial.
         force_limit_n: largest force of the live hands of participants who bear less, N, by pseudonym.
         catch: trials of another condition among those of a block; they do not count.
+        training: trials in which authority moves from an expert to somebody who learns.
     """
 
     name: Name
@@ -82,7 +122,7 @@ class Protocol(Frozen, frozen=True):
     participants: Count | tuple[Pseudonym, ...] = 12
     design: Literal["williams", "latin", "random", "fixed"] = "williams"
     trials: Count = 10
-    practice: Annotated[int, Meta(ge=0, le=1000)] = 0
+    practice: Counted = 0
     foreperiod_s: tuple[Wait, Wait] = (0.5, 1.0)
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 1
     task: AnyTask = field(default_factory=ReachTrial)
@@ -93,6 +133,13 @@ class Protocol(Frozen, frozen=True):
     feedback: tuple[Feedback, ...] = ()
     force_limit_n: dict[Pseudonym, Positive] = field(default_factory=dict)
     catch: CatchTrials | None = None
+    training: Training | None = None
+
+    def list_phases(self, condition: str) -> list[tuple[str, float | None]]:
+        """Returns phase and first user's part of what two share, of every trial of a block after practice."""
+        if self.training is None:
+            return [("", None)] * self.trials
+        return [*self.training.list_phases(condition, self.trials)]
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
@@ -119,6 +166,8 @@ class PlannedTrial(NamedTuple):
             direction of a target does is no learning.
         seed: of what is drawn in it.
         catch: whether its condition is another than the block's, and it does not count.
+        phase: of a training: "before", "training", "after" or "retention".
+        lead: the first user's part of what two users share at the slave; None: as the scenario has it.
     """
 
     number: int
@@ -131,6 +180,8 @@ class PlannedTrial(NamedTuple):
     target: int
     seed: int
     catch: bool = False
+    phase: str = ""
+    lead: float | None = None
 
     @property
     def file(self) -> str:
@@ -193,6 +244,13 @@ class ExperimentPlan(Result):
                 asked = [form for form in forms if left or form.after == "block"]
                 yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
 
+    def rest_before_s(self, planned: PlannedTrial) -> float:
+        """Returns how long people rest at least before a trial, s."""
+        training, before = self.protocol.training, self.trials[max(planned.number - 2, 0)]
+        if training is not None and planned.phase == "retention" != before.phase:
+            return training.rest_s
+        return self.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
+
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order of conditions of each group, by its name."""
         found: dict[str, list[str]] = {}
@@ -208,7 +266,8 @@ class ExperimentPlan(Result):
         whose = "pairs" if len(protocol.users) > 1 else "participants"
         yield f"{protocol.name}: {protocol.title or protocol.task.words}"
         yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.words}"
-        each = f"{len(protocol.conditions)} conditions of {protocol.practice} + {protocol.trials} trials"
+        trials = self.trials[-1].trial - protocol.practice
+        each = f"{len(protocol.conditions)} conditions of {protocol.practice} + {trials} trials"
         longest_s = protocol.foreperiod_s[1] + protocol.task.longest_s
         yield f"{each}: {len(self.trials)} trials of at most {longest_s:g} s; design {protocol.design}"
         yield TextTable(
@@ -272,6 +331,12 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
     if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
         yield f"catch.condition: there is no condition {protocol.catch.condition}"
+    if protocol.training is not None and protocol.training.lead.keys() != protocol.conditions.keys():
+        yield f"training.lead: is a pair of numbers for each of {', '.join(protocol.conditions)}"
+    if protocol.training is not None and protocol.catch is not None:
+        yield "a training has no catch trials"
+    if size != 2 and (protocol.training is not None or protocol.task.needs_pair):
+        yield "a training, a handover and users who are shown different targets need two users"
     forms = [form.name for form in protocol.questionnaires]
     if len(set(forms)) < len(forms):
         yield "two questionnaires have one name"
@@ -303,6 +368,12 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
                 "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",
             )
+    slave = scenario.slave
+    if protocol.task.presses and not scenario.sites[slave].environment:
+        raise ScenarioError("there is no wall to press", path=f"sites.{slave}.environment")
+    shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
+    if (protocol.training is not None or protocol.task.handover is not None) and min(shares) <= 0.0:
+        raise ScenarioError("both users are to have a share", path=f"dominance.{slave}")
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)
     return scenario
@@ -354,18 +425,19 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
 
 def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
-    each = protocol.practice + protocol.trials
     number = 0
-    for n, group in enumerate(protocol.groups):
-        for block, trial in itertools.product(range(len(protocol.conditions)), range(each)):
-            condition, number = orders[n % len(orders)][block], number + 1
+    for (n, group), block in itertools.product(enumerate(protocol.groups), range(len(protocol.conditions))):
+        condition = orders[n % len(orders)][block]
+        phases = [*[("", None)] * protocol.practice, *protocol.list_phases(condition)]
+        for trial, phase in enumerate(phases):
+            number += 1
             caught = trial in _draw_catches(protocol, condition, (n, block))
             drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
             seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
             first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
-            counts = block + 1, trial + 1, practice, block * each + trial, int(first) + trial
+            counts = block + 1, trial + 1, practice, block * len(phases) + trial, int(first) + trial
             shown = protocol.catch.condition if protocol.catch is not None and caught else condition
-            yield PlannedTrial(number, group, shown, *counts, seed, caught)
+            yield PlannedTrial(number, group, shown, *counts, seed, caught, *phase)
 
 
 def _draw_catches(protocol: Protocol, condition: str, block: tuple[int, int]) -> set[int]:

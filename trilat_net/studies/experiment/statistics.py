@@ -433,6 +433,7 @@ _METHODS = (
     ("design", ". The design was {},"),
     ("blocks", " in {} blocks"),
     ("trials", " with {} trials of every participant under a condition."),
+    ("training", " {}."),
     ("conditions", " Conditions, with delays as measured, were: {}."),
     ("law", " The arms ran the control law {}"),
     ("rate_hz", " at {}"),
@@ -450,7 +451,7 @@ _METHODS = (
     ("resamples", " and by the bootstrap (BCa, {} resamples)."),
 )  # fmt: skip
 """Facts, in the order of the paragraph, and what is said of each."""
-_WELCOME = ("pairs", "exclusions", "blocks", "rate_hz", "program", "digest", "unit", "alpha")
+_WELCOME = ("pairs", "exclusions", "blocks", "training", "rate_hz", "program", "digest", "unit", "alpha")
 _OWN = {"confidence": 100 * CONFIDENCE, "resamples": RESAMPLES}
 _UNITS = {
     "ms": "ms",
@@ -470,10 +471,10 @@ def write_methods(facts: Mapping[str, Any]) -> str:
 
     Args:
         facts: `participants`, whose data count; `excluded`, how many more; `exclusions`, why; `pairs`;
-            `design`; `blocks`; `trials` of a participant under a condition; `conditions`, by name what each
-            was, with its delay as measured (`delay_ms`); `law`; `gains`; `rate_hz`; `seeds`; `measures`;
-            `correction` of p; `unit`; `alpha`; `program`, its version; `digest` of the protocol. Keys end in
-            their unit.
+            `design`; `blocks`; `trials` of a participant under a condition; `training`, what they were;
+            `conditions`, by name what each was, with its delay as measured (`delay_ms`); `law`; `gains`;
+            `rate_hz`; `seeds`; `measures`; `correction` of p; `unit`; `alpha`; `program`, its version;
+            `digest` of the protocol. Keys end in their unit.
 
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.

@@ -10,6 +10,7 @@ Invariant: what it does is a function of what its site knows, of its numbers and
 """
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from ...core.own_hand import HandContext, HandView
+from ...core.user_law import PeerView
 from ...core.vectors import Array
 from ...fields import Frozen
 from .tasks import TrialGoal, place_slave
@@ -63,9 +65,10 @@ class SyntheticParticipant:
         facts: of its site.
         model: its numbers.
         goal: the target that it sees.
-        slave: the site of the slave, and its arm.
+        slave: the site of the slave, its arm, and the force at its end effector by angles and torques.
         trials: how many trials it has made before.
         seed: of the trial, for what it draws.
+        user: which of the users it is, from 0.
     """
 
     def __init__(
@@ -73,12 +76,14 @@ class SyntheticParticipant:
         facts: HandContext,
         model: ParticipantModel,
         goal: TrialGoal,
-        slave: tuple[str, Any],
+        slave: tuple[str, Any, Callable[[Array, Array], Array]],
         trials: int,
         seed: int,
+        user: int = 0,
     ) -> None:
         self._model, self._goal, self._trials, self._size = model, goal, trials, facts.size
-        self._peer, self._arm = facts.peers.index(slave[0]), slave[1]
+        name, self._arm, self._find_force_n = slave
+        self._user, self._peer = user, facts.peers.index(name)
         self._random = np.random.default_rng([seed, facts.seed])
         self._from = self._to = np.zeros(facts.size)
         self._begins_s, self._takes_s, self._seen = -math.inf, 0.0, np.zeros(facts.size)
@@ -93,14 +98,30 @@ class SyntheticParticipant:
         moved, self._seen = float(np.linalg.norm(seen - self._seen)), seen
         if moved > 0.02 * self._goal.width_m:
             self._still_s = now.t_s
-        target = self._goal.place(now.t_s - self._model.reaction_s)[: self._size]
+        if not self._goal.leads(now.t_s, self._user):  # goes along
+            self._from = self._to = now.pose
+            return now.pose
+        target = self._goal.place(now.t_s - self._model.reaction_s, self._user)[: self._size]
         if self._goal.moves:
             return self._follow(now, target - seen, slave.age_s)
+        if (
+            self._goal.force_n
+            and now.t_s > self._goal.appears_s
+            and (way := self._press(slave, now.t_s)).any()
+        ):
+            return self._follow(now, way, slave.age_s)
         ended_s = max(self._begins_s + self._takes_s, self._still_s)
         waits_s = self._model.reaction_s + (0.0 if math.isinf(self._begins_s) else slave.age_s)
         if now.t_s >= max(ended_s, 0.0) + waits_s and self._is_off(target - seen):
             self._start(now.t_s, target - seen)
         return self._reach(now.t_s)
+
+    def _press(self, slave: PeerView, t_s: float) -> Array:
+        """Returns the way to the force that is asked, by the force seen over the network; 0 off a wall."""
+        (felt_n,) = self._find_force_n(np.array([slave.q]), np.array([slave.tau_x]))
+        towards = (self._goal.place(t_s) - self._goal.start_m)[: self._size]
+        way: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
+        return way * (1.0 - felt_n / self._goal.force_n) if felt_n else 0.0 * way
 
     def _is_off(self, way: Array) -> bool:
         return float(np.linalg.norm(way)) > 0.35 * self._goal.width_m

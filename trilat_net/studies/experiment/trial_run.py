@@ -6,7 +6,7 @@ and into its log, which then lasts just that long.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ...analysis.aligned import AlignedRecords, align_records
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
 from ...core.ticks import NS_PER_S, tick_ns
@@ -29,7 +30,9 @@ from ...log.log_reader import Log, open_log
 from ...scenario import Scenario, parse_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from ...scenario.operators.program_hand import HandPlayer, HandSite
+from ...scenario.scenario_types import Change
 from .movement_measures import (
+    energy_j,
     mean_force_n,
     measure_pair,
     movement_time_s,
@@ -75,14 +78,17 @@ class TrialJudge:
         outcome: how it ended; None: it goes on.
     """
 
-    def __init__(self, goal: TrialGoal, arm: Any) -> None:
-        self.goal, self._arm = goal, arm
+    def __init__(self, goal: TrialGoal, arm: Any, find_force_n: Callable[[Array, Array], Array]) -> None:
+        self.goal, self._arm, self._find_force_n = goal, arm, find_force_n
         self.outcome: Outcome | None = None
 
-    def take(self, t_s: float, q: Sequence[float]) -> Outcome | None:
-        """Takes in the joints' coordinates at a time of the run; returns the outcome, once there is one."""
+    def take(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
+        """Takes in angles and exogenous torques of a record; returns the outcome, once there is one."""
         if self.outcome is None:
-            self.outcome = self.goal.judge(t_s, np.array(self._arm.end_effector(q), dtype=np.float64))
+            force_n = 0.0
+            if self.goal.force_n:
+                (force_n,) = self._find_force_n(np.array([q]), np.array([tau_x]))
+            self.outcome = self.goal.judge(t_s, np.array(self._arm.end_effector(q)), force_n)
         return self.outcome
 
 
@@ -114,21 +120,46 @@ class ExperimentTrial:
         )
         drawn_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
         self.appears_s = round(float(drawn_s), 3)
+        scenario = self._share_out(scenario)
         self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
         lasts_s, sites = self.longest_s + REST_S, limit_forces(scenario, protocol, planned.group)
         self.scenario = replace(
             scenario, duration_s=lasts_s, seed=planned.seed, about=about, sites={**scenario.sites, **sites}
         )
 
+    def _share_out(self, scenario: Scenario) -> Scenario:
+        """Returns a scenario in which users have the authority over the slave that the trial gives them."""
+        row, users, goal = scenario.dominance[self.slave], self.protocol.users, self.make_goal()
+        if goal.lead is None:
+            return scenario
+        both = sum(row[user] for user in users)
+        ways = [
+            {**row, users[0]: both * lead, users[1]: both - both * lead}
+            for lead in (goal.lead, 1.0 - goal.lead)
+        ]
+        timeline = scenario.timeline
+        if self.protocol.task.handover is not None:
+            after_s, ramp_s = self.protocol.task.handover
+            change = Change(self.appears_s + after_s, dominance=self.slave, to=ways[1], ramp_s=ramp_s)
+            timeline = (*timeline, change)
+        return replace(scenario, dominance={**scenario.dominance, self.slave: ways[0]}, timeline=timeline)
+
     def begin(self) -> TrialJudge:
         """Returns what judges it, from its first record on."""
-        return TrialJudge(self.make_goal(), self.arm)
+        return TrialJudge(self.make_goal(), self.arm, self._find_force_n)
+
+    def _find_force_n(self, q: Array, tau_x: Array) -> Array:
+        """Returns the magnitude of what presses on the slave's end effector, shape (K,), N."""
+        placed = build_arm_rows(self.scenario, self.slave).place_end_effector(q, 0.0 * q)
+        force_n: Array = np.linalg.norm(placed.find_force(tau_x), axis=1)
+        return force_n
 
     def make_goal(self) -> TrialGoal:
         """Returns what is asked."""
         planned = self.planned
         goal = self.protocol.task.begin(self._start_m, planned.target, planned.seed)
         goal.appears_s = self.appears_s
+        goal.lead = planned.lead if goal.lead is None else goal.lead
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
@@ -148,20 +179,23 @@ class ExperimentTrial:
 
     def _judge(self, log: Log) -> Outcome | None:
         judge, part = self.begin(), log[self.slave]
-        for t_s, q in zip(part.t_s.tolist(), part.q.tolist(), strict=True):
-            if (outcome := judge.take(t_s, q)) is not None:
+        for moment in zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True):
+            if (outcome := judge.take(*moment)) is not None:
                 return outcome
         return None if log.diverged_s is None else Outcome(False, log.diverged_s)
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Returns the measures of a trial, units in the names."""
         found, aligned = self._measure_motion(log, outcome.ended_s), align_records(log)
-        forces = [_hand_force_n(aligned[user], log.scenario, outcome.ended_s) for user in self.protocol.users]
-        for place, force in enumerate(forces, 1):
-            which = f"_user{place}" if len(self.protocol.users) > 1 else ""
+        forces = list[Array]()
+        for place, user in enumerate(self.protocol.users, 1):
+            own, which = aligned[user], f"_user{place}" if len(self.protocol.users) > 1 else ""
+            split, until = split_torque(own, log.scenario), own.t_s <= outcome.ended_s
+            forces.append(split.end_effector.find_force(split.operator)[until])  # of the hand ON its arm
             found |= {
-                f"force_mean{which}_n": mean_force_n(force),
-                f"force_peak{which}_n": peak_force_n(force),
+                f"force_mean{which}_n": mean_force_n(forces[-1]),
+                f"force_peak{which}_n": peak_force_n(forces[-1]),
+                f"work{which}_j": energy_j(forces[-1], split.end_effector.speed[until], own.rate_hz),
             }
         if len(forces) > 1:
             found |= self._measure_pair(aligned, forces, outcome.ended_s)
@@ -193,6 +227,7 @@ class ExperimentTrial:
         apart_m = np.linalg.norm(places - wanted, axis=1)
         speed = np.linalg.norm(np.gradient(places, 1.0 / rate_hz, axis=0), axis=1)
         smooth = sparc(speed, rate_hz)
+        force_n = self._find_force_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
         ends = {"start": goal.start_m, "target": wanted[-1], "end": places[-1]}
         return {
             "completion_s": ended_s - goal.appears_s,
@@ -202,6 +237,7 @@ class ExperimentTrial:
             "error_rms_mm": 1e3 * float(np.sqrt(np.mean(apart_m**2))),
             "path_m": path_length_m(places),
             **({} if smooth is None else {"sparc": smooth}),
+            **goal.measure(t_s - goal.appears_s, places, force_n),
             **{
                 f"{name}_{axis}_m": float(x)
                 for name, at in ends.items()
@@ -214,15 +250,16 @@ class SyntheticTrial(ExperimentTrial):
     """A trial of synthetic participants."""
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        found = {}
+        found = dict[str, HandPlayer]()
         for user, name in zip(self.protocol.users, self.planned.group, strict=True):
             hand = find_live_hand(scenario.sites[user].hands, is_open=True)
             assert hand is not None  # see `plan_experiment`
             at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
             model, before = self.protocol.model.draw(own), self.planned.before
+            goal, slave = self.make_goal(), (self.slave, self.arm, self._find_force_n)
             act = SyntheticParticipant(
-                at.describe(), model, self.make_goal(), (self.slave, self.arm), before, self.planned.seed
+                at.describe(), model, goal, slave, before, self.planned.seed, len(found)
             )
             found[user] = HandPlayer(at, act)
         return found
@@ -232,13 +269,14 @@ class SyntheticTrial(ExperimentTrial):
         scenario, judge, site = self.scenario, self.begin(), self.slave
         run = FusedRun(scenario, keep=1, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
-        place, joints = scenario.names.index(site), self.arm.counts.joints
+        place, columns = scenario.names.index(site), scenario.layout(site).columns()
         rate_hz, t_s = scenario.sites[site].rate_hz, 0.0
         for tick in range(1, scenario.ticks(site)):
             t_s = tick_ns(tick, rate_hz) / NS_PER_S
-            run.step_to(tick_ns(tick, rate_hz) - 1)  # then it is what the record of this tick will have
-            q = run.arrays(place).site[0]["q"][:joints]
-            if run.diverged_s is not None or judge.take(t_s, q) is not None:
+            run.step_to(tick_ns(tick, rate_hz))
+            row = run.records[place]
+            q, tau_x = (row[columns[name]].tolist() for name in ("q", "tau_x"))
+            if run.diverged_s is not None or judge.take(t_s, q, tau_x) is not None:
                 break
         return t_s
 
@@ -249,12 +287,6 @@ class SyntheticTrial(ExperimentTrial):
         with LogFile(path, force=True) as stream:
             write_virtual_log(lasts, stream, hands=hands)
         return self.settle(path)
-
-
-def _hand_force_n(own: AlignedRecords, scenario: Scenario, until_s: float) -> Array:
-    """Returns the force of a participant's hand ON its arm, shape (K, 2) or (K, 3), N."""
-    split = split_torque(own, scenario)
-    return split.end_effector.find_force(split.operator)[own.t_s <= until_s]
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
