@@ -117,7 +117,7 @@ def test_silent_haply_lets_go_and_needs_its_button_anew(held: Held) -> None:
 
 
 @pytest.mark.long
-def test_killed_service_lets_go_and_one_that_comes_back_leads_again(held: Held) -> None:
+def test_killed_service_lets_go_and_leads_again_once_back(held: Held) -> None:
     held.circles()
     until(lambda: len(held.service.asked) > 500, 60.0)
     held.service.kill()

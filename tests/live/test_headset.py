@@ -127,7 +127,7 @@ def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
 
 
 @pytest.mark.long
-def test_a_lost_controller_lets_go_and_a_button_stops_every_arm(stage: Stage) -> None:
+def test_a_lost_controller_lets_go_and_a_button_stops_all(stage: Stage) -> None:
     """On the page of a user, whose controllers both lead its own arm."""
     running = served(stage)
     link = role_address(running, "user m1")

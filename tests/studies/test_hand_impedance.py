@@ -93,7 +93,7 @@ def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> 
     assert spring.summary().count(" +- ") == 12
 
 
-def test_mass_that_its_own_motion_hides_is_found_across_a_network() -> None:
+def test_mass_hidden_by_its_own_motion_is_found_over_networks() -> None:
     true, found = held(3, 40.0)
     assert covered(true, found).mean() >= 0.75
     assert np.allclose(found.M, true.M, atol=0.2)
