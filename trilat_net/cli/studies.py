@@ -303,8 +303,9 @@ def tune_command(
 
     loop: dict[str, Any] = {"set": overrides or (), "tip": tip, "sites": sites, "rate_hz": rate}
     wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
-    found = tune_arm(arm, _measure_delay(delay, reach), law, **loop, **wanted, curve=picture is not None)
-
+    there = _measure_delay(delay, reach)
+    with terminal.progress_bar("edge and runs") as show:
+        found = tune_arm(arm, there, law, **loop, **wanted, curve=picture is not None, progress=show)
     options.print_drawn(found, picture, "linear_figures:draw_arm_gains", found.to_dict(), as_json=as_json)
     if not found.agree:
         raise typer.Exit(1)

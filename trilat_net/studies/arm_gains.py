@@ -40,6 +40,7 @@ from ..theory.characteristic_roots import CharacteristicRoot
 from ..theory.floquet import find_samples_in_use
 from ..theory.linear_edge import find_rightmost_root
 from ..theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .executor import Progress, ignore_progress
 
 TUNED_LAWS = tuple(
     name for name, law in BUILT_IN.items() if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
@@ -345,6 +346,7 @@ def tune_arm(
     poses: int = 16,
     seed: int = 1,
     curve: bool = False,
+    progress: Progress = ignore_progress,
 ) -> ArmGains:
     """Returns the largest gains with which alike arms follow one another stably; as `trilat tune`.
 
@@ -366,6 +368,7 @@ def tune_arm(
         poses: how many poses within the joints' limits are tried.
         seed: seed of the poses.
         curve: whether to find the edge over the delay too, for a figure.
+        progress: called with the steps done, and in all: the edge, and each run.
 
     Raises:
         ScenarioError: the file, its tip or an override is not valid.
@@ -382,7 +385,10 @@ def tune_arm(
     pose, found = np.array(edge["pose"]), search.at(edge["used_per_s2"], margin)
     push = _PUSH * np.random.Generator(np.random.Philox(seed)).uniform(0.5, 1.0, len(pose))
     tried = [(None, found), *((share, search.at(share * edge["k_per_s2"])) for share in SHARES)]
-    runs = [search.confirm(one, share, pose, push) for share, one in tried]
+    runs = list[dict[str, Any]]()
+    for share, one in tried:
+        progress(1 + len(runs), 1 + len(tried))
+        runs.append(search.confirm(one, share, pose, push))
     gains = {name: list(getattr(found, name)) for name in ("K", "Kd", "d") if name in found.kind.tune}
     cells = ", ".join(f"{name} = {msgspec.json.encode(own).decode()}" for name, own in gains.items())
     model = scenario.arms[scenario.names[0]]
