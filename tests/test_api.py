@@ -80,13 +80,7 @@ def test_a_name_has_a_docstring_with_an_example(name: str) -> None:
     assert doctest.DocTestParser().get_examples(text), f"{name} shows no example"
 
 
-SLOW = {"bench", "check", "certify", "hand", "linear", "margin", "ping_benchmark", "report", "run"}
-SLOW |= {"sweep", "tune", "tune_arm"}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] if name in SLOW else []) for name in FUNCTIONS]
-)
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_its_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     text = inspect.getdoc(getattr(tn, name)) or ""

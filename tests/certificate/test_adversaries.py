@@ -30,36 +30,12 @@ from .adversaries import (
 )
 from .drawn_loops import WIDE_FROM, Drawn, draw_experiment, experiment
 
-SLOW = tuple(
-    f"{mark}{mirror}"
-    for mark in ("F2", "F4", "F5", "F8", "F9", "C1", "C2", "C3", "C4", "C6", "C7", "S1", "S4")
-    for mirror in ("", "=")
-)
-"""Rows at 1 kHz, or that take minutes of their own time, or beside which another one says nearly the same."""
-CHEAP = (
-    "a sampled wall of 5 kN/m at 100 Hz",
-    "a push without end",
-    "P+d, 1.6 s, d 2.7",
-    "gravity known",
-    "the same, d 2",
-    "40 and 30 Hz, K 50",
-    "40 and 30 Hz, d 5",
-    "a reserve of 1 J, the same",
-    "by 20 ms",
-    "a wave line that nobody holds",
-)
-
 
 def _named(row: Row) -> str:
     return f"{row.mark} {row.what}"
 
 
-def _marked(row: Row) -> object:
-    slow = row.mark in SLOW and row.what not in CHEAP
-    return pytest.param(row, id=_named(row), marks=pytest.mark.long if slow else ())
-
-
-@pytest.mark.parametrize("row", list(map(_marked, ROWS)))
+@pytest.mark.parametrize("row", ROWS, ids=_named)
 def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
     found = trilat_net.certify(trilat_net.simulate(row.make()))
     assert found.stability in row.words
