@@ -28,6 +28,7 @@ from .statistics import (
     ConditionMean,
     MixedModel,
     Row,
+    average_trials,
     compare_conditions,
     find_least_number,
     fit_mixed_model,
@@ -113,19 +114,14 @@ class ExperimentAnalysis(Result):
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
         """Yields by how much each pair has become better by a training: at once (transfer), and later."""
-        task = self._experiment.plan.protocol.task
-        by: dict[tuple[str, str], dict[str, list[float]]] = {}
-        for row in self.learning_rows:
-            phases = by.setdefault((row[self.unit], row["condition"]), {})
-            phases.setdefault(row.get("phase", ""), []).append(row[task.learnt])
-        for (who, condition), phases in by.items():
-            means = {phase: float(np.mean(values)) for phase, values in phases.items()}
-            gains = {
-                f"gain_{phase}_{task.learnt}": means["before"] - means[phase]
-                for phase in ("after", "retention")
-                if {"before", phase} <= means.keys()
-            }
-            if gains:
+        learnt, means = self._experiment.plan.protocol.task.learnt, dict[str, Any]()
+        for phase in ("before", "after", "retention"):
+            if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
+                means[phase] = average_trials(rows, learnt, self.unit)
+        for condition, each in means.pop("before", {}).items():
+            for who, before in each.items():
+                of = {phase: found.get(condition, {}).get(who) for phase, found in means.items()}
+                gains = {f"gain_{phase}_{learnt}": before - mean for phase, mean in of.items() if mean}
                 yield {self.unit: who, "condition": condition, **gains}
 
     def _write_methods(self) -> str:

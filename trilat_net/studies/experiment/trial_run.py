@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ...analysis.aligned import AlignedRecords, align_records
-from ...analysis.arm_rows import build_arm_rows
+from ...analysis.arm_rows import EndEffectorRows, build_arm_rows
 from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
 from ...core.ticks import NS_PER_S, tick_ns
@@ -150,9 +150,11 @@ class ExperimentTrial:
 
     def _find_force_n(self, q: Array, tau_x: Array) -> Array:
         """Returns the magnitude of what presses on the slave's end effector, shape (K,), N."""
-        placed = build_arm_rows(self.scenario, self.slave).place_end_effector(q, 0.0 * q)
-        force_n: Array = np.linalg.norm(placed.find_force(tau_x), axis=1)
+        force_n: Array = np.linalg.norm(self._place(q).find_force(tau_x), axis=1)
         return force_n
+
+    def _place(self, q: Array) -> EndEffectorRows:
+        return build_arm_rows(self.scenario, self.slave).place_end_effector(q, 0.0 * q)
 
     def make_goal(self) -> TrialGoal:
         """Returns what is asked."""
@@ -209,7 +211,7 @@ class ExperimentTrial:
         slave = aligned[self.slave]
         rows = np.flatnonzero(slave.t_s <= ended_s)[::EVERY]
         rate_hz, t_s = slave.rate_hz / EVERY, slave.t_s[rows]
-        places = np.array([self.arm.end_effector(q) for q in slave.q[rows]], dtype=np.float64)
+        places = self._place(slave.q[rows]).at
         one, other = (
             np.column_stack([np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T])
             for user, force in zip(self.protocol.users, forces, strict=True)
@@ -222,7 +224,7 @@ class ExperimentTrial:
         goal, part = self.make_goal(), log[self.slave]
         rows = np.flatnonzero((part.t_s >= goal.appears_s) & (part.t_s <= ended_s))[::EVERY]
         t_s, rate_hz = part.t_s[rows], part.rate_hz / EVERY
-        places = np.array([self.arm.end_effector(q) for q in part.q[rows]], dtype=np.float64)
+        places = self._place(part.q[rows]).at
         wanted = np.array([goal.place(t) for t in t_s])
         apart_m = np.linalg.norm(places - wanted, axis=1)
         speed = np.linalg.norm(np.gradient(places, 1.0 / rate_hz, axis=0), axis=1)
