@@ -37,7 +37,7 @@ from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
-WORDS = {"Twenty-two": "22", "eleven": "11", "−": "-"}
+WORDS = {"Twenty-two": "22", "eleven": "11", "twelve": "12", "−": "-"}
 G = 9.81
 WALL = "sites.s.environment.0"
 DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
