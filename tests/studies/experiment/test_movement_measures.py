@@ -7,6 +7,7 @@ from trilat_net.errors import UsageError
 from trilat_net.studies.experiment.movement_measures import (
     TLX_SCALES,
     energy_j,
+    find_internal_force,
     mean_force_n,
     measure_pair,
     measure_throughput,
@@ -15,7 +16,6 @@ from trilat_net.studies.experiment.movement_measures import (
     peak_force_n,
     raw_tlx,
     sparc,
-    split_forces,
     sus_score,
     weighted_tlx,
 )
@@ -112,15 +112,13 @@ def test_end_points_without_spread_have_no_throughput() -> None:
     assert measure_throughput(starts[:1], targets[:1], targets[:1] + 1.0, times_s[:1]) is None
 
 
-def test_internal_and_useful_force_make_up_both_forces() -> None:
+def test_useful_forces_oppose_each_other_nowhere() -> None:
     rng = np.random.default_rng(4)
     first, second = rng.normal(size=(2, 400, 3))
-    split = split_forces(first, second)
-    np.testing.assert_allclose(split.useful_first + split.internal, first, atol=1e-15)
-    np.testing.assert_allclose(split.useful_second - split.internal, second, atol=1e-15)
-    assert (split.useful_first * split.useful_second >= 0.0).all()
+    internal = find_internal_force(first, second)
+    assert ((first - internal) * (second + internal) >= 0.0).all()
     smaller = np.minimum(np.abs(first), np.abs(second))
-    np.testing.assert_array_equal(np.abs(split.internal), np.where(first * second < 0.0, smaller, 0.0))
+    np.testing.assert_array_equal(np.abs(internal), np.where(first * second < 0.0, smaller, 0.0))
 
 
 def test_users_who_oppose_each_other_move_nothing() -> None:

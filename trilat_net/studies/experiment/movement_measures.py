@@ -174,31 +174,17 @@ def measure_throughput(
 # --- a pair ----------------------------------------------------------------------------------------------
 
 
-class PairForces(NamedTuple):
-    """The forces of two users on one object, taken apart; N, shape (K, D) each.
+def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
+    """Returns what cancels of two users' forces on an object, N, shape (K, D): as force of the first user.
 
-    Args:
-        internal: what cancels, as force of the first user on the object; the second's is its negative.
-        useful_first: the rest of the first user's force.
-        useful_second: the rest of the second's. Both sum to the whole force, and oppose each other nowhere.
-    """
-
-    internal: Array
-    useful_first: Array
-    useful_second: Array
-
-
-def split_forces(first: ArrayLike, second: ArrayLike) -> PairForces:
-    """Returns internal and useful force of two users, axis by axis, of forces on an object, N, shape (K, D).
-
-    Where the signs of an axis differ the smaller force cancels as much of the larger one. `internal_rms_n` of
-    docs/metrics.md is its RMS. Source: Groten, Feth, Goshy, Peer, Kenny and Buss, "Experimental analysis of
-    dominance in haptic collaboration", IEEE RO-MAN (2009).
+    Where the signs of an axis differ the smaller force cancels as much of the larger one; the second is
+    its negative. `internal_rms_n` of docs/metrics.md is its RMS. Source: Groten, Feth, Goshy, Peer, Kenny and
+    Buss, "Experimental analysis of dominance in haptic collaboration", IEEE RO-MAN (2009).
     """
     one, other = _read_alike(first=first, second=second)
     opposed = np.sign(one) * np.sign(other) < 0.0
-    internal = np.where(opposed, np.sign(one) * np.minimum(np.abs(one), np.abs(other)), 0.0)
-    return PairForces(internal, one - internal, other + internal)
+    found: Array = np.where(opposed, np.sign(one) * np.minimum(np.abs(one), np.abs(other)), 0.0)
+    return found
 
 
 class PairMeasures(NamedTuple):
@@ -235,7 +221,7 @@ def measure_pair(first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_
         rate_hz: samples a second.
     """
     one, other, moves = _read_alike(first=first, second=second, velocity=velocity)
-    internal = split_forces(one, other).internal
+    internal = find_internal_force(one, other)
     sizes, efforts = np.abs(one).sum() + np.abs(other).sum(), [float((f * f).sum()) for f in (one, other)]
     powers = [(force * moves).sum(axis=1) for force in (one, other)]
     work_j = [_integrate(power, rate_hz) for power in powers]

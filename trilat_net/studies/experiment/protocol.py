@@ -77,14 +77,6 @@ class Training(Frozen, frozen=True):
             f"{self.after} after them{later} were made without it and are compared"
         )
 
-    def list_phases(self, condition: str, trials: int) -> list[tuple[str, float]]:
-        """Returns the phase of every trial of a block and the expert's part in it."""
-        first, last = self.lead[condition]
-        parts = np.linspace(first, last, trials).tolist()
-        alone = [("before", self.before), ("after", self.after), ("retention", self.retention)]
-        before, after, later = ([(phase, 0.0)] * count for phase, count in alone)
-        return [*before, *(("training", part) for part in parts), *after, *later]
-
 
 class Protocol(Frozen, frozen=True):
     """An experiment, as its file has it.
@@ -137,9 +129,12 @@ class Protocol(Frozen, frozen=True):
 
     def list_phases(self, condition: str) -> list[tuple[str, float | None]]:
         """Returns phase and first user's part of what two share, of every trial of a block after practice."""
-        if self.training is None:
+        if (how := self.training) is None:
             return [("", None)] * self.trials
-        return [*self.training.list_phases(condition, self.trials)]
+        parts = np.linspace(*how.lead[condition], self.trials).tolist()
+        alone = {"before": how.before, "after": how.after, "retention": how.retention}
+        before, after, later = ([(phase, 0.0)] * count for phase, count in alone.items())
+        return [*before, *(("training", part) for part in parts), *after, *later]
 
     @property
     def groups(self) -> list[tuple[str, ...]]:

@@ -192,15 +192,15 @@ def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[
     mean, spread = float(differences.mean()), float(differences.std(ddof=1))
     if spread <= _ROUNDING * max(np.abs(one).max(), np.abs(other).max()):
         return empty._replace(difference=mean, interval=(mean, mean))
-    stats, freedom = _scipy(), len(both) - 1
-    error = spread / math.sqrt(len(both))
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
+    stats = _scipy()
+    test = stats.ttest_rel(other, one)
+    low, high = test.confidence_interval(CONFIDENCE)
     average = float(one.std(ddof=1) + other.std(ddof=1)) / 2.0
     return empty._replace(
         difference=mean,
-        interval=(mean - half, mean + half),
-        t=mean / error,
-        p=2.0 * float(stats.t.sf(abs(mean / error), freedom)),
+        interval=(float(low), float(high)),
+        t=float(test.statistic),
+        p=float(test.pvalue),
         d_z=mean / spread,
         d_av=mean / average,
         p_wilcoxon=float(stats.wilcoxon(differences).pvalue),
