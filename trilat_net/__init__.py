@@ -33,7 +33,6 @@ if _TYPE_CHECKING:
     from .api import certify as certify
     from .api import export as export
     from .api import linear as linear
-    from .api import make_env as make_env
     from .api import margin as margin
     from .api import metrics as metrics
     from .api import report as report
@@ -76,6 +75,7 @@ if _TYPE_CHECKING:
     from .studies.experiment.experiment_run import new_experiment as new_experiment
     from .studies.experiment.experiment_run import open_experiment as open_experiment
     from .studies.experiment.experiment_run import run_experiment as run_experiment
+    from .studies.gym_environment import make_env as make_env
     from .studies.hand_impedance import identify_hand as identify_hand
     from .studies.log_comparison import compare as compare
     from .studies.trials import check as check
@@ -93,8 +93,7 @@ _NAMES = {
     "sites.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
     "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify export linear make_env margin metrics report simulate sweep tune "
-    "verify view",
+    "trilat_net.api": "bench certify export linear margin metrics report simulate sweep tune verify view",
     "trilat_net.core.compiled_law": "compiled",
     "trilat_net.core.own_hand": "HandContext HandView",
     "trilat_net.core.user_law": "LawContext LawInput",
@@ -116,6 +115,7 @@ _NAMES = {
     "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment compute_experiment_power",
     "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment open_experiment "
     "run_experiment",
+    "trilat_net.studies.gym_environment": "make_env",
     "trilat_net.studies.hand_impedance": "identify_hand",
     "trilat_net.studies.log_comparison": "compare",
     "trilat_net.studies.trials": "check trials",

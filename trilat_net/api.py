@@ -14,7 +14,7 @@ from .analysis.twin_growth import TWINS
 from .errors import UsageError
 from .execution.log_checks import LogCheckReport, run_log_checks
 from .execution.virtual import SimulatedLog, simulate_scenario
-from .files import import_extra, make_results_folder
+from .files import make_results_folder
 from .log.accounting import MIN_COVERAGE
 from .log.log_reader import Log, open_log, open_logs
 from .scenario import Scenario, load_scenario
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from .reporting.conclude import Conclusion
     from .studies.bench import BenchResults
     from .studies.executor import Workers
-    from .studies.gym_environment import TeleoperationEnv
     from .studies.sweep.margin_search import SweepMargins
     from .studies.sweep.sweep_results import SweepResults
     from .studies.tuning.tuning_plan import TuningResult
@@ -422,49 +421,6 @@ def bench(
     plan = plan_bench(study, tasks=tasks, laws=laws, links=links, seeds=seeds)
     folder = prepare_bench_folder(plan, None if out is None else Path(out))
     return run_bench(folder, jobs, on, confirm=confirm)
-
-
-def make_env(
-    scenario: AnyScenario = "paper",
-    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
-    *,
-    user: str = "m2",
-    leads: str = "s",
-    mode: str = "",
-    rate_hz: int = 50,
-    delay_ms: float = 20.0,
-    duration_s: float | None = None,
-    task: Any = None,
-    vary: Mapping[str, Sequence[Any]] = {},
-) -> "TeleoperationEnv":
-    """Returns an experiment as a Gymnasium environment, in which one user is trained; see docs/policies.md.
-
-    >>> env = tn.make_env("two_sites", user="m", duration_s=1)
-    >>> observation, info = env.reset(seed=1)
-    >>> observation["peer_q"].shape
-    (1, 2)
-
-    Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        set: overrides, as in `{"link.delay_ms": 100}`.
-        user: the site whose arm is acted on.
-        leads: the site that works.
-        mode: "tip", "joint" or "force", as of a live hand; by default the scenario's.
-        rate_hz: steps a second.
-        delay_ms: from what is seen to what is done, ms.
-        duration_s: of an episode, s; by default the scenario's.
-        task: what is to be done; by default `leads` brings its end effector to a place.
-        vary: what each episode draws, by key a list, or a pair of numbers.
-
-    Raises:
-        ScenarioError: the scenario or an override is not valid.
-        UsageError: the site or the rate is none, or Gymnasium is not installed.
-    """
-    import_extra("gymnasium", "gym", "environments")
-    from .studies.gym_environment import TeleoperationEnv
-
-    how: dict[str, Any] = {"mode": mode, "rate_hz": rate_hz, "delay_ms": delay_ms, "duration_s": duration_s}
-    return TeleoperationEnv(scenario, set, user=user, leads=leads, task=task, vary=vary, **how)
 
 
 def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:

@@ -14,9 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 from msgspec.structs import replace
 
 from ..core.own_hand import HandView
@@ -26,12 +24,20 @@ from ..core.vectors import Array
 from ..errors import UsageError
 from ..execution.fused import FusedRun
 from ..execution.virtual import write_virtual_log
+from ..files import import_extra
 from ..log.log_file import LogFile
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
 from ..scenario.own_plant import make_plant_players
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError:
+    import_extra("gymnasium", "gym", "environments")
+    raise
 
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
@@ -128,7 +134,29 @@ class ActedHand(HandPlayer):
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """One user of an experiment, in steps; `make_env` says what its arguments mean."""
+    """An experiment in which one user is trained, in steps, see docs/policies.md; also called `tn.make_env`.
+
+    >>> env = tn.make_env("two_sites", user="m", duration_s=1)
+    >>> observation, info = env.reset(seed=1)
+    >>> observation["peer_q"].shape
+    (1, 2)
+
+    Args:
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        set: overrides, as in `{"link.delay_ms": 100}`.
+        user: the site whose arm is acted on.
+        mode: "tip", "joint" or "force", as of a live hand; by default the scenario's.
+        rate_hz: steps a second.
+        delay_ms: from what is seen to what is done, ms.
+        duration_s: of an episode, s; by default the scenario's.
+        task: what is to be done; by default `leads` brings its end effector to a place.
+        vary: what each episode draws, by key a list, or a pair of numbers.
+        leads: the site that works.
+
+    Raises:
+        ScenarioError: the scenario or an override is not valid.
+        UsageError: the site or the rate is none, or Gymnasium is not installed.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
 
@@ -289,5 +317,6 @@ def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:
     return of[int(random.integers(len(of)))]
 
 
+make_env = TeleoperationEnv
 if ENV_ID not in gymnasium.registry:
     gymnasium.register(ENV_ID, entry_point=f"{__name__}:TeleoperationEnv")
