@@ -3,10 +3,6 @@
 Invariant: an episode is a run in virtual time, of which the scenario, the seed and the actions say all; saved
 as a log it verifies. A step is a fixed number of ticks. What is observed, and when an action acts, is as of a
 hand of one's own (`OwnHand`), so that what is trained here can hold an arm live, unchanged.
-
-    env = tn.make_env("paper", user="m2", vary={"link.delay_ms": (0, 400)})
-    observation, info = env.reset(seed=1)
-    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 """
 
 import math

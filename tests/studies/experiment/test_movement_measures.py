@@ -8,12 +8,10 @@ from trilat_net.studies.experiment.movement_measures import (
     TLX_SCALES,
     energy_j,
     find_internal_force,
-    mean_force_n,
     measure_pair,
     measure_throughput,
     movement_time_s,
     path_length_m,
-    peak_force_n,
     raw_tlx,
     sparc,
     sus_score,
@@ -54,11 +52,10 @@ def test_movement_lasts_while_speed_is_above_its_threshold() -> None:
     assert movement_time_s(speed, 1000.0) == pytest.approx(0.8 * (above[-1] - above[0]), abs=2e-3)
 
 
-def test_path_and_forces_of_a_circle() -> None:
+def test_path_of_a_circle() -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 2001)
     places = 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
     assert path_length_m(places) == pytest.approx(0.6 * np.pi, rel=1e-5)
-    assert peak_force_n(places) == pytest.approx(0.3) == mean_force_n(places)
 
 
 def test_work_of_force_on_a_mass_is_its_kinetic_energy() -> None:

@@ -88,16 +88,6 @@ def movement_time_s(speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SH
     return float(moves[-1] - moves[0]) / rate_hz
 
 
-def peak_force_n(force: ArrayLike) -> float:
-    """Returns the largest magnitude of forces, N, shape (K, D)."""
-    return float(np.linalg.norm(_read("force", force, 2), axis=1).max())
-
-
-def mean_force_n(force: ArrayLike) -> float:
-    """Returns the mean magnitude of forces, N, shape (K, D)."""
-    return float(np.linalg.norm(_read("force", force, 2), axis=1).mean())
-
-
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
     """Returns the work of a force on what moves: the integral of f'v by the trapezoidal rule.
 

@@ -33,7 +33,6 @@ Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
 """It becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 Counted = Annotated[int, Meta(ge=0, le=1000)]
-Rest = Annotated[float, Meta(ge=0.0, le=1e6)]
 Feedback = Literal[
     "completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m", "wall_force_n"
 ]
@@ -66,7 +65,7 @@ class Training(Frozen, frozen=True):
     before: Counted = 2
     after: Counted = 2
     retention: Counted = 0
-    rest_s: Rest = 600.0
+    rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
         """Returns it in a sentence of a methods paragraph."""
@@ -367,7 +366,7 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     if protocol.task.presses and not scenario.sites[slave].environment:
         raise ScenarioError("there is no wall to press", path=f"sites.{slave}.environment")
     shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
-    if (protocol.training is not None or protocol.task.handover is not None) and min(shares) <= 0.0:
+    if (protocol.training is not None or protocol.task.needs_pair) and min(shares) <= 0.0:
         raise ScenarioError("both users are to have a share", path=f"dominance.{slave}")
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)

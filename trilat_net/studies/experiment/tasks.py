@@ -40,13 +40,8 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def needs_pair(self) -> bool:
-        """Whether it is of two users, who do not do the same."""
-        return self.handover is not None
-
-    @property
-    def handover(self) -> tuple[float, float] | None:
-        """When the second user gets the first one's authority, s after the target; how long that takes."""
-        return None
+        """Whether it is of two users: one hands over to the other, or they are shown different targets."""
+        return bool(getattr(self, "handover_s", None) or getattr(self, "apart_m", 0.0))
 
     def begin(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
         """Returns what is asked in a trial, by the number of its target from 0.
@@ -69,13 +64,13 @@ class TrialGoal:
         moves: whether it moves from then on.
         force_n: the force to press with, N; 0: none.
         lead: the first user's part of what two users share at the slave until a handover; None: as written.
-        handed_s: when the second has more of it, s after the target appears; None: no handover.
+        handover: when it goes to the second, s after the target, and how long that takes; None: never.
     """
 
     moves = False
     force_n = 0.0
     lead: float | None = None
-    handed_s: float | None = None
+    handover: tuple[float, float] | None = None
 
     def __init__(self, start_m: Array, width_m: float) -> None:
         self.start_m, self.width_m, self.appears_s = start_m, width_m, 0.0
@@ -90,7 +85,8 @@ class TrialGoal:
 
     def leads(self, t_s: float, user: int) -> bool:
         """Returns whether a user, from 0, has any authority over the slave."""
-        handed = self.handed_s is not None and t_s >= self.appears_s + self.handed_s
+        begins_s, ramp_s = self.handover or (math.inf, 0.0)
+        handed = t_s >= self.appears_s + begins_s + ramp_s / 2.0
         return self.lead is None or abs(self.lead - (user != handed)) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
@@ -98,12 +94,9 @@ class TrialGoal:
         return None
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns what is measured of this task alone, of rows from when the target appears to the end.
+        """Returns what is measured of this task alone, of K rows from when the target appears to the end.
 
-        Args:
-            after_s: when, s after the target appears, shape (K,).
-            at_m: where the slave's end effector is, m, shape (K, 2) or (K, 3).
-            force_n: what presses on it, N, shape (K,).
+        `at_m`, shape (K, 2) or (K, 3), is where the slave's end effector is, `force_n` what presses on it.
         """
         return {}
 
@@ -164,12 +157,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     @property
     def longest_s(self) -> float:
         """The time-out, from the last target on, s."""
-        return self.timeout_s + sum(self.handover or ())
-
-    @property
-    def handover(self) -> tuple[float, float] | None:
-        """When authority is handed over, if it is, and how long that takes, s."""
-        return None if self.handover_s is None else (self.handover_s, self.ramp_s)
+        return self.timeout_s + (0.0 if self.handover_s is None else self.handover_s + self.ramp_s)
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
         """Returns the next target around the ring, and after a handover the one after it."""
@@ -205,10 +193,10 @@ class _ReachGoal(_DwellGoal):
     def __init__(self, task: ReachTrial, start_m: Array, targets_m: Sequence[Array]) -> None:
         super().__init__(task, start_m)
         self._corridor_m, self._places = task.corridor_m, (start_m, *targets_m)
-        self._ramp_s, self._next_s = -1.0, -1.0
-        if task.handover is not None:
-            self._ramp_s, self._next_s = task.handover[0], sum(task.handover)
-            self.lead, self.handed_s = 1.0, (self._ramp_s + self._next_s) / 2.0
+        if task.handover_s is not None:
+            self.lead, self.handover = 1.0, (task.handover_s, task.ramp_s)
+        self._ramp_s, ramp_s = self.handover or (-1.0, 0.0)
+        self._next_s = self._ramp_s + ramp_s
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
         """Returns how far the end effector was from the target at the most during the handover."""
@@ -327,11 +315,6 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def longest_s(self) -> float:
         """Its duration, s."""
         return self.duration_s
-
-    @property
-    def needs_pair(self) -> bool:
-        """Whether users are shown different targets."""
-        return self.apart_m > 0.0
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - phases are of the seed
         """Returns the path, which begins at the start."""

@@ -33,11 +33,9 @@ from ...scenario.operators.program_hand import HandPlayer, HandSite
 from ...scenario.scenario_types import Change
 from .movement_measures import (
     energy_j,
-    mean_force_n,
     measure_pair,
     movement_time_s,
     path_length_m,
-    peak_force_n,
     sparc,
 )
 from .protocol import PlannedTrial, Protocol, limit_forces
@@ -129,20 +127,18 @@ class ExperimentTrial:
 
     def _share_out(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which users have the authority over the slave that the trial gives them."""
-        row, users, goal = scenario.dominance[self.slave], self.protocol.users, self.make_goal()
+        row, (first, *rest), goal = scenario.dominance[self.slave], self.protocol.users, self.make_goal()
         if goal.lead is None:
             return scenario
-        both = sum(row[user] for user in users)
-        ways = [
-            {**row, users[0]: both * lead, users[1]: both - both * lead}
-            for lead in (goal.lead, 1.0 - goal.lead)
-        ]
-        timeline = scenario.timeline
-        if self.protocol.task.handover is not None:
-            after_s, ramp_s = self.protocol.task.handover
-            change = Change(self.appears_s + after_s, dominance=self.slave, to=ways[1], ramp_s=ramp_s)
-            timeline = (*timeline, change)
-        return replace(scenario, dominance={**scenario.dominance, self.slave: ways[0]}, timeline=timeline)
+        both = row[first] + row[rest[0]]
+        before, after = (
+            {**row, first: both * lead, rest[0]: both - both * lead} for lead in (goal.lead, 1.0 - goal.lead)
+        )
+        dominance, timeline = {**scenario.dominance, self.slave: before}, scenario.timeline
+        if goal.handover is not None:
+            at_s, ramp_s = self.appears_s + goal.handover[0], goal.handover[1]
+            timeline = (*timeline, Change(at_s, dominance=self.slave, to=after, ramp_s=ramp_s))
+        return replace(scenario, dominance=dominance, timeline=timeline)
 
     def begin(self) -> TrialJudge:
         """Returns what judges it, from its first record on."""
@@ -194,9 +190,10 @@ class ExperimentTrial:
             own, which = aligned[user], f"_user{place}" if len(self.protocol.users) > 1 else ""
             split, until = split_torque(own, log.scenario), own.t_s <= outcome.ended_s
             forces.append(split.end_effector.find_force(split.operator)[until])  # of the hand ON its arm
+            force_n = np.linalg.norm(forces[-1], axis=1)
             found |= {
-                f"force_mean{which}_n": mean_force_n(forces[-1]),
-                f"force_peak{which}_n": peak_force_n(forces[-1]),
+                f"force_mean{which}_n": float(force_n.mean()),
+                f"force_peak{which}_n": float(force_n.max()),
                 f"work{which}_j": energy_j(forces[-1], split.end_effector.speed[until], own.rate_hz),
             }
         if len(forces) > 1:
