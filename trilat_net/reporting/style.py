@@ -87,23 +87,11 @@ _NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "leg
 
 
 @contextmanager
-def figure_style(form: FigureSize = REPORT_SIZE) -> Iterator[None]:
-    """Gives figures inside the block the style of all figures; outside, nothing changes."""
+def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
+    """Yields an empty figure of a size, to be drawn in the style of all figures; outside, nothing changes."""
     sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
     with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
-        yield
-
-
-@contextmanager
-def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Yields an empty figure of a size, to be drawn in the style of all figures."""
-    with figure_style(form):
-        yield new_figure(height_in, form.width_in)
-
-
-def new_figure(height_in: float, width_in: float) -> Figure:
-    """Returns an empty figure of a size in inches."""
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+        yield Figure(figsize=(form.width_in, height_in), layout="constrained")
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
@@ -336,17 +324,15 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
 @contextmanager
 def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
     """Yields an empty figure in the style of all figures."""
-    with figure_style(form):
-        yield TimeFigure(log, form, height_in)
+    with styled_figure(form, height_in) as figure:
+        yield TimeFigure(log, form, figure)
 
 
 class TimeFigure:
     """A figure of a log over time."""
 
-    def __init__(self, log: Log, form: FigureSize, height_in: float) -> None:
-        self.log = log
-        self.figure = new_figure(height_in, form.width_in)
-        self._small_pt = form.small_pt
+    def __init__(self, log: Log, form: FigureSize, figure: Figure) -> None:
+        self.log, self.figure, self._small_pt = log, figure, form.small_pt
         self._changes = list(enumerate(list_changes(log), 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
 

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 
 from ...files import write_whole
 from ...reporting import style
-from ...reporting.appearance import SITE_COLOURS
+from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
 from ...reporting.result_text import Block, TextTable
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
@@ -197,8 +197,8 @@ _LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s
 
 def draw_front(tuned: TuningResult) -> Figure:
     """Returns the fronts of all laws in one panel, both axes logarithmic."""
-    with style.figure_style():
-        figure = style.new_figure(_HEIGHT_IN, FRONT_WIDTH_IN)
+    with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
+        figure.set_figwidth(FRONT_WIDTH_IN)
         axes = figure.add_subplot()
         drawn = [_draw_law(axes, found) for found in tuned.found]
         stars = _draw_printed(axes, tuned)
