@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -201,7 +201,8 @@ def _row(
 def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
     if channel is None:
         return None
-    names = _names(channel.about.get("names", ""))
+    axes = (axis.split(" ") for axis in channel.about.get("names", "").split("; "))
+    names = tuple(" ".join(filter(None, one)) for one in product(*axes))
     if topic.endswith("/theta_hat"):
         kinds = [name.rpartition(".")[2].rstrip("xyz_") if "." in name else "" for name in names]
         return PlotCurves(topic, names, tuple(kind == field for kind in kinds)) if field in kinds else None
@@ -215,13 +216,6 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
         names = tuple(name.removesuffix("_ref") + "_ref" for name in names)
     shown = tuple(reference or field == "position" or not name.endswith("_ref") for name in names)
     return PlotCurves(f"{topic}/{field}", names, shown)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = [""]
-    for axis in text.split("; "):
-        names = [f"{before} {name}".strip() for before in names for name in axis.split(" ")]
-    return tuple(names)
 
 
 _COLORS = [(31, 119, 180), (214, 96, 20), (44, 160, 44), (148, 103, 189), (150, 120, 30)]

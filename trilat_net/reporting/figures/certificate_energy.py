@@ -112,15 +112,13 @@ def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = 
     return plot.figure
 
 
-def _observed_energy(log: Log) -> ObservedEnergy | None:
-    found = observe_energies(log)
-    return found if found is not None and found.curves else None
-
-
 @draws(
     "observed_energy",
     "energies that the control laws declare: lines, observers, tanks",
-    unless(_observed_energy, "the laws of this run declare no energies"),
+    unless(
+        lambda log: (found := observe_energies(log)) and found.curves,
+        "the laws of this run declare no energies",
+    ),
     in_report=True,
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:

@@ -75,10 +75,8 @@ def write_figures(
             exists.
     """
     form, wanted = make_print_size(width_in), list(dict.fromkeys(names)) or list_drawable_figures(log)
-    kinds = _check_formats(formats)
     chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
-    _refuse_figures(folder, chosen, kinds, force=force)
-    return _write(chosen, folder, form, kinds, progress)
+    return _write(chosen, folder, form, _claim(folder, chosen, formats, force=force), progress)
 
 
 def write_overlay(
@@ -94,22 +92,17 @@ def write_overlay(
     Raises:
         UsageError: there is no such width or format, the logs differ in kind, or a file exists.
     """
-    form, kinds = make_print_size(width_in), _check_formats(formats)
+    form = make_print_size(width_in)
     chosen = {"overlay": partial(draw_overlay, logs, form)}
-    _refuse_figures(folder, chosen, kinds, force=force)
-    return _write(chosen, folder, form, kinds)
+    return _write(chosen, folder, form, _claim(folder, chosen, formats, force=force))
 
 
-def _refuse_figures(folder: Path, names: Iterable[str], kinds: Sequence[str], *, force: bool) -> None:
+def _claim(folder: Path, names: Iterable[str], formats: Sequence[str], *, force: bool) -> list[str]:
+    kinds = list(dict.fromkeys(formats))
+    if strange := [kind for kind in kinds if kind not in FIGURE_FORMATS]:
+        raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}")
     for path in (folder / f"{name}.{kind}" for name in names for kind in kinds):
         refuse_existing(path, force=force)
-
-
-def _check_formats(formats: Sequence[str]) -> list[str]:
-    kinds = list(dict.fromkeys(formats))
-    for kind in kinds:
-        if kind not in FIGURE_FORMATS:
-            raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {kind!r}")
     return kinds
 
 
