@@ -1,7 +1,6 @@
 """What a run is made of: scenarios, control laws of one's own, measured delays, keys."""
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -70,7 +69,7 @@ def scenario_new_command(
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
-def _tell_skeleton(kind: str, written: list[Path], key: str, then: Sequence[str]) -> None:
+def _tell_skeleton(kind: str, written: list[Path], key: str, then: str) -> None:
     """Prints what was written, and how to run it."""
     from ..scenario.skeletons import name_skeleton_class
 
@@ -79,8 +78,7 @@ def _tell_skeleton(kind: str, written: list[Path], key: str, then: Sequence[str]
     there = "" if file.parent == Path() else f"cd {file.parent}, and "
     terminal.print_text(f"{file}: a {kind} that works; {test.name}: its test. Change the {kind}, {there}run")
     terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
-    for line in (*then, f"pytest {test.name}"):
-        terminal.print_text(f"  {line.format(file.stem)}")
+    terminal.print_texts([f"  trilat {then} {file.stem}.mcap", f"  pytest {test.name}"])
 
 
 @options.command("mylaw.py")
@@ -91,8 +89,7 @@ def new_law_command(
     """Writes a control law of your own, working and with comments, and its test."""
     from ..scenario.skeletons import new_law
 
-    written = new_law(file, force=force)
-    _tell_skeleton("law", written, "control.law={}", ["trilat certify {}.mcap"])
+    _tell_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
 
 
 @options.command("myhand.py")
@@ -103,9 +100,8 @@ def new_hand_command(
     """Writes a hand of your own, a program that acts as a user, and its test."""
     from ..scenario.skeletons import new_hand
 
-    written = new_hand(file, force=force)
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
-    _tell_skeleton("hand", written, key, ["trilat report {}.mcap"])
+    _tell_skeleton("hand", new_hand(file, force=force), key, "report")
 
 
 @options.command("myplant.py")
@@ -116,7 +112,7 @@ def new_plant_command(
     """Writes a plant of your own, which moves an arm in the place of the program, and its test."""
     from ..scenario.skeletons import new_plant
 
-    _tell_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", ["trilat verify {}.mcap"])
+    _tell_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
 
 
 @options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")

@@ -257,9 +257,6 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
         raise RunFailed(f"{parts[0]}: {ended.text}")
 
 
-_MIB = 1 << 20
-
-
 @options.command("run.mcap --rate 2 --start 5")
 def replay_command(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
@@ -312,7 +309,7 @@ def replay_command(
     selection = parse_selection(include or (), exclude or (), start, stop, duration, time)
     speed = parse_rate(rate)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        facts, block = preload_messages(files, selection, preload * _MIB, progress)
+        facts, block = preload_messages(files, selection, preload << 20, progress)
     name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
     ways = options.MemberOptions(listen, connect, router, zenoh_config, None, insecure)
     connection = ways.resolve([default_endpoint(name, 0)], [])

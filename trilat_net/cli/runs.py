@@ -299,9 +299,13 @@ def rerun_command(
     Without --closed-loop the other sites stay as recorded and do not react.
     """
     from ..execution.rerun import rerun
+    from ..files import refuse_existing
+    from ..log.log_layout import active_path
 
     if output is not None:
-        _check_output(output, files, force=force)
+        if any(output.exists() and file.exists() and output.samefile(file) for file in files):
+            raise UsageError(f"{output}: is the log itself; choose another name")
+        refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
     with terminal.progress_bar("executing") as progress:
         again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
@@ -314,15 +318,6 @@ def rerun_command(
         terminal.print_paths([output] if output else [])
     if again.diverged or again.broken:
         raise typer.Exit(1)
-
-
-def _check_output(output: Path, files: list[Path], *, force: bool) -> None:
-    from ..files import refuse_existing
-    from ..log.log_layout import active_path
-
-    if any(output.exists() and file.exists() and output.samefile(file) for file in files):
-        raise UsageError(f"{output}: is the log itself; choose another name")
-    refuse_existing(output, force=force, unfinished=active_path(output))
 
 
 LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
