@@ -21,7 +21,7 @@ from ..scenario import Scenario
 from . import log_layout
 from .log_file import LogFile
 from .mcap_writer import McapWriter, Sink
-from .ros2 import cdr
+from .ros2.ros2_messages import StandardChannels
 from .ros2.viz_channels import TakeMessage, VizChannels
 from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
 
@@ -71,8 +71,8 @@ class LogWriter:
             self._views = VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view)
         self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
-        self._standard: dict[str, int] = {}  # standard schemas and channels in the file
         self._file = McapWriter(stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}")
+        self._standard = StandardChannels(self._file, self._views.channels if self._views else {})
         about = {
             "schema_version": str(VERSION),
             "session": session,
@@ -178,16 +178,8 @@ class LogWriter:
             raise self._refused(error) from None
 
     def _put_view(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        channel = self._standard.get(topic)
-        if channel is None and self._views is not None:
-            kind, about = self._views.channels[topic]
-            if kind not in self._standard:
-                schema = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind])
-                self._standard[kind] = schema
-            channel = self._file.register_channel(topic, cdr.ENCODING, self._standard[kind], about)
-            self._standard[topic] = channel
-        if channel is not None:
-            self._file.add_message(channel, log_ns, data, min(publish_ns, log_layout.MAX_TIME_NS))
+        publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
+        self._file.add_message(self._standard[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
         """Closes the open chunk and hands it to the operating system: a crash loses nothing before it.

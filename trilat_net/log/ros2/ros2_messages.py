@@ -7,7 +7,7 @@ dimension.
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
+from ..mcap_writer import McapWriter
 from ..site_log import find_task_errors
 from . import cdr
 from .robot_model import build_robot_model
@@ -40,6 +41,24 @@ class Ros2Channel(NamedTuple):
 
     kind: str
     about: dict[str, str]
+
+
+class StandardChannels:
+    """The channels of a file, of all that are known by topic; each is registered with its first message."""
+
+    def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel], **about: str) -> None:
+        self._file, self._known, self._about = file, known, about
+        self._numbers: dict[str, int] = {}  # of schemas by their kind, and of channels by their topic
+
+    def __getitem__(self, topic: str) -> int:
+        if topic not in self._numbers:
+            kind, about = self._known[topic]
+            if kind not in self._numbers:
+                schema = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind])
+                self._numbers[kind] = schema
+            own = self._numbers[kind], {**self._about, **about}
+            self._numbers[topic] = self._file.register_channel(topic, cdr.ENCODING, *own)
+        return self._numbers[topic]
 
 
 SESSION_CHANNELS = {

@@ -64,32 +64,12 @@ def export_ros2(log: Log, path: Path, written: Written = lambda _: None) -> None
         known = {f"/{name}": channel for name, channel in ros2_messages.SESSION_CHANNELS.items()}
         for site in sites:
             known |= site.channels
-        bag = _BagChannels(file, known)
+        bag = ros2_messages.StandardChannels(file, known, offered_qos_profiles=_QOS)
         parts = [part for site in sites for part in (site.records(), site.statistics())]
         for log_ns, publish_ns, messages in heapq.merge(*parts, _events(log), key=itemgetter(0)):
             for topic, data in messages:
-                file.add_message(bag.channel(topic), log_ns, data, publish_ns)
+                file.add_message(bag[topic], log_ns, data, publish_ns)
         file.finish()
-
-
-class _BagChannels:
-    """The channels of a bag, of all that are known by topic; each is registered with its first message."""
-
-    def __init__(self, file: McapWriter, known: dict[str, ros2_messages.Ros2Channel]) -> None:
-        self._file, self._known = file, known
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-
-    def channel(self, topic: str) -> int:
-        if topic not in self._channels:
-            kind, about = self._known[topic]
-            if kind not in self._schemas:
-                text = cdr.ROS2_SCHEMAS[kind]
-                self._schemas[kind] = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, text)
-            self._channels[topic] = self._file.register_channel(
-                topic, cdr.ENCODING, self._schemas[kind], {"offered_qos_profiles": _QOS, **about}
-            )
-        return self._channels[topic]
 
 
 class _SiteMessages:
