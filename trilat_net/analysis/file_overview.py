@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
-from ..files import open_regular
+from ..files import reading
 from ..log.accounting import Account
 from ..log.log_layout import SESSION
 from ..log.log_reader import Log, open_log
@@ -73,11 +73,8 @@ class FileInventory:
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
-            try:
-                with open_regular(path) as stream:
-                    self._read(path, McapReader(stream, str(path), shift_progress(progress, before, total)))
-            except OSError as error:
-                raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+            with reading(path) as stream:
+                self._read(path, McapReader(stream, str(path), shift_progress(progress, before, total)))
             before += path.stat().st_size
 
     def _read(self, path: Path, walk: McapReader) -> None:

@@ -18,7 +18,7 @@ import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
 from ..errors import SessionError, UsageError
-from ..files import open_regular
+from ..files import reading
 from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
@@ -247,10 +247,8 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         UsageError: it cannot be read, is no configuration, or contradicts what a session needs.
     """
     try:
-        with open_regular(path, encoding="utf-8-sig") as stream:
-            text = stream.read()
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+        with reading(path, UsageError) as stream:
+            text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UsageError(f"{path}: is no text in UTF-8") from None
     return check_zenoh_file(str(path), _parse_json5(str(path), text), _find_refusal)

@@ -231,15 +231,11 @@ def warn_if_unfinished(path: Path) -> None:
     Raises:
         LogError: it cannot be read.
     """
-    from ..errors import LogError
-    from ..files import open_regular
+    from ..files import reading
     from ..log.mcap_records import RecordScanner
 
-    try:
-        with open_regular(path) as stream:
-            whole = RecordScanner(stream).ends
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    with reading(path) as stream:
+        whole = RecordScanner(stream).ends
     if not whole:
         print_note(
             f"{path}: was not finished: its end and its index are missing; make it whole with: "
