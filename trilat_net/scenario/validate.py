@@ -198,8 +198,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
         check_law(name, site, len(scenario.sites))
         check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
-        _check_live_hands(site, f"sites.{name}.hands")
-        _check_own_hand(site, f"sites.{name}.hands")
+        _check_hands(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
     _check_received(scenario)
     _check_links(scenario)
@@ -395,8 +394,8 @@ def _check_actors(actors: Sequence[operators.Operator | operators.Environment], 
             raise ScenarioError(found.problem, path=f"{path}[{n}].{found.key}")
 
 
-def _check_live_hands(site: SiteSpec, path: str) -> None:
-    """Refuses a second live hand of an arm, and one of an arm that is outside of the program."""
+def _check_hands(site: SiteSpec, path: str) -> None:
+    """Refuses two live hands, one of an arm outside of the program, and one's own out of step with ticks."""
     live = [n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)]
     if live and site.plant != "simulated":
         raise ScenarioError(
@@ -408,10 +407,6 @@ def _check_live_hands(site: SiteSpec, path: str) -> None:
         raise ScenarioError(
             f"is a second live hand besides {path}[{live[0]}]; an arm has one", path=f"{path}[{live[1]}].kind"
         )
-
-
-def _check_own_hand(site: SiteSpec, path: str) -> None:
-    """Refuses a hand of one's own that cannot be asked at ticks of its site."""
     for n, hand in enumerate(site.hands):
         if isinstance(hand, ProgramHand) and site.rate_hz % hand.rate_hz:
             raise ScenarioError(
