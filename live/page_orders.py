@@ -9,6 +9,8 @@ site is open at a time, besides that to stop.
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any
 
 import msgspec
@@ -121,20 +123,7 @@ class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
 
 Order = SetLink | SetShares
 StageMessage = DoStep | AbortTrial
-_DECODER = msgspec.json.Decoder(
-    Seen
-    | TakePart
-    | AnswerPage
-    | StopArms
-    | SetLink
-    | SetShares
-    | ShowAges
-    | MoveHand
-    | MarkMoment
-    | EndSession
-    | DoStep
-    | AbortTrial
-)
+_DECODER = msgspec.json.Decoder(reduce(or_, PageMessage.__subclasses__()))
 _RATES: dict[type[PageMessage], tuple[float, int]] = {
     PageMessage: (240.0, 480),
     MoveHand: (200.0, 400),

@@ -7,7 +7,6 @@ the arms.
 
 import hmac
 import secrets
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 from urllib.parse import parse_qs
@@ -57,11 +56,6 @@ class RoleLinks:
         """Returns the link of a role; its token stands where a browser sends it to no server by itself."""
         query = f"?{role.query}" if role.query else ""
         return f"{address}{query}" + (f"#token={self._make_token(role)}" if self._secret else "")
-
-    def list_users(self, address: str, sites: Iterable[str]) -> list[str]:
-        """Returns a line for each role but the experimenter's: who, and the link."""
-        users = [(f"user {site}", Role("user", site)) for site in sites]
-        return [f"{who}: {self.link(address, role)}" for who, role in [*users, ("watcher", Role("watcher"))]]
 
     def find(self, query: str) -> Role | None:
         """Returns the role of whoever comes by a link with this query; None if no role has its token."""

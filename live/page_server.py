@@ -303,10 +303,8 @@ class PageServer:
 
     def _turn_to(self, bus: Bus, session: str) -> None:
         self._bus, self.view = bus, SessionView(bus, self._clock, session)
-        self._frames, self._desk = (
-            SessionFrames(self.view),
-            OrderDesk(bus, self._clock, session, self.refused),
-        )
+        self._frames = SessionFrames(self.view)
+        self._desk = OrderDesk(bus, self._clock, session, self.refused)
         self._frame: dict[str, Any] | None = None
         self._known: dict[str, dict[str, Any]] = {}
         self._notices: list[dict[str, Any]] = []
@@ -379,8 +377,8 @@ class PageServer:
         sites = {} if scenario is None else scenario.sites
         users = [name for name, spec in sites.items() if spec.role == "master"]
         users = users if self._stage is None else [*self._stage.users]
-        for line in self._links.list_users(self._base, users):
-            self._say(line)
+        for role in (*(Role("user", site) for site in users), Role("watcher")):
+            self._say(f"{role.kind} {role.site}".rstrip() + f": {self._links.link(self._base, role)}")
 
     async def _tick(self) -> None:
         """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
@@ -517,7 +515,11 @@ class PageServer:
         elif isinstance(message, ShowAges):
             self._ages = message.shown
         elif isinstance(message, MoveHand):
-            self._move_hand(page, message)
+            site = view.sites.get(message.site)
+            if site is None or site.hand is None:
+                self.refused["nobody can hold it"] += 1
+            else:
+                page.hands.move(message, pushes=site.hand.mode == "force")
         elif isinstance(message, StageMessage):
             asked = self._stage is not None and self._stage.take(page.role.site, page.number, message)
             self.refused["was not asked"] += not asked
@@ -557,13 +559,6 @@ class PageServer:
     def _list_held(self, page: Page) -> list[str]:
         sites = (self._frame or {}).get("sites", {})
         return [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
-
-    def _move_hand(self, page: Page, order: MoveHand) -> None:
-        site = self.view.sites.get(order.site)
-        if site is None or site.hand is None:
-            self.refused["nobody can hold it"] += 1
-            return
-        page.hands.move(order, pushes=site.hand.mode == "force")
 
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
@@ -639,11 +634,8 @@ class PageServer:
         points = frames.points.since(page.points, most)
         energies = frames.energies.since(page.energies, most)
         events = [show_event(event) for event in view.events.since(page.events, 100)]
-        page.points, page.energies, page.events = (
-            frames.points.count,
-            frames.energies.count,
-            view.events.count,
-        )
+        page.points, page.energies = frames.points.count, frames.energies.count
+        page.events = view.events.count
         return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
 
@@ -709,17 +701,11 @@ def serve_page(
     with PageServer(bus, clock, session, options, ends=ends, say=say, stage=stage) as page:
         say(f"experimenter: {page.address}")
         with suppress(OSError, webbrowser.Error):
-            if options.opens and _has_browser():
+            screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            shows = bool(screen) or not sys.platform.startswith("linux")
+            if options.opens and shows and sys.stdout.isatty():
                 webbrowser.open(page.address)
         yield page
-
-
-def _has_browser() -> bool:
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-        return False
-    return sys.stdout.isatty()
 
 
 @contextmanager
