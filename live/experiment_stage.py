@@ -202,7 +202,7 @@ class Stage:
             "users": [{"site": at, "who": names[at], "state": state} for at, state in states.items()],
             "task": protocol.task.ask(self._plan.scenarios[planned.condition].slave),
             "trial": planned.trial,
-            "trials": protocol.practice + protocol.trials,
+            "trials": self._plan.trials[-1].trial,
             "block": planned.block,
             "blocks": len(protocol.conditions),
             "practice": planned.practice,

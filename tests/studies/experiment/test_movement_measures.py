@@ -159,12 +159,27 @@ def test_task_load_equals_the_published_example() -> None:
     assert raw_tlx(RATINGS) == pytest.approx(250.0 / 6.0)
 
 
-def test_weights_are_of_fifteen_comparisons() -> None:
+@pytest.mark.parametrize(
+    "weights", [(5, 5, 5, 0, 0, 0), (3, 3, 3, 3, 2, 2), (6, 4, 3, 2, 0, 0), (3, 1, 3, 4, 3)]
+)
+def test_weights_that_no_comparisons_give_are_refused(weights: tuple[int, ...]) -> None:
+    given = dict(zip(TLX_SCALES, weights, strict=False))
     with pytest.raises(UsageError, match="15 comparisons"):
-        weighted_tlx(RATINGS, {**WEIGHTS, "mental": 4})
+        weighted_tlx(RATINGS, given)
+
+
+def test_ratings_out_of_range_are_refused_by_name() -> None:
+    with pytest.raises(UsageError, match=r"effort = 101\.0: .* between 0 and 100"):
+        raw_tlx({**RATINGS, "effort": 101.0})
+    with pytest.raises(UsageError, match="NASA-TLX has mental, physical"):
+        raw_tlx({"mental": 3.0})
 
 
 def test_usability_score_has_its_example_and_its_ends() -> None:
     """Brooke (1996), from memory: contributions of 22 times 2.5."""
     assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0
     assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (100.0, 0.0, 50.0)
+    with pytest.raises(UsageError, match="answer 4 = 6"):
+        sus_score([1, 2, 3, 6, 1, 1, 1, 1, 1, 1])
+    with pytest.raises(UsageError, match="SUS has 10"):
+        sus_score([1, 2])

@@ -232,24 +232,44 @@ TLX_SCALES = ("mental", "physical", "temporal", "performance", "effort", "frustr
 """Of the NASA Task Load Index; `performance` runs from good, 0, to poor, 100."""
 
 
+def _rate_tlx(ratings: Mapping[str, float]) -> list[float]:
+    if ratings.keys() != set(TLX_SCALES):
+        raise UsageError(
+            f"ratings of {', '.join(ratings) or 'nothing'}: NASA-TLX has {', '.join(TLX_SCALES)}"
+        )
+    for scale, rating in ratings.items():
+        if not 0.0 <= rating <= 100.0:
+            raise UsageError(f"{scale} = {rating}: a rating of NASA-TLX lies between 0 and 100")
+    return [float(ratings[scale]) for scale in TLX_SCALES]
+
+
 def raw_tlx(ratings: Mapping[str, float]) -> float:
     """Returns the mean of six ratings from 0 to 100, by scale: the raw NASA-TLX.
 
     Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and Ergonomics
     Society 50 (2006).
     """
-    return float(np.mean([ratings[scale] for scale in TLX_SCALES]))
+    return float(np.mean(_rate_tlx(ratings)))
 
 
 def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> float:
-    """Returns the mean of six ratings from 0 to 100 by how often each scale was chosen in the 15 comparisons.
+    """Returns the mean of six ratings from 0 to 100 by their weights.
+
+    A weight is how often its scale was chosen in the 15 comparisons of two scales.
 
     Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical and
     theoretical research", Advances in Psychology 52 (1988).
     """
-    if sum(weights.values()) != 15:
-        raise UsageError(f"weights {dict(weights)}: of 15 comparisons of two scales")
-    return sum(ratings[scale] * weights[scale] for scale in TLX_SCALES) / 15.0
+    rated = _rate_tlx(ratings)
+    given = [weights.get(scale, -1) for scale in TLX_SCALES]
+    sums = np.cumsum(sorted(given))
+    fewest = [n * (n - 1) // 2 for n in range(1, 7)]  # n scales are compared with each other that often
+    if len(weights) != 6 or any(w != int(w) for w in given) or sums[-1] != 15 or (sums < fewest).any():
+        raise UsageError(
+            f"weights {dict(weights)}: give how often each of {', '.join(TLX_SCALES)} was chosen, 0 to 5, in "
+            "the 15 comparisons of two"
+        )
+    return float(np.dot(rated, given) / 15.0)
 
 
 def sus_score(answers: Sequence[int]) -> float:
@@ -257,4 +277,9 @@ def sus_score(answers: Sequence[int]) -> float:
 
     Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry (1996).
     """
+    if len(answers) != 10:
+        raise UsageError(f"{len(answers)} answers: SUS has 10 questions")
+    for number, answer in enumerate(answers, 1):
+        if answer not in (1, 2, 3, 4, 5):
+            raise UsageError(f"answer {number} = {answer}: an answer of SUS is 1, 2, 3, 4 or 5")
     return 2.5 * sum(answer - 1 if n % 2 == 0 else 5 - answer for n, answer in enumerate(answers))
