@@ -32,7 +32,7 @@ HICCUP_NS = 50_000_000
 CHECK_S = 1.0
 CHECKS, FIRST_CHECKS = 3, 61
 """Code in the same call at so many checks in a row, one every `CHECK_S`, hangs; the second is of its first
-call, in which it may compile."""
+tick, in which it may compile."""
 
 
 def read_thread_usage() -> tuple[int, int]:
@@ -66,9 +66,9 @@ class WatchedCode:
         self.longest_tick = -1
         self._name, self._fail, self._clock, self._usage = name, fail, clock, usage
         self._period_ns = NS_PER_S // rate_hz
-        self._owed_ns = self._sum_ns = self._count = 0
-        self._running = -1  # the tick of the call under way
-        self._checked, self._checks = -1, 0
+        self._owed_ns = self._sum_ns = self._count = self._checks = 0
+        self._running = self._first = -1  # the ticks of the call under way and of the first one
+        self._checked = -1  # how many calls there were before the one checked last
 
     def run(self, k: int, call: Callable[[], T]) -> T:
         """Returns what a call gives at a tick.
@@ -78,7 +78,7 @@ class WatchedCode:
         """
         computed_ns, switches = self._usage()
         began_ns = self._clock.monotonic_ns()
-        self._running = k
+        self._running, self._first = k, k if self._first < 0 else self._first
         try:
             result = call()
         finally:
@@ -123,9 +123,9 @@ class WatchedCode:
             Exception: of `fail`, out of the code.
         """
         running = self._running
-        self._checks = self._checks + 1 if running >= 0 and running == self._checked else 0
-        self._checked = running
-        most = (CHECKS if self._count else FIRST_CHECKS) - 1
+        self._checks = self._checks + 1 if running >= 0 and self._count == self._checked else 0
+        self._checked = self._count if running >= 0 else -1
+        most = (FIRST_CHECKS if running == self._first else CHECKS) - 1
         if self._checks >= most:
             raise self._fail(running, f"it did not come back within {most * CHECK_S:g} s")
 
