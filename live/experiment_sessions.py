@@ -107,9 +107,8 @@ class ExperimentSessions:
     def _make_trial(self, step: Step) -> bool:
         """Makes a trial until one counts; false if the experiment was ended before."""
         plan, planned = self.experiment.plan, step.planned
-        trial = ExperimentTrial(
-            plan.protocol, plan.scenarios[planned.condition], planned, plan.digest, whose=""
-        )
+        scenario = plan.find_scenario(planned, self.experiment.list_choices())
+        trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest, whose="")
         path = make_folder(self.experiment.folder / LOGS) / planned.file
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True

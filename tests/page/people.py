@@ -63,7 +63,7 @@ class People(ManualClock):
             failed = fault(watch, folder)
             if failed is None:
                 trial, plan = watch.trial, self.experiment.plan
-                scenario = plan.scenarios[trial.planned.condition]
+                scenario = plan.find_scenario(trial.planned, self.experiment.list_choices())
                 SyntheticTrial(plan.protocol, scenario, trial.planned, plan.digest).write(folder / "run.mcap")
             return failed or SessionResult(folder / "run.mcap")
 

@@ -106,7 +106,7 @@ def test_digest_knows_what_was_planned() -> None:
                 "training": {"lead": {"near": [1.0, 0.0], "far": [1.0, 0.0]}},
                 "catch": {"condition": "far"},
             },
-            "a training has no catch trials",
+            "one of catch trials, a training and a staircase",
         ),
         (
             {

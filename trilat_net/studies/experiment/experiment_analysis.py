@@ -41,7 +41,7 @@ from .statistics import (
 MEASURES = (
     "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
     "force_mean_user1_n", "force_mean_user2_n", "wall_force_n", "error_force_n", "error_handover_mm",
-    "first_settled", "succeeded",
+    "first_settled", "threshold", "succeeded",
 )  # fmt: skip
 """What is compared, as far as trials have it, and differ in it."""
 FOLDER = "analysis"
@@ -52,7 +52,7 @@ class ExperimentAnalysis(Result):
 
     Attributes:
         rows: the trials that count, after a training if there is one; `learning_rows` has all of its phases.
-        throughput_rows, gain_rows: a row for each participant, or pair, and condition.
+        throughput_rows, gain_rows, threshold_rows: a row for each participant, or pair, and condition.
         means: by measure, for each condition.
         comparisons: by measure, of every two conditions.
         methods: the paragraph of a paper.
@@ -71,10 +71,12 @@ class ExperimentAnalysis(Result):
         kept = (row for row in experiment.to_rows() if row[self.unit] not in exclude)
         counted = [row for row in kept if not (row["practice"] or row["catch"])]
         self.learning_rows = sorted(counted, key=lambda row: order(row["condition"]))
-        self.rows = [row for row in self.learning_rows if row.get("phase", "after") == "after"]
+        left_out = ("before", "training", "retention")
+        self.rows = [row for row in self.learning_rows if row.get("phase") not in left_out]
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
         self.throughput_rows, self.gain_rows = list(self._find_throughput()), list(self._find_gains())
+        self.threshold_rows = sorted(self._find_thresholds(), key=lambda row: order(row["condition"]))
         scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
         self._scores = [row for row in scores if row[self.unit] not in exclude]
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
@@ -94,6 +96,8 @@ class ExperimentAnalysis(Result):
             return self.throughput_rows
         if measure.startswith("gain_"):
             return self.gain_rows
+        if measure == "threshold":
+            return self.threshold_rows
         return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
@@ -124,6 +128,17 @@ class ExperimentAnalysis(Result):
                 gains = {f"gain_{phase}_{learnt}": before - mean for phase, mean in of.items() if mean}
                 yield {self.unit: who, "condition": condition, **gains}
 
+    def _find_thresholds(self) -> Iterator[dict[str, Any]]:
+        """Yields the threshold of each participant and condition, of a staircase that turned often enough."""
+        plan, choices = self._experiment.plan, self._experiment.list_choices()
+        for trial in plan.trials:
+            stairs = plan.protocol.staircase
+            if stairs is None or trial.trial > 1 or (who := "-".join(trial.group)) in self._exclude:
+                continue
+            threshold = stairs.find_threshold(plan.judge_choices(trial, choices))
+            if threshold is not None:
+                yield {self.unit: who, "condition": trial.condition, "threshold": threshold}
+
     def _write_methods(self) -> str:
         plan = self._experiment.plan
         protocol, scenario = plan.protocol, next(iter(plan.scenarios.values()))
@@ -147,6 +162,7 @@ class ExperimentAnalysis(Result):
             "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
             **({"exclusions": reasons} if reasons else {}),
             **({"training": protocol.training.describe()} if protocol.training else {}),
+            **({"staircase": protocol.staircase.describe()} if protocol.staircase else {}),
             "design": protocol.design,
             "blocks": len(protocol.conditions),
             "trials": protocol.trials,

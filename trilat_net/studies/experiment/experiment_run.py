@@ -20,8 +20,9 @@ from ...results import Result
 from ...scenario import parse_scenario
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..study_folder import RunJournal, build_resume_hint, encode_csv
-from .protocol import ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
+from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
 from .questionnaires import find_form
+from .staircase import CHOICE, COMPARISON, Staircase
 from .trial_run import TrialEntry, run_trial
 
 PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, NOTES_FILE, TRIALS_FILE = (
@@ -108,6 +109,30 @@ class Experiment(Result):
         with self.open_notes() as journal:
             return list(journal.done.values())
 
+    def list_choices(self) -> Choices:
+        """Returns what was chosen of the pairs of a staircase so far."""
+        found = dict[tuple[tuple[str, ...], int], list[float]]()
+        for note in self.read_notes():
+            if note.text == CHOICE:
+                last = self.plan.trials[note.number - 1]
+                found.setdefault((last.group, last.block), []).append(note.answers[CHOICE])
+        return found
+
+    def _choose(self, stairs: Staircase) -> None:
+        """Notes what synthetic participants choose, of all pairs: a function of the plan."""
+        chosen = dict[tuple[tuple[str, ...], int], list[float]]()
+        with self.open_notes() as notes:
+            for step in self.plan.list_steps():
+                if step.form is None or step.form.name != CHOICE:
+                    continue
+                last, who = step.planned, "-".join(step.planned.group)
+                right, more = self.plan.judge_choices(last, chosen), 1 + (last.phase == COMPARISON)
+                choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
+                chosen.setdefault((last.group, last.block), []).append(choice)
+                notes.add(
+                    Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, {CHOICE: choice})
+                )
+
     def status(self) -> ExperimentStatus:
         """Returns how far it is."""
         done = self.read_entries()
@@ -120,10 +145,14 @@ class Experiment(Result):
         """Makes the trials that are left, with synthetic participants, and writes the tables."""
         logs, plan = make_folder(self.folder / LOGS), self.plan
         with self.open_trials(people=False) as journal:
+            if plan.protocol.staircase is not None:
+                self._choose(plan.protocol.staircase)
+            choices = self.list_choices()
             done = {entry.cell for entry in journal.done.values()}
             left = [one for one in plan.trials if one.number not in done]
-            texts = {name: scenario.text for name, scenario in plan.scenarios.items()}
-            tasks = [(plan.protocol, texts[one.condition], one, plan.digest, logs) for one in left]
+            tasks = [
+                (plan.protocol, plan.find_scenario(one, choices).text, one, plan.digest, logs) for one in left
+            ]
             with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
                 journal.complete(pool, run_trial, tasks, len(done), len(plan.trials), show)
         self.write_tables()
@@ -131,7 +160,7 @@ class Experiment(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each trial that is done, in the order of the plan."""
-        done = self.read_entries()
+        done, choices, stairs = self.read_entries(), self.list_choices(), self.plan.protocol.staircase
         return [
             {
                 "trial_number": planned.number,
@@ -141,6 +170,7 @@ class Experiment(Result):
                 "trial": planned.trial,
                 "practice": int(planned.practice),
                 **({"phase": planned.phase} if planned.phase else {}),
+                **({} if stairs is None else self._tell_pair(planned, choices)),
                 "catch": int(planned.catch),
                 "people": int(entry.people),
                 "succeeded": int(entry.succeeded),
@@ -151,6 +181,12 @@ class Experiment(Result):
             for planned in self.plan.trials
             if (entry := done.get(planned.number)) is not None
         ]
+
+    def _tell_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
+        if planned.practice:
+            return {"difference": None, "right": None}
+        difference, right = self.plan.find_pair(planned, choices)
+        return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
         """Returns a row for each item that somebody has answered."""
@@ -164,7 +200,9 @@ class Experiment(Result):
         """Returns a row for each questionnaire that somebody has answered, with its score by its name."""
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
         return [
-            {**row, note.text: forms[note.text].score(note.answers)} for row, note in self._list_answered()
+            {**row, note.text: forms[note.text].score(note.answers)}
+            for row, note in self._list_answered()
+            if note.text in forms
         ]
 
     def _list_answered(self) -> Iterator[tuple[dict[str, Any], Note]]:

@@ -25,6 +25,7 @@ from ...results import Result
 from ...scenario import Scenario, load_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from .questionnaires import Name, Questionnaire, find_form
+from .staircase import COMPARISON, STANDARD, Staircase
 from .synthetic_participant import ParticipantModel, Share
 from .tasks import AnyTask, ReachTrial
 
@@ -102,6 +103,7 @@ class Protocol(Frozen, frozen=True):
         force_limit_n: largest force of the live hands of participants who bear less, N, by pseudonym.
         catch: trials of another condition among those of a block; they do not count.
         training: trials in which authority moves from an expert to somebody who learns.
+        staircase: pairs of trials by which a key is adapted to what a participant can tell.
     """
 
     name: Name
@@ -125,15 +127,24 @@ class Protocol(Frozen, frozen=True):
     force_limit_n: dict[Pseudonym, Positive] = field(default_factory=dict)
     catch: CatchTrials | None = None
     training: Training | None = None
+    staircase: Staircase | None = None
 
-    def list_phases(self, condition: str) -> list[tuple[str, float | None]]:
+    def list_phases(self, condition: str, random: np.random.Generator) -> list[tuple[str, float | None]]:
         """Returns phase and first user's part of what two share, of every trial of a block after practice."""
+        if self.staircase is not None:
+            pairs = [random.permutation([STANDARD, COMPARISON]).tolist() for _ in range(self.trials // 2)]
+            return [(phase, None) for phase in itertools.chain(*pairs)]
         if (how := self.training) is None:
             return [("", None)] * self.trials
         parts = np.linspace(*how.lead[condition], self.trials).tolist()
         alone = {"before": how.before, "after": how.after, "retention": how.retention}
         before, after, later = ([(phase, 0.0)] * count for phase, count in alone.items())
         return [*before, *(("training", part) for part in parts), *after, *later]
+
+    @property
+    def forms(self) -> list[Questionnaire]:
+        """What is answered: questionnaires, and the choices of a staircase."""
+        return [*self.questionnaires, *([self.staircase.form] if self.staircase else [])]
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
@@ -157,10 +168,11 @@ class PlannedTrial(NamedTuple):
         practice: whether it does not count.
         before: how many trials the group has made before.
         target: the number of its target; each block begins at another, which is drawn, so that what the
-            direction of a target does is no learning.
+            direction of a target does is no learning. Both trials of a pair have one.
         seed: of what is drawn in it.
         catch: whether its condition is another than the block's, and it does not count.
-        phase: of a training: "before", "training", "after" or "retention".
+        phase: of a training: "before", "training", "after" or "retention"; of a staircase which trial of its
+            pair it is: "standard" or "comparison".
         lead: the first user's part of what two users share at the slave; None: as the scenario has it.
     """
 
@@ -182,6 +194,10 @@ class PlannedTrial(NamedTuple):
         """The name of its log."""
         who = "-".join(self.group)
         return f"{self.number:05d}-{who}-b{self.block}-t{self.trial:02d}-{self.condition}.mcap"
+
+
+Choices = Mapping[tuple[tuple[str, ...], int], Sequence[float]]
+"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by group and block."""
 
 
 class Step(NamedTuple):
@@ -233,10 +249,38 @@ class ExperimentPlan(Result):
             if self.protocol.consent and (before is None or before.group != planned.group):
                 yield Step("consent", planned)
             yield Step("trial", planned)
+            if (stairs := self.protocol.staircase) is not None and self._is_second(planned):
+                yield Step("questionnaire", planned, stairs.form)
             left = after is None or after.group != planned.group
             if left or (after is not None and after.block != planned.block):
                 asked = [form for form in forms if left or form.after == "block"]
                 yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
+
+    def _is_second(self, planned: PlannedTrial) -> bool:
+        """Returns whether a pair ends with a trial."""
+        return planned.trial > self.protocol.practice and (planned.trial - self.protocol.practice) % 2 == 0
+
+    def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
+        """Returns whether each choice of a trial's block is the trial that had more."""
+        block = self.trials[planned.number - planned.trial :][: self.trials[-1].trial]
+        more = (1 + (second.phase == COMPARISON) for second in filter(self._is_second, block))
+        chosen = choices.get((planned.group, planned.block), ())
+        return [choice == one for choice, one in zip(chosen, more, strict=False)]
+
+    def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
+        """Returns the difference in a trial's pair, and whether the choice was right; None: it is to come."""
+        stairs, number = self.protocol.staircase, (planned.trial - self.protocol.practice - 1) // 2
+        assert stairs is not None
+        right = self.judge_choices(planned, choices)
+        return stairs.list_differences(right)[number], right[number] if number < len(right) else None
+
+    def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
+        """Returns the scenario of a trial, after the choices of its block before it."""
+        scenario, stairs = self.scenarios[planned.condition], self.protocol.staircase
+        if stairs is None or planned.practice:
+            return scenario
+        more = self.find_pair(planned, choices)[0] if planned.phase == COMPARISON else 0.0
+        return load_scenario(scenario, {stairs.key: stairs.standard + more})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
         """Returns how long people rest at least before a trial, s."""
@@ -327,11 +371,13 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         yield f"catch.condition: there is no condition {protocol.catch.condition}"
     if protocol.training is not None and protocol.training.lead.keys() != protocol.conditions.keys():
         yield f"training.lead: is a pair of numbers for each of {', '.join(protocol.conditions)}"
-    if protocol.training is not None and protocol.catch is not None:
-        yield "a training has no catch trials"
+    if sum(one is not None for one in (protocol.training, protocol.catch, protocol.staircase)) > 1:
+        yield "an experiment has one of catch trials, a training and a staircase"
+    if protocol.staircase is not None:
+        yield from _find_staircase_problems(protocol, protocol.staircase)
     if size != 2 and (protocol.training is not None or protocol.task.needs_pair):
         yield "a training, a handover and users who are shown different targets need two users"
-    forms = [form.name for form in protocol.questionnaires]
+    forms = [form.name for form in protocol.forms]
     if len(set(forms)) < len(forms):
         yield "two questionnaires have one name"
     for form in protocol.questionnaires:
@@ -352,6 +398,15 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         )
 
 
+def _find_staircase_problems(protocol: Protocol, stairs: Staircase) -> Iterator[str]:
+    if len(protocol.users) != 1:
+        yield "staircase: is of one user, who answers"
+    if protocol.trials % 2:
+        yield f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
+    if setting := [name for name, keys in protocol.conditions.items() if stairs.key in keys]:
+        yield f"staircase.key: {stairs.key} is set by condition {', '.join(setting)} too"
+
+
 def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     """Returns the scenario of a condition, if participants can hold its masters."""
     for user in protocol.users:
@@ -370,6 +425,9 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
         raise ScenarioError("both users are to have a share", path=f"dominance.{slave}")
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)
+    if (stairs := protocol.staircase) is not None:
+        for value in (stairs.standard, stairs.standard + stairs.start):
+            load_scenario(scenario, {stairs.key: value})
     return scenario
 
 
@@ -422,14 +480,16 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
     number = 0
     for (n, group), block in itertools.product(enumerate(protocol.groups), range(len(protocol.conditions))):
         condition = orders[n % len(orders)][block]
-        phases = [*[("", None)] * protocol.practice, *protocol.list_phases(condition)]
+        random = np.random.default_rng([protocol.seed, n, block, 2])
+        phases = [*[("", None)] * protocol.practice, *protocol.list_phases(condition, random)]
         for trial, phase in enumerate(phases):
             number += 1
             caught = trial in _draw_catches(protocol, condition, (n, block))
             drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
             seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
             first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
-            counts = block + 1, trial + 1, practice, block * len(phases) + trial, int(first) + trial
+            target = int(first) + ((trial - protocol.practice) // 2 if protocol.staircase else trial)
+            counts = block + 1, trial + 1, practice, block * len(phases) + trial, target
             shown = protocol.catch.condition if protocol.catch is not None and caught else condition
             yield PlannedTrial(number, group, shown, *counts, seed, caught, *phase)
 

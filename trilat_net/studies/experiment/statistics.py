@@ -434,6 +434,7 @@ _METHODS = (
     ("blocks", " in {} blocks"),
     ("trials", " with {} trials of every participant under a condition."),
     ("training", " {}."),
+    ("staircase", " {}."),
     ("conditions", " Conditions, with delays as measured, were: {}."),
     ("law", " The arms ran the control law {}"),
     ("rate_hz", " at {}"),
@@ -451,7 +452,9 @@ _METHODS = (
     ("resamples", " and by the bootstrap (BCa, {} resamples)."),
 )  # fmt: skip
 """Facts, in the order of the paragraph, and what is said of each."""
-_WELCOME = ("pairs", "exclusions", "blocks", "training", "rate_hz", "program", "digest", "unit", "alpha")
+_WELCOME = (
+    "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest", "unit", "alpha",
+)  # fmt: skip
 _OWN = {"confidence": 100 * CONFIDENCE, "resamples": RESAMPLES}
 _UNITS = {
     "ms": "ms",
@@ -471,10 +474,10 @@ def write_methods(facts: Mapping[str, Any]) -> str:
 
     Args:
         facts: `participants`, whose data count; `excluded`, how many more; `exclusions`, why; `pairs`;
-            `design`; `blocks`; `trials` of a participant under a condition; `training`, what they were;
-            `conditions`, by name what each was, with its delay as measured (`delay_ms`); `law`; `gains`;
-            `rate_hz`; `seeds`; `measures`; `correction` of p; `unit`; `alpha`; `program`, its version;
-            `digest` of the protocol. Keys end in their unit.
+            `design`; `blocks`; `trials` of a participant under a condition; `training` or `staircase`, what
+            they were; `conditions`, by name what each was, with its delay as measured (`delay_ms`); `law`;
+            `gains`; `rate_hz`; `seeds`; `measures`; `correction` of p; `unit`; `alpha`; `program`, its
+            version; `digest` of the protocol. Keys end in their unit.
 
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.
