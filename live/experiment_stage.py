@@ -115,10 +115,12 @@ class Stage:
 
     Attributes:
         users: the sites of those who take part.
+        shows_ages: whether pages begin with the ages of samples shown; they could tell the answer of a pair.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
         self.users, self._plan, self._clock = plan.protocol.users, plan, clock
+        self.shows_ages = plan.protocol.staircase is None
         self._asked: Asked | None = None
         self._watch: TrialWatch | None = None
         self._step: Step | None = None

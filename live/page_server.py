@@ -262,7 +262,7 @@ class PageServer:
         self._guarded = options.host not in LOOPBACK
         self._links, self._told = RoleLinks(guarded=self._guarded), False
         self._files = _list_assets()
-        self._ages = True
+        self._ages = stage is None or stage.shows_ages
         self.results: dict[str, Path] = {}
         self._n = 0
         self.end_requested = threading.Event()

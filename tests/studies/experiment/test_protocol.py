@@ -10,6 +10,7 @@ import pytest
 
 import trilat_net as tn
 from trilat_net.errors import UsageError
+from trilat_net.scenario import load_scenario
 from trilat_net.studies.experiment.protocol import Protocol, list_orders, plan_experiment, read_protocol
 from trilat_net.studies.experiment.questionnaires import Questionnaire, find_form
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
@@ -21,6 +22,25 @@ def make_protocol(**keys: Any) -> Protocol:
     conditions = {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}}
     given = {"name": "study", "scenario": "paper", "set": LIVE, "conditions": conditions, "participants": 4}
     return msgspec.convert({**given, **keys}, Protocol)
+
+
+def test_keys_of_a_site_leave_its_others() -> None:
+    """Written as TOML nests them: role, arm and what another table sets stay."""
+    nested = {"sites": {"m1": {"hands": [{"kind": "live"}]}, "s": {"q0_rad": [-0.6, 1.2]}}}
+    conditions = {
+        "near": {"dominance": {"s": {"m1": 0.8, "m2": 0.2}}},
+        "far": {"sites": {"s": {"qd0_rad_s": 0.1}}},
+    }
+    plan = plan_experiment(make_protocol(set=nested, conditions=conditions))
+    paper = load_scenario("paper")
+    for scenario in plan.scenarios.values():
+        assert [site.role for site in scenario.sites.values()] == ["master", "master", "slave"]
+        assert scenario.sites["s"].q0_rad == (-0.6, 1.2)
+        assert scenario.sites["m2"] == paper.sites["m2"]
+        assert scenario.dominance["m1"] == paper.dominance["m1"]
+    assert plan.scenarios["near"].dominance["s"] == {"m1": 0.8, "m2": 0.2}
+    assert plan.scenarios["far"].dominance == paper.dominance
+    assert plan.scenarios["far"].sites["s"].qd0_rad_s == (0.1, 0.1)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7])

@@ -115,6 +115,7 @@ def test_people_choose_after_each_pair(tmp_path: Path) -> None:
     assert [key for _, key in people.steps if "choice" in key] == [
         f"questionnaire {number} choice" for number in (3, 5, 7)
     ]
+    assert not people.stage.shows_ages
     assert_values_are_those_of_the_rule(experiment)
 
 

@@ -348,7 +348,8 @@ def plan_experiment(
         source = folder / protocol.scenario
     for name, keys in protocol.conditions.items() if scenarios is None else ():
         try:
-            found[name] = _prepare(load_scenario(source, {**protocol.set, **keys}), protocol)
+            every = _list_keys(protocol.set) | _list_keys(keys)
+            found[name] = _prepare(load_scenario(source, every), protocol)
         except TrilatError as error:
             problems.append(f"condition {name}: {error}")
     if problems:
@@ -356,6 +357,16 @@ def plan_experiment(
     texts = {name: scenario.text for name, scenario in found.items()}
     whole = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
     return ExperimentPlan(protocol, found, list(_list_trials(protocol)), hashlib.sha256(whole).hexdigest())
+
+
+def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Returns keys of a scenario, each written out that is of a site, a link or a row of dominance."""
+    found = dict[str, Any]()
+    for name, value in table.items():
+        key = f"{path}.{name}" if path else name
+        inside = key in ("sites", "links", "dominance") or path in ("sites", "links")
+        found |= _list_keys(value, key) if inside and isinstance(value, Mapping) else {key: value}
+    return found
 
 
 def _find_problems(protocol: Protocol) -> Iterator[str]:
@@ -403,7 +414,7 @@ def _find_staircase_problems(protocol: Protocol, stairs: Staircase) -> Iterator[
         yield "staircase: is of one user, who answers"
     if protocol.trials % 2:
         yield f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
-    if setting := [name for name, keys in protocol.conditions.items() if stairs.key in keys]:
+    if setting := [name for name, keys in protocol.conditions.items() if stairs.key in _list_keys(keys)]:
         yield f"staircase.key: {stairs.key} is set by condition {', '.join(setting)} too"
 
 
