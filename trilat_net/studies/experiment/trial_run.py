@@ -124,6 +124,7 @@ class ExperimentTrial:
         self.scenario = replace(
             scenario, duration_s=lasts_s, seed=planned.seed, about=about, sites={**scenario.sites, **sites}
         )
+        self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _share_out(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which users have the authority over the slave that the trial gives them."""
@@ -150,7 +151,7 @@ class ExperimentTrial:
         return force_n
 
     def _place(self, q: Array) -> EndEffectorRows:
-        return build_arm_rows(self.scenario, self.slave).place_end_effector(q, 0.0 * q)
+        return self._rows.place_end_effector(q, 0.0 * q)
 
     def make_goal(self) -> TrialGoal:
         """Returns what is asked."""
