@@ -238,9 +238,7 @@ def analyse_ports(
         transparency=tuple(
             one for site in sites if site != of for one in measure_transparency(loop, site, of)
         ),
-        clamped_verdict=compute_delay_spectrum(
-            port_response.apply_loads(loop, {of: port_response.CLAMPED}), 1
-        ).verdict,
+        clamped_verdict=compute_delay_spectrum(port_response.clamp_site(loop, of), 1).verdict,
         axes=name_ports(conditions),
         measured=check_against_hands(Y, w_rad_s, *_place_hands(scenario, conditions, rest, loop, hands)),
     )
