@@ -282,20 +282,17 @@ class Transparency(NamedTuple):
         return float(np.exp(np.trapezoid(logs, x) / (x[-1] - x[0])))
 
 
-def measure_transparency(
-    loop: LinearLoop, at: str, of: str, band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ
-) -> tuple[Transparency, ...]:
+def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
     """Returns the transparency along each joint of site `at`, with site `of` free and clamped.
 
     Z(j w) = 1 / Y_ii(j w) with Y of the loop; the rest is free.
 
     Raises:
-        UsageError: no such site, both are one, or the band is empty.
+        UsageError: no such site, or both are one.
     """
-    check_band(band_hz)
-    low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
+    low, high = _SHOWN_HZ
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
-    w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
+    w_rad_s = 2.0 * np.pi * np.union1d(points, TRANSPARENCY_BAND_HZ)
     places = find_site_ports(loop, at)
     if at == of:
         raise UsageError(f"a load at {at} would be at the operator's own site")
@@ -305,14 +302,6 @@ def measure_transparency(
     )
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
-        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)
+        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n])
         for n, joint in enumerate(joints)
     )
-
-
-def check_band(band_hz: tuple[float, float]) -> None:
-    """Raises UsageError unless a band goes from a positive frequency to a higher one."""
-    if not 0.0 < band_hz[0] < band_hz[1]:
-        raise UsageError(
-            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
-        )
