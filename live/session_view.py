@@ -13,13 +13,7 @@ import msgspec
 
 from recorder.backfill import GapRepair
 from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
-from trilat_net.analysis.certificate.running_energy import (
-    KEPT_S,
-    EnergyCourse,
-    RecordWindow,
-    RunningEnergy,
-    make_windows,
-)
+from trilat_net.analysis.certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
 from trilat_net.core.live_hand import TAKEN
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
@@ -43,6 +37,8 @@ LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
 GONE_NS = 2 * NS_PER_S
 """A site that is silent for so long is shown as gone."""
+ENDED_NS = 15 * NS_PER_S
+"""A session all of whose sites are silent for so long has ended."""
 EVENTS_KEPT = 400
 
 T = TypeVar("T")
@@ -146,16 +142,12 @@ class SessionView:
     @property
     def ended(self) -> bool:
         """True once every site has said that it ends, or is silent for long."""
-        now_ns = self._clock.monotonic_ns()
-        return self.running and all(
-            site.reception.made is not None or now_ns - (site.reception.heard_ns or now_ns) > 15 * NS_PER_S
-            for site in self.sites.values()
-        )
+        return self.running and all(self.silent(site, ENDED_NS) for site in self.sites.values())
 
-    def silent(self, site: SiteView) -> bool:
-        """True if a site has ended, or was not heard for long."""
+    def silent(self, site: SiteView, for_ns: int = GONE_NS) -> bool:
+        """True if a site has ended, or was not heard for so long, ns."""
         heard_ns = site.reception.heard_ns
-        lately = heard_ns is None or self._clock.monotonic_ns() - heard_ns < GONE_NS
+        lately = heard_ns is None or self._clock.monotonic_ns() - heard_ns < for_ns
         return site.reception.made is not None or not lately
 
     def poll(self) -> None:
@@ -206,7 +198,7 @@ class SessionView:
             self._begin(self.scenario, boots)
 
     def _begin(self, scenario: Scenario, boots: dict[str, int]) -> None:
-        windows = make_windows(scenario, scenario.names)
+        windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links, self._planned = initial_link_tables(scenario), scheduled_link_tables(scenario)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)

@@ -7,21 +7,20 @@ time are skipped. If its class fails, it lets go and ends; if it is killed, the 
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from trilat_net.core.own_hand import HandProgram, HandView
 from trilat_net.core.user_law import PeerView
-from trilat_net.errors import RunFailed, SessionError, UsageError, WireError
+from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.net.arm_client import SiteClient, make_hand_sender
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, open_bus
+from trilat_net.net.membership import read_messages
 from trilat_net.net.requests import HandMessage, HandViewMessage
-from trilat_net.net.wire import decode
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, find_site
 from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
@@ -57,9 +56,7 @@ class HandProcess(SiteClient):
             RunFailed: its class failed; it has let go.
         """
         views = self._waiting
-        while (message := self._views.poll()) is not None:
-            with suppress(WireError):
-                views.append(decode(message[1], HandViewMessage))
+        views.extend(read_messages(self._views, HandViewMessage))
         while len(views) > self._most:
             self.skipped += 1
             views.popleft()

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilat_net.theory.linear_loop import DelayedTerm, LinearLoop
+from trilat_net.theory.port_response import find_site_ports
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -66,6 +67,16 @@ class Network(NamedTuple):
             Z[:, wire.at, wire.of] -= link * late
             reflected[:, wire.at, wire.of] += wire.k_f * late
         return np.asarray(np.linalg.solve(reflected, Z), dtype=np.complex128)
+
+
+def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> LinearLoop:
+    """The loop with a spring, N m/rad, and a damper, N m s/rad, to a fixed point at each joint of a site."""
+    ports = find_site_ports(loop, site)
+    back = np.zeros((len(loop.inputs), len(loop.names)))
+    back[ports] = B * loop.C[ports]
+    back[ports, [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]] += K
+    delayed = tuple(term._replace(A=term.A - term.B @ back) for term in loop.delayed)
+    return loop._replace(A=loop.A - loop.B @ back, delayed=delayed)
 
 
 def pair(

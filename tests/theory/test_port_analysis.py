@@ -118,8 +118,9 @@ def test_what_cannot_be_asked_is_refused() -> None:
     rest = find_equilibrium(scenario, POSE)
     with pytest.raises(UsageError, match="no site 'x' at the ports; there are m, s"):
         analyse_ports(scenario, rest, "x")
-    with pytest.raises(UsageError, match="to a higher one"):
-        analyse_ports(scenario, rest, band_hz=(1.0, 1.0))
+    for band_hz in ((1.0, 1.0), (1.0, 0.1), (0.0, 0.1)):
+        with pytest.raises(UsageError, match="to a higher one"):
+            analyse_ports(scenario, rest, band_hz=band_hz)
     measured = load_scenario("p_d_margin_two", {"link": {"model": "measured"}})
     with pytest.raises(ScenarioError, match="is not known beforehand"):
         analyse_ports(measured, rest)

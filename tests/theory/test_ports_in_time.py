@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.theory.networks import Array, Complex
+from tests.theory.networks import Array, Complex, hold_by_spring
 from tests.virtual_runs import trajectories
 from trilat_net.scenario import load_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.operating_point import derive_operating_conditions
 from trilat_net.theory.port_analysis import linearise_teleoperator
-from trilat_net.theory.port_response import PortLoad, apply_loads, build_admittance
+from trilat_net.theory.port_response import build_admittance
 
 POSE = (-0.6, 1.8)
 AMPLITUDE_NM = 0.02
@@ -68,6 +68,6 @@ def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
     }
     scenario = load_scenario("two_sites", {**overrides, "sites.m.hands": [], "sites.s.hands": []})
     bare = linearise_teleoperator(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
-    Y = build_admittance(apply_loads(bare, {"m": PortLoad(20.0, 3.0)}))(np.array([2.0 * np.pi * hz]))[0]
+    Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
     found = answered("two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0)
     assert (np.abs(found - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()

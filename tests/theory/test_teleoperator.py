@@ -4,6 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.theory.networks import hold_by_spring
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
@@ -17,10 +18,8 @@ from trilat_net.theory.port_analysis import (
 )
 from trilat_net.theory.port_passivity import Passivity, check_passivity
 from trilat_net.theory.port_response import (
-    CLAMPED,
-    PortLoad,
-    apply_loads,
     build_admittance,
+    clamp_site,
     evaluate_transfer,
     find_longest_delay_s,
     find_site_ports,
@@ -64,7 +63,7 @@ def test_hands_back_at_their_ports_make_loop_that_had_them() -> None:
     rest = find_equilibrium(scenario)
     bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
     again, whole = (
-        apply_loads(bare, {"m1": PortLoad(20.0, 3.0), "s": PortLoad(0.0, 0.7)}),
+        hold_by_spring(hold_by_spring(bare, "m1", 20.0, 3.0), "s", 0.0, 0.7),
         linearise_loop(derive_operating_conditions(scenario), rest),
     )
     np.testing.assert_allclose(again.A, whole.A, rtol=1e-9, atol=1e-9)
@@ -79,9 +78,8 @@ def test_force_that_law_reflects_is_reflected_of_load_as_well() -> None:
         "contact", {"sites.m.hands": [], "sites.s.environment": [], "sites.s.hands": [hand]}
     )
     rest = find_equilibrium(scenario, POSE)
-    again = apply_loads(
-        linearise_teleoperator(derive_operating_conditions(scenario), rest), {"s": PortLoad(50.0, 4.0)}
-    )
+    bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
+    again = hold_by_spring(bare, "s", 50.0, 4.0)
     whole = linearise_loop(derive_operating_conditions(scenario), rest)
     for a, b in zip(again.delayed, whole.delayed, strict=True):
         np.testing.assert_allclose(a.A, b.A, rtol=1e-9, atol=1e-9)
@@ -168,7 +166,7 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
 def test_against_a_clamped_site_the_learnt_gravity_winds_up() -> None:
     """Impedance as 1 / w^2 towards zero, its phase that of a negative damper."""
     _, _, _, loop = at_pose("two_sites", ALONE["two_sites"])
-    held = apply_loads(loop, {"s": CLAMPED})
+    held = clamp_site(loop, "s")
     assert {parse_port_site(name) for name in held.inputs} == {"m"}
     Z = 1.0 / build_admittance(held)(np.array([1e-3, 2e-3]))[:, 0, 0]
     assert abs(Z[0] / Z[1]) == pytest.approx(4.0, rel=1e-2)

@@ -27,7 +27,7 @@ def compose_linear(found: LinearAnalysis) -> Iterator[Block]:
     yield describe_zero_roots(found)
     verdict, _, rest = describe_linear_verdict(found).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
-    yield describe_delay_margin(found)
+    yield f"delay margin, continuous loop, one delay on all links: {found.margin.words}"
     yield from (f"note: {note}" for note in found.notes)
     if found.ports is not None:
         yield from describe_ports(found.ports)
@@ -124,11 +124,6 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     which = "" if analysis.sampled is None else f", as computed{computed.removeprefix(',')}"
     slowest = f"{keeps}, and the slowest of the others" if drifting else "the slowest motion"
     return f"{analysis.verdict}: {slowest} goes as {rate}{at}{which}"
-
-
-def describe_delay_margin(analysis: LinearAnalysis) -> str:
-    """Returns the common delays for which the continuous loop is stable, in words."""
-    return f"delay margin, continuous loop, one delay on all links: {analysis.margin.words}"
 
 
 _SHOWN_BANDS = 3

@@ -8,6 +8,7 @@ import base64
 import io
 import json
 import re
+import tomllib
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -39,34 +40,8 @@ from .style import typeset
 _PAGE_DPI = 110
 _ASSETS = resources.files("trilat_net.reporting") / "assets"
 
-_SECTIONS = {
-    "torques": ("Operator torques", "The torque of the operators on the arms; Fig. 3 of the paper."),
-    "positions": ("Positions", "Actual and desired joint angles; Fig. 4 of the paper."),
-    "errors": ("Tracking errors", "e = q − q_des, Eq. (9); Fig. 5 of the paper."),
-    "estimates": (
-        "Parameter estimates",
-        "Dashed: the true value, Eq. (24). Fig. 6 of the paper shows one site.",
-    ),
-    "moved": ("Motion due to the operators", "The log minus the same run without operators."),
-    "control": ("Control torques", "τ of Eq. (13), the controllers' command to the joints."),
-    "ages": (
-        "Age of the samples in use",
-        "Now minus the stamp of the sample in use: the effective delay. Dashed: the stated mean delay.",
-    ),
-    "delays": (
-        "Distributions of delay and age",
-        "The percentage of samples with at most that delay, and of ticks with at most that age.",
-    ),
-    "timing": ("The loops", "How late each loop woke up, and how long its ticks took."),
-}
-_EFFECTIVE = (
-    "Effective is the delay that the controller saw: the age of the sample in use, over all ticks. Jitter "
-    "makes it shorter than stated where the newest sample wins, and longer where samples stay in order."
-)
-_SAMPLES = (
-    "Delivery of the samples. Superseded: never used, because a newer one came into use before or with it."
-)
-_CLOCKS = "The sender's clock against the receiver's, as estimated while the session ran."
+_WORDS: dict[str, dict[str, Any]] = tomllib.loads((_ASSETS / "report.toml").read_text(encoding="utf-8"))
+"""Headings and notes of the page."""
 _CODE = re.compile(r"`([^`]+)`")
 _MOST_MODES = 200
 """Intervals of a site that are listed."""
@@ -74,10 +49,6 @@ _MOST_ALARMS = 8
 """Alarms that are shown in large."""
 _WORST = ("FAULT", "STOPPED")
 _PREMISE_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
-_CERTIFICATE_NOTE = (
-    "V of the theorem, with the weights that the shares ask for, and its energy balance: what is left of "
-    "V − V(0) + dissipation − work must vanish, whatever the operators do."
-)
 
 
 def write_report(
@@ -174,11 +145,11 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
     chains = any(arm.chain for arm in log.scenario.arms.values())
     absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
     html, missing = "", []
-    for key, (heading, sentence) in _SECTIONS.items():
+    for key, (heading, sentence) in _WORDS["charts"].items():
         if key in filled:
             kind = "charts small" if key == "estimates" and chains else "charts"
             if chains and key == "estimates":
-                sentence = "Of every link, about the frame of its joint. Dashed: the true value."
+                sentence = _WORDS["notes"]["chain_estimates"]
             body = f'<p class="note">{escape(sentence)}</p><div class="{kind}" data-section="{key}"></div>'
             html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
         elif absent.get(key):
@@ -188,16 +159,16 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
 
 
 def _links(log: Log, facts: JsonObject) -> str:
-    parts = [
-        (_render_link_ages(log, facts), _EFFECTIVE),
-        (_render_link_samples(log, facts), _SAMPLES),
-        (_render_clocks(log, facts), _CLOCKS),
-        (_render_changes(facts), "Changes during the run; charts show their numbers."),
-        (_render_modes(log, facts), "Reactions of sites to stale peers; charts are shaded then."),
-    ]
+    tables = {
+        "ages": _render_link_ages(log, facts),
+        "samples": _render_link_samples(log, facts),
+        "clocks": _render_clocks(log, facts),
+        "changes": _render_changes(facts),
+        "modes": _render_modes(log, facts),
+    }
     return "".join(
-        f'<p class="note">{escape(sentence)}</p><div class="scroll">{table}</div>'
-        for table, sentence in parts
+        f'<p class="note">{escape(_WORDS["notes"][name])}</p><div class="scroll">{table}</div>'
+        for name, table in tables.items()
         if table
     )
 
@@ -394,7 +365,7 @@ def _render_certificate(certificate: Certificate) -> str:
         return html
     rows = [(escape(name), f"{value:.4g}") for name, value in list_energies(certificate.balance)]
     table = f'<div class="scroll">{_render_table(("energy", "J"), rows)}</div>'
-    return f'{html}{table}<p class="note">{escape(_CERTIFICATE_NOTE)}</p>'
+    return f'{html}{table}<p class="note">{escape(_WORDS["notes"]["certificate"])}</p>'
 
 
 def _render_assumptions(scenario: Scenario) -> str:

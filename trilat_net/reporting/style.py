@@ -12,6 +12,7 @@ import io
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,36 +54,12 @@ _LEAST_RANGE = 1e-9
 BUCKETS_PER_PANEL = 700
 """Per panel: half a page is 700 pixels wide."""
 
+_STYLE_SHEET = resources.files("trilat_net.reporting") / "assets" / "figures.mplstyle"
 _RC: Any = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture everywhere
-    "font.size": 8.0,
-    "axes.labelsize": 8.0,
-    "axes.titlesize": 8.0,
-    "axes.titlepad": 4.0,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.use_mathtext": True,
-    "axes.formatter.useoffset": False,  # an axis says what it shows, not what it shows less one
-    "grid.color": "#dddddd",
-    "grid.linewidth": 0.5,
-    "lines.linewidth": 1.1,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "legend.handlelength": 2.2,
-    "legend.columnspacing": 1.6,
-    "figure.constrained_layout.h_pad": 0.03,
-    "figure.constrained_layout.w_pad": 0.03,
+    **mpl.rc_params_from_file(str(_STYLE_SHEET), use_default_template=False),
     "figure.dpi": REPORT_DPI,
     "savefig.dpi": REPORT_DPI,
-    "path.simplify": True,
 }
-
 _NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "legend.borderaxespad": 0.2}
 
 

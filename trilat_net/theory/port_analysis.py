@@ -44,7 +44,7 @@ from .port_passivity import (
     llewellyn_parameter,
     llewellyn_rounding,
 )
-from .port_response import QUOTED_AT_HZ, Transparency, check_band, measure_transparency
+from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
 from .site_dynamics import follow_peers, lay_out_arguments, place_arm
 from .textbook_arm import PLACE_COORDINATES
 
@@ -204,7 +204,7 @@ def analyse_ports(
         ScenarioError: the scenario has no linear loop.
         UsageError: no site of that name, or an empty band.
     """
-    check_band(band_hz)
+    _check_band(*band_hz)
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
     of = of or scenario.slave
@@ -238,12 +238,15 @@ def analyse_ports(
         transparency=tuple(
             one for site in sites if site != of for one in measure_transparency(loop, site, of)
         ),
-        clamped_verdict=compute_delay_spectrum(
-            port_response.apply_loads(loop, {of: port_response.CLAMPED}), 1
-        ).verdict,
+        clamped_verdict=compute_delay_spectrum(port_response.clamp_site(loop, of), 1).verdict,
         axes=name_ports(conditions),
         measured=check_against_hands(Y, w_rad_s, *_place_hands(scenario, conditions, rest, loop, hands)),
     )
+
+
+def _check_band(low: float, high: float) -> None:
+    if not 0.0 < low < high:
+        raise UsageError(f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz")
 
 
 def _place_hands(

@@ -1,8 +1,8 @@
-"""Frequency response of the loop at its haptic ports, free or with springs, dampers and clamps as loads.
+"""Frequency response of the loop at its haptic ports, free or with a site clamped.
 
 Invariant: torque is ON the joint, so that torque times velocity is the power that the operator puts in. A
-load's torque counts as any torque on the joint: a law that reflects force reflects it too, also that of a
-clamp. Frequencies inside are rad/s; those for people are Hz and carry it in their names.
+clamp's torque counts as any torque on the joint: a law that reflects force reflects it too. Frequencies
+inside are rad/s; those for people are Hz and carry it in their names.
 
 Source: impedance and admittance of ports after Hogan, "Impedance control: an approach to manipulation", ASME
 J. Dynamic Systems, Measurement, and Control 107 (1985); teleoperators as networks of them after Hannaford, "A
@@ -17,7 +17,7 @@ for teleoperation control architectures", ICRA (2000); the ratio is our own meas
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -172,55 +172,17 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     return PoleAtZero(max(powers, default=0), residue)
 
 
-class PortLoad(NamedTuple):
-    """A spring and a damper to a fixed point, at each joint of a site.
-
-    Attributes:
-        K_nm_rad: stiffness, N m/rad; infinite: a clamp.
-        B_nm_s_rad: damping, N m s/rad.
-    """
-
-    K_nm_rad: float = 0.0
-    B_nm_s_rad: float = 0.0
-
-
-FREE = PortLoad()
-CLAMPED = PortLoad(math.inf)
-
-
-def apply_loads(loop: LinearLoop, loads: Mapping[str, PortLoad]) -> LinearLoop:
-    """Returns the loop with loads at some of its sites; clamped sites lose their ports and angles.
+def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
+    """Returns the loop with a site held still: the site loses its ports, velocities and angles.
 
     Raises:
-        UsageError: no such site, a negative stiffness or damping, or several clamps that reflect each other.
+        UsageError: no such site, or its clamp and an earlier one reflect force onto each other.
     """
-    for site, load in loads.items():
-        find_site_ports(loop, site)
-        if not (load.K_nm_rad >= 0.0 and 0.0 <= load.B_nm_s_rad < math.inf):
-            raise UsageError(f"a load needs stiffness and damping of at least 0, not {load}")
-    for site, load in loads.items():
-        loop = _clamp(loop, site) if math.isinf(load.K_nm_rad) else _add_spring(loop, site, load)
-    return loop
-
-
-def _find_angles(loop: LinearLoop, ports: list[int]) -> list[int]:
-    return [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]
-
-
-def _add_spring(loop: LinearLoop, site: str, load: PortLoad) -> LinearLoop:
-    ports = find_site_ports(loop, site)
-    back = np.zeros((len(loop.inputs), len(loop.names)))
-    back[ports] = load.B_nm_s_rad * loop.C[ports]
-    back[ports, _find_angles(loop, ports)] += load.K_nm_rad
-    delayed = tuple(term._replace(A=term.A - term.B @ back) for term in loop.delayed)
-    return loop._replace(A=loop.A - loop.B @ back, delayed=delayed)
-
-
-def _clamp(loop: LinearLoop, site: str) -> LinearLoop:
     ports = find_site_ports(loop, site)
     others = [n for n in range(len(loop.inputs)) if n not in ports]
     speeds = [loop.names.index(loop.outputs[port]) for port in ports]
-    removed = {*speeds, *_find_angles(loop, ports)}
+    angles = [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]
+    removed = {*speeds, *angles}
     kept = [n for n in range(len(loop.names)) if n not in removed]
     terms = [DelayedTerm(0.0, loop.A, loop.B), *loop.delayed]
     if any(term.B[np.ix_(speeds, ports)].any() for term in loop.delayed):
@@ -320,44 +282,26 @@ class Transparency(NamedTuple):
         return float(np.exp(np.trapezoid(logs, x) / (x[-1] - x[0])))
 
 
-def measure_transparency(
-    loop: LinearLoop,
-    at: str,
-    of: str,
-    others: Mapping[str, PortLoad] | None = None,
-    band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ,
-) -> tuple[Transparency, ...]:
+def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
     """Returns the transparency along each joint of site `at`, with site `of` free and clamped.
 
-    Z(j w) = 1 / Y_ii(j w) with Y of the loop with loads at `others`; the rest is free.
+    Z(j w) = 1 / Y_ii(j w) with Y of the loop; the rest is free.
 
     Raises:
-        UsageError: no such site, both are one, or the band is empty.
+        UsageError: no such site, or both are one.
     """
-    check_band(band_hz)
-    low, high = min(band_hz[0], _SHOWN_HZ[0]), max(band_hz[1], _SHOWN_HZ[1])
+    low, high = _SHOWN_HZ
     points = np.geomspace(low, high, 1 + round(_PER_DECADE * np.log10(high / low)))
-    w_rad_s = 2.0 * np.pi * np.union1d(points, band_hz)
+    w_rad_s = 2.0 * np.pi * np.union1d(points, TRANSPARENCY_BAND_HZ)
     places = find_site_ports(loop, at)
-    if at == of or at in (others or {}):
+    if at == of:
         raise UsageError(f"a load at {at} would be at the operator's own site")
-
-    def admittance(load: PortLoad) -> Complex:
-        """Returns the admittance at the operator's site with a load at the other one."""
-        loaded = apply_loads(loop, {**(others or {}), of: load})
-        return select_ports(build_admittance(loaded), find_site_ports(loaded, at))(w_rad_s)
-
-    free, clamped = admittance(FREE), admittance(CLAMPED)
+    free, clamped = (
+        select_ports(build_admittance(one), find_site_ports(one, at))(w_rad_s)
+        for one in (loop, clamp_site(loop, of))
+    )
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
-        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n], band_hz)
+        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n])
         for n, joint in enumerate(joints)
     )
-
-
-def check_band(band_hz: tuple[float, float]) -> None:
-    """Raises UsageError unless a band goes from a positive frequency to a higher one."""
-    if not 0.0 < band_hz[0] < band_hz[1]:
-        raise UsageError(
-            f"a band goes from a frequency to a higher one, not from {band_hz[0]:g} to {band_hz[1]:g} Hz"
-        )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.running_energy import EnergyCourse, RunningEnergy, make_windows
+from trilat_net.analysis.certificate.running_energy import EnergyCourse, RecordWindow, RunningEnergy
 from trilat_net.log.log_reader import Log
 
 BLOCK = 60
@@ -12,7 +12,7 @@ BLOCK = 60
 
 def courses(log: Log, *, late: int = 0, without: frozenset[int] = frozenset()) -> list[EnergyCourse]:
     """V of a log whose records come block by block, at its last site later; that lacks some."""
-    windows = make_windows(log.scenario, log.sites, kept_s=4.0)
+    windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
     found = []
     blocks = max(len(log[site]) for site in log.sites) // BLOCK + late + 1
@@ -59,7 +59,7 @@ def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
 
 def test_v_begins_late_in_a_session_joined_late() -> None:
     log, whole = runs.run("rich").log, runs.run("rich").balance
-    windows = make_windows(log.scenario, log.sites, kept_s=4.0)
+    windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running, found = RunningEnergy(log.scenario, windows), []
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
@@ -75,6 +75,7 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
 
 def test_a_law_without_such_a_v_says_so() -> None:
     log = runs.run("jitter", {"duration_s": 0.3}).log
-    running = RunningEnergy(log.scenario, make_windows(log.scenario, log.sites))
+    windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
+    running = RunningEnergy(log.scenario, windows)
     assert "p_d" in running.reason or "law" in running.reason
     assert running.advance(dict.fromkeys(log.sites, 100)) is None

@@ -39,11 +39,11 @@ from trilat_net.studies.bench.bench_results import (
     BenchPlace,
     BenchRun,
     build_bench_page,
-    encode_places,
     encode_runs,
 )
 from trilat_net.studies.bench.bench_run import BenchRunItem, find_least_energy, run_bench_task
 from trilat_net.studies.measure_run import RecordBatch
+from trilat_net.studies.study_folder import encode_csv
 from trilat_net.studies.tuning import plan_tuning
 from trilat_net.studies.tuning.candidate import CandidateClass, load_tuning_scenario, measure_candidate
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
@@ -57,7 +57,7 @@ def asked(**more: Any) -> BenchPlan:
 
 
 def files(results: BenchResults) -> list[str]:
-    return [build_bench_page(results, "trilat bench"), encode_places(results), encode_runs(results)]
+    return [build_bench_page(results, "trilat bench"), encode_csv(results.to_rows()), encode_runs(results)]
 
 
 @pytest.fixture(scope="module")

@@ -129,11 +129,6 @@ class RecordWindow:
         )
 
 
-def make_windows(scenario: Scenario, sites: Iterable[str], kept_s: float = KEPT_S) -> dict[str, RecordWindow]:
-    """Returns an empty window for each of some sites."""
-    return {site: RecordWindow(scenario, site, kept_s) for site in sites}
-
-
 class EnergyCourse(NamedTuple):
     """V over some instants.
 

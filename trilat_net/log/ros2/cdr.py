@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
+from importlib import resources
 from typing import Any, NamedTuple
 
 from ...core.ticks import NS_PER_S
@@ -21,49 +22,13 @@ LOG = "rcl_interfaces/msg/Log"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
-_TIME = "int32 sec\nuint32 nanosec\n"
 _LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
 
-
-def _schema(text: str, parts: dict[str, str] = {}) -> bytes:  # noqa: B006
-    rule = "=" * 80
-    return "".join([text, *(f"{rule}\nMSG: {name}\n{part}" for name, part in parts.items())]).encode()
-
-
-ROS2_SCHEMAS: dict[str, bytes] = {
-    JOINT_STATE: _schema(
-        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
-        {
-            "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-            "builtin_interfaces/Time": _TIME,
-        },
-    ),
-    FLOAT64_ARRAY: _schema(
-        "std_msgs/MultiArrayLayout layout\nfloat64[] data\n",
-        {
-            "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
-            "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
-        },
-    ),
-    STRING: _schema("string data\n"),
-    TRANSFORMS: _schema(
-        "geometry_msgs/TransformStamped[] transforms\n",
-        {
-            "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
-            "geometry_msgs/Transform transform\n",
-            "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
-            "builtin_interfaces/Time": _TIME,
-            "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\n"
-            "geometry_msgs/Quaternion rotation\n",
-            "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
-            "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-        },
-    ),
-    LOG: _schema(
-        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
-        "string function\nuint32 line\n",
-        {"builtin_interfaces/Time": _TIME},
-    ),
+DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
+"""Texts of ROS: types with the types of their fields, the quality of service of a bag, the planar arm."""
+ROS2_SCHEMAS = {
+    name: (DEFINITIONS / f"{name.rpartition('/')[2]}.msg").read_bytes()
+    for name in (JOINT_STATE, FLOAT64_ARRAY, STRING, TRANSFORMS, LOG)
 }
 """Complete definitions of the types that are packed here, by name."""
 

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 from ...scenario import Scenario
 from ...scenario.arms import read_arm
-from .cdr import TransformPacker
+from .cdr import DEFINITIONS, TransformPacker
 
 WORLD = "world"
 SPACING_M = 1.5
@@ -77,13 +77,7 @@ def _upright(down: Sequence[float]) -> Quaternion:
     return -y / length, x / length, 0.0, (1.0 - z) / length
 
 
-_PLANAR = """<robot name="planar">
-<link name="base"/><link name="link1"/><link name="link2"/><link name="tip"/>
-<joint name="q1" type="continuous"><parent link="base"/><child link="link1"/><axis xyz="0 0 1"/></joint>
-<joint name="q2" type="continuous"><parent link="link1"/><child link="link2"/><axis xyz="0 0 1"/>
-<origin xyz="{l1_m} 0 0"/></joint>
-<joint name="end" type="fixed"><parent link="link2"/><child link="tip"/><origin xyz="{l2_m} 0 0"/></joint>
-</robot>"""
+_PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
 """The planar arm as a chain."""
 
 

@@ -21,17 +21,7 @@ from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
 """Metadata of the file: its session."""
-_QOS = """\
-- history: 1
-  depth: 10
-  reliability: 1
-  durability: 2
-  deadline: {sec: 9223372036, nsec: 854775807}
-  lifespan: {sec: 9223372036, nsec: 854775807}
-  liveliness: 1
-  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
-  avoid_ros_namespace_conventions: false
-"""
+_QOS = (cdr.DEFINITIONS / "qos.yaml").read_text(encoding="utf-8")
 """Reliable, volatile, the last ten: the default of publishers in ROS 2."""
 _TF = "/tf"
 """The frames of all sites, where tools look for them."""

@@ -18,7 +18,8 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import make_print_size
 from ..intervals import MeanInterval
-from .bench_results import BenchPlace, BenchResults, build_bench_page, encode_places, encode_runs, name_law
+from ..study_folder import encode_csv
+from .bench_results import BenchPlace, BenchResults, build_bench_page, encode_runs, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
@@ -99,7 +100,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     """Writes the page, the tables and the figures of a suite, and returns their paths."""
     texts = {
         "bench.md": build_bench_page(results, command),
-        "places.csv": encode_places(results),
+        "places.csv": encode_csv(results.to_rows()),
         "runs.csv": encode_runs(results),
     }
     for name, text in texts.items():

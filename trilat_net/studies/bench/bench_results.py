@@ -392,11 +392,6 @@ def encode_runs(results: BenchResults) -> str:
     return encode_csv(rows, [*_PLACE, *BenchRun.__struct_fields__])
 
 
-def encode_places(results: BenchResults) -> str:
-    """Returns a row per cell as CSV: counts, the share of stable runs, and means with their intervals."""
-    return encode_csv(results.to_rows())
-
-
 _GONE = ("reflected", "reflected_half", "observed", "least_j")
 """Keys that had numbers once: no key is taken away (docs/json.md)."""
 _PLACE = ("task", "law", "link", "form")
