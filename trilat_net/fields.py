@@ -206,3 +206,35 @@ def check_finite(value: Any, path: str) -> None:
     if isinstance(value, list):
         for n, entry in enumerate(value):
             check_finite(entry, f"{path}[{n}]")
+
+
+UNITS = {
+    **{unit: unit for unit in ("rad", "m", "s", "ms", "kg")},
+    "n": "N",
+    "nm": "N m",
+    "j": "J",
+    "hz": "Hz",
+    "percent": "%",
+    "bits_s": "bit/s",
+    "rad_s": "rad/s",
+    "rad_s2": "rad/s^2",
+    "m_s": "m/s",
+    "m_s2": "m/s^2",
+    "kg_m2": "kg m^2",
+    "n_m": "N/m",
+    "n_s_m": "N s/m",
+    "nm_rad": "N m/rad",
+    "nm_s_rad": "N m s/rad",
+}
+"""Units by how they are written at the ends of names."""
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Returns a name in words without its unit, and that: of the longest ending that is one, "" without any.
+
+    >>> split_unit("contact_stiffness_n_m")
+    ('contact stiffness', 'N/m')
+    """
+    words = name.split("_")
+    endings = ((" ".join(words[:n]), UNITS.get("_".join(words[n:]), "")) for n in range(1, len(words)))
+    return next((found for found in endings if found[1]), (" ".join(words), ""))

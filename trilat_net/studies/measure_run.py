@@ -27,7 +27,7 @@ from ..execution import virtual
 from ..execution.fused import FusedRun
 from ..execution.virtual import simulate_scenario
 from ..execution.virtual_comparison import find_absent_samples
-from ..fields import field_names
+from ..fields import field_names, split_unit
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import find_task_errors
@@ -520,15 +520,7 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
         yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
 
 
-_UNITS = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N m", "_n": "N", "_ms": "ms", "_s": "s"}
-"""Per ending of a key its unit, for people."""
-
-
 _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
-
-
-def _find_unit(key: str) -> str:
-    return next((unit for ending, unit in _UNITS.items() if key.endswith(ending)), "")
 
 
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
@@ -543,7 +535,7 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    least, unit = "_min_" in key, _find_unit(key)
+    least, unit = "_min_" in key, split_unit(key)[1]
     wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(key, False, "never", wanted)
@@ -571,7 +563,7 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
         for key, limits in window.asked:
             site = f" {window.site}" if window.site else ""
             name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
-            yield _compare_with_range(name, ranges.get(key), limits, _find_unit(key))
+            yield _compare_with_range(name, ranges.get(key), limits, split_unit(key)[1])
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...core.vectors import Array
 from ...errors import UsageError
+from ...fields import split_unit
 from ...files import import_extra
 from ..intervals import mean_interval, wilson_interval
 
@@ -456,17 +457,6 @@ _WELCOME = (
     "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest", "unit", "alpha",
 )  # fmt: skip
 _OWN = {"confidence": 100 * CONFIDENCE, "resamples": RESAMPLES}
-_UNITS = {
-    "ms": "ms",
-    "s": "s",
-    "hz": "Hz",
-    "n": "N",
-    "nm": "N m",
-    "m": "m",
-    "rad": "rad",
-    "j": "J",
-    "percent": "%",
-}
 
 
 def write_methods(facts: Mapping[str, Any]) -> str:
@@ -494,7 +484,7 @@ def write_methods(facts: Mapping[str, Any]) -> str:
             )
     told = {key: _tell(value, key) for key, value in {**facts, **_OWN}.items()}
     told["conditions"] = "; ".join(f"{name} ({_tell(each)})" for name, each in facts["conditions"].items())
-    told["measures"] = ", ".join(" in ".join(filter(None, _split_unit(name))) for name in facts["measures"])
+    told["measures"] = ", ".join(" in ".join(filter(None, split_unit(name))) for name in facts["measures"])
     return "".join(text.format(told[key]) for key, text in _METHODS if told.get(key))
 
 
@@ -503,13 +493,8 @@ def _tell(value: Any, key: str = "") -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
-        return ", ".join(f"{_split_unit(name)[0]} {_tell(one, name)}" for name, one in value.items())
+        return ", ".join(f"{split_unit(name)[0]} {_tell(one, name)}" for name, one in value.items())
     if isinstance(value, Sequence):
         return ", ".join(_tell(one, key) for one in value)
     number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")
-    return f"{number} {_split_unit(key)[1]}".strip()
-
-
-def _split_unit(key: str) -> tuple[str, str]:
-    name, _, unit = key.rpartition("_")
-    return (name.replace("_", " "), _UNITS[unit]) if name and unit in _UNITS else (key.replace("_", " "), "")
+    return f"{number} {split_unit(key)[1]}".strip()

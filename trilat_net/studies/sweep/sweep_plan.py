@@ -18,7 +18,7 @@ import numpy as np
 
 from ...analysis.metrics.log_metrics import find_quantity
 from ...errors import ScenarioError, UsageError
-from ...fields import is_number, suggest_nearest
+from ...fields import is_number, split_unit, suggest_nearest
 from ...scenario import Scenario, apply_overrides
 from ...scenario.code_consent import allow_own_code
 from ...scenario.imported_code import name_law_classes
@@ -434,25 +434,6 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
     return scenario
 
 
-_UNITS = {
-    "_nm_s_rad": "N m s/rad",
-    "_nm_rad": "N m/rad",
-    "_n_s_m": "N s/m",
-    "_kg_m2": "kg m²",
-    "_n_m": "N/m",
-    "_m_s2": "m/s²",
-    "_rad_s": "rad/s",
-    "_rad": "rad",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_nm": "N m",
-    "_kg": "kg",
-    "_m": "m",
-    "_s": "s",
-}
-"""The longest that a key ends in counts."""
-
-
 _GAINS = {"K": "N m/rad", "d": "N m s/rad", "Kp": "N m s/rad", "Kd": "N m s/rad", "Lambda": "1/s"}
 
 
@@ -477,13 +458,11 @@ def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
     number = ""
     if last.isdigit() and folders:  # one of several joints or parameters
         *folders, last, number = *folders, f"[{last}]"
-    endings = [ending for ending in _UNITS if last.endswith(ending)]
-    ending = max(endings, key=len, default="")
-    unit = _GAINS.get(last) or _UNITS.get(ending, "")
-    word = last.removesuffix(ending)
-    if last not in _GAINS and (unit or len(word) > 3):
-        word = word.replace("_", " ")
-    return f"{word}{number}{_describe_owner(folders, scenario)}", unit
+    words, unit = split_unit(last)
+    if not unit and len(last) <= 3:  # a symbol
+        words = last
+    owner = _describe_owner(folders, scenario)
+    return f"{words}{number}{owner}", _GAINS.get(last) or unit.replace("^2", "²")
 
 
 def _describe_owner(folders: list[str], scenario: Scenario | None) -> str:
