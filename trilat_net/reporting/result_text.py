@@ -137,7 +137,7 @@ _COMPOSERS = {
     "Log": "summary_text:compose_log",
     "LogCheckReport": "summary_text:compose_verification",
     "LogCheckResult": "summary_text:compose_log_check",
-    "LogMetrics": "metrics_text:compose_metrics",
+    "LogMetrics": "summary_text:compose_metrics",
     "DoctorReport": "summary_text:compose_doctor",
     "FileOverview": "overview_tables:compose_overview",
     "NetworkBenchmark": "summary_text:compose_benchmark",

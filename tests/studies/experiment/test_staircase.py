@@ -35,6 +35,7 @@ def test_difference_falls_after_two_right_and_rises_after_wrong() -> None:
     # It turns at 40 (up), 80 (down), 20 (up) and 80 (down); the first two do not count.
     assert stairs.find_threshold(right) == pytest.approx(np.sqrt(20.0 * 80.0))
     assert stairs.find_threshold(right[:-1]) is None  # the odd one is left out with them
+    assert stairs.measure == "threshold_delay_ms"
 
 
 @pytest.mark.parametrize("down", [1, 2, 3])
@@ -93,7 +94,7 @@ def test_choices_and_threshold_are_in_the_tables(done: Experiment) -> None:
     assert (first["value"] == 1 + (second[1] == "comparison")) == bool(done.to_rows()[1]["right"])
     analysis, stairs = tn.analyse_experiment(done.folder), done.plan.protocol.staircase
     assert stairs is not None
-    found = {(row["participant"], row["condition"]): row["threshold"] for row in analysis.threshold_rows}
+    found = {(row["participant"], row["condition"]): row["threshold_K"] for row in analysis.threshold_rows}
     for who, block in itertools.groupby(done.to_rows(), lambda row: (row["participant"], row["condition"])):
         right = [bool(row["right"]) for row in list(block)[1::2]]
         assert found.get(who) == stairs.find_threshold(right)

@@ -363,7 +363,7 @@ def test_methods_paragraph_refuses_what_a_referee_would_ask(changed: dict[str, A
 
 def test_every_participant_is_drawn_under_every_condition() -> None:
     rows = [row for row in draw(9, 6, [0.0, 1.0, 2.0]) if row["participant"] != 4 or row["condition"] != "c1"]
-    figure = draw_conditions(rows, "time_s", label="time, s")
+    figure = draw_conditions(rows, "time_s")
     (axes,) = figure.axes
     shown = {(float(x), float(y)) for line in axes.lines for x, y in zip(*line.get_data(), strict=True)}
     for n, (name, each) in enumerate(average_trials(rows, "time_s").items()):

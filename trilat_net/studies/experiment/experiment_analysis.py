@@ -41,7 +41,7 @@ from .statistics import (
 MEASURES = (
     "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
     "force_mean_user1_n", "force_mean_user2_n", "wall_force_n", "error_force_n", "error_handover_mm",
-    "first_settled", "threshold", "succeeded",
+    "first_settled", "succeeded",
 )  # fmt: skip
 """What is compared, as far as trials have it, and differ in it."""
 FOLDER = "analysis"
@@ -82,8 +82,9 @@ class ExperimentAnalysis(Result):
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
         self.means: dict[str, list[ConditionMean]] = {}
         self.comparisons: dict[str, list[Comparison]] = {}
-        gains = [key for key in self.gain_rows[0] if key.startswith("gain")] if self.gain_rows else []
-        for measure in (*MEASURES, *forms, *gains):
+        once = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
+        own = [key for key in once if key.startswith(("gain_", "threshold_"))]
+        for measure in (*MEASURES, *forms, *own):
             rows = self.of(measure)
             if len({row.get(measure) for row in rows}) > 1:
                 self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
@@ -96,7 +97,7 @@ class ExperimentAnalysis(Result):
             return self.throughput_rows
         if measure.startswith("gain_"):
             return self.gain_rows
-        if measure == "threshold":
+        if measure.startswith("threshold_"):
             return self.threshold_rows
         return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
 
@@ -137,7 +138,7 @@ class ExperimentAnalysis(Result):
                 continue
             threshold = stairs.find_threshold(plan.judge_choices(trial, choices))
             if threshold is not None:
-                yield {self.unit: who, "condition": trial.condition, "threshold": threshold}
+                yield {self.unit: who, "condition": trial.condition, stairs.measure: threshold}
 
     def _write_methods(self) -> str:
         plan = self._experiment.plan
@@ -194,7 +195,8 @@ class ExperimentAnalysis(Result):
             draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)
             self.paths.append(path)
         if len({row["trial"] for row in self.learning_rows}) > 1:
-            learnt = self._experiment.plan.protocol.task.learnt
+            protocol = self._experiment.plan.protocol
+            learnt = "difference" if protocol.staircase else protocol.task.learnt
             self.paths.append(made / "learning.png")
             draw_learning(self.learning_rows, learnt, unit=self.unit).savefig(self.paths[-1], dpi=200)
         return self

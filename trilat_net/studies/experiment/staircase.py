@@ -45,6 +45,11 @@ class Staircase(Frozen, frozen=True):
     deviation: Positive | None = None
 
     @property
+    def measure(self) -> str:
+        """The name of its threshold, with the key's unit, as threshold_delay_ms of link.delay_ms."""
+        return "threshold_" + [part for part in self.key.split(".") if not part.isdigit()][-1]
+
+    @property
     def form(self) -> Questionnaire:
         """What is asked after each pair; the answer is 1 or 2."""
         items, ends = {CHOICE: self.asks}, ("the first", "the second")
