@@ -390,7 +390,7 @@ def _compose_group(
     cells = [
         [q.name, q.unit, *(_write_metric(places[name]) for name in names)] for q, places in could.items()
     ]
-    yield from _list_values([group, "", *names], cells, words=2)
+    yield from _tabulate([group, "", *names], cells, words=2)
     for quantity, places in could.items():
         for name in names:
             if places[name].value is None and places[name].applies:
@@ -409,7 +409,7 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
             when, which = f"{pair.from_s:.1f} - {pair.to_s:.1f} s", found.label(pair.joint)
             row = [when, which, pushed, _write_value(pair.pushed_nm)]
             rows.append([*row, pair.holds, _write_value(pair.felt_nm), _write_metric(pair.expected_nm), off])
-        yield from _list_values(heads, rows, words=1)
+        yield from _tabulate(heads, rows, words=1)
         for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
             if why:
                 yield _explain_missing("nothing is expected", why)
@@ -421,7 +421,7 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
             rows.append([*row, _write_value(one.torque_nm), _write_value(one.angle_rad), stiffness])
         nm, rad, ratio = (found.unit(unit, 1) for unit in ("N m", "rad", "N m/rad"))
         joint = "axis" if found.axes else "joint"
-        yield from _list_values(
+        yield from _tabulate(
             ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio), rows, words=1
         )
 
@@ -442,7 +442,7 @@ def _compose_impedance(found: LogMetrics) -> Iterator[Block]:
             numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
             error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
             rows.append([*head, *(_write_value(value or 0.0) for value in numbers), f"+- {error}"])
-    yield from _list_values(
+    yield from _tabulate(
         ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2
     )
 
@@ -455,7 +455,7 @@ def _write_value(value: float) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.4g}"
 
 
-def _list_values(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> Iterator[Block]:
+def _tabulate(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> Iterator[Block]:
     """Yields a table and an empty line; its first columns hold words, the others numbers."""
     align = "l" * words + "r" * (len(heads) - words - 1) + ("r" if heads[-1] else "l")
     yield TextTable(heads, list(rows), align)
