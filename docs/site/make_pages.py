@@ -80,6 +80,8 @@ def list_functions() -> str:
     for name in tn.__all__:
         if name != "__version__":
             made = getattr(tn, name)
+            if made.__name__ != name:
+                text += [f"## {name}", f"`tn.{name}` is another name of the following one."]
             text.append(f"::: {inspect.getmodule(made).__name__}.{made.__name__}")
     return "\n\n".join(text)
 
