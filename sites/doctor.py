@@ -269,12 +269,12 @@ class Rehearsal(LoopStats):
 
     def __init__(self, scenario: Scenario, name: str) -> None:
         self._stepped, self._ticks = Site(scenario.setup(name)), scenario.ticks(name)
-        super().__init__(self._stepped, 1, [scenario.sites[peer].rate_hz for peer in self._stepped.peers])
+        super().__init__(self._stepped, 1)
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
         """Makes its ticks in real time; returns how late each began, us."""
-        inbox = PeerInbox((), (), (), (), (), self.dropped, ())
+        inbox = PeerInbox((), (), (), (), self.dropped)
         timing = SiteTiming(clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), "")
         timed: Any = (clock, inbox, timing, self, StateBlock(self._stepped, 1, lambda _: None), self)
         run_loop(self._stepped, 1, self._ticks, *timed)

@@ -7,13 +7,14 @@ time. What is refused is counted by reason.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
 from trilat_net.core.site_arrays import SiteArrays
+from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError
 from trilat_net.net.bus import Inbox
@@ -50,23 +51,15 @@ def _read_messages(
 class HandServer:
     """The live hand of one site.
 
-    `angles` returns the joint angles at the tick that is about to be made, rad; `news` are ticks, and
-    sentences on who has taken hold and let go that no event names yet.
+    `news` are ticks, and sentences on who has taken hold and let go that no event names yet.
     """
 
     def __init__(
-        self,
-        site: str,
-        rate_hz: int,
-        hand: LiveHand,
-        arm: ArmModel,
-        inbox: Inbox,
-        dropped: Counter[str],
-        angles: Callable[[], Sequence[float]],
+        self, site: Site, hand: LiveHand, arm: ArmModel, inbox: Inbox, dropped: Counter[str]
     ) -> None:
-        self._site, self._hand, self._inbox, self._dropped = site, hand, inbox, dropped
-        self._rules = hand.rules(rate_hz, arm.counts)
-        self._place = angles if hand.mode == "joint" else lambda: arm.end_effector(angles())
+        self._site, self._hand, self._inbox, self._dropped = site.name, hand, inbox, dropped
+        self._rules = hand.rules(site.rate_hz, arm.counts)
+        self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)
         self._names: dict[int, str] = {}

@@ -88,8 +88,7 @@ class SiteParts:
         self.setup = scenario.setup(name)
         self.site, self.boot = Site(self.setup), new_boot()
         peers, session = self.site.peers, options.session
-        self.rates = [scenario.sites[peer].rate_hz for peer in peers]
-        self.stats = LoopStats(self.site, self.boot, self.rates)
+        self.stats = LoopStats(self.site, self.boot)
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
         self.rings = [
             bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
@@ -105,7 +104,7 @@ class SiteParts:
         self.hand: HandServer | HandPlayer | None = None
         self._meet_hand()
         queries = bus.questions(topics.key(session, name, topics.PAST))
-        self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
+        self.buffer = RetransmitBuffer(self.site, self.boot, queries)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
         single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
         send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
@@ -139,8 +138,7 @@ class SiteParts:
             publish = bus.publisher(topics.key(session, name, topics.VIEW))
             self.hand = RemoteHand(at, self.boot, inbox, publish, dropped, self.clock)
             return
-        meets = (self.scenario.arms[name], inbox, dropped, lambda: self.site.q)
-        self.hand = HandServer(name, self.site.rate_hz, live, *meets)
+        self.hand = HandServer(self.site, live, self.scenario.arms[name], inbox, dropped)
 
     def _meet_outside_arm(self) -> None:
         name, session, dropped = self.name, self.options.session, self.stats.dropped

@@ -179,19 +179,11 @@ class RunningSite:
             for peer, boot in zip(site.peers, boots, strict=True)
         ]
         site.begin_at(epoch.first)
-        parts.buffer.begin_at(epoch.first, site.rate_hz)
+        parts.buffer.begin_at(epoch.first)
         self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0])
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
-        self._inbox = PeerInbox(
-            site.peers,
-            parts.rings,
-            parts.rates,
-            boots,
-            self._timing.meters,
-            parts.stats.dropped,
-            parts.setup.links,
-            tick_ns(epoch.first, site.rate_hz),
-        )
+        heard = (parts.rings, boots, self._timing.meters, parts.stats.dropped)
+        self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
         publisher.update(
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
         )
