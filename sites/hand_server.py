@@ -151,9 +151,8 @@ class RemoteHand(HandPlayer):
 
     def _decide(self, k: int, message: HandMessage) -> None:
         asked = message.n * self.hand.every
-        is_here = (
-            message.n == 0 and not message.grip
-        )  # may come after the first question, and decides nothing
+        # that it is here may come after the first question, and decides nothing
+        is_here = message.n == 0 and not message.grip
         if self.failure or is_here or asked > self._asked:
             return
         self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))
