@@ -1,17 +1,23 @@
-"""What a page may ask for: its messages, checked, and how they reach the sites.
+"""What a page may ask for, by who looks at it: roles and their links, messages, and how they reach the sites.
 
 Invariant: a message is one of the types below with finite numbers in range and names of the session, and
 comes no oftener than its kind may, or it is counted and dropped. What a site takes in is for the site to
 decide. Of a link or a row only the newest order waits, however often it is changed, and one question to a
-site is open at a time, besides that to stop.
+site is open at a time, besides that to stop. A token gives a role and, to a user, a site; the rest of a link
+may lower the role and never raises it. Without tokens, on loopback, whoever comes is an experimenter, unless
+the link says less. Every role stops the arms.
 """
 
+import hmac
 import math
+import secrets
 from collections import Counter
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+from urllib.parse import parse_qs
 
 import msgspec
 from msgspec import Meta
@@ -27,6 +33,7 @@ from trilat_net.net.wire import decode, encode
 MAX_MESSAGE_BYTES = 4_096
 REPLY_TIMEOUT_NS = 3_000_000_000
 MOST_WAITING = 256
+TOKEN_BYTES = 16
 LEAST_RAMP_S = 0.25
 """The time in which shares change that somebody drags, s."""
 
@@ -174,6 +181,66 @@ def read_page_message(text: str | bytes) -> PageMessage:
     if not all(isinstance(number, str) or math.isfinite(number) for number in numbers):
         raise WireError("not finite", type(message).__name__)
     return message
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """What somebody may do, and which view of the arms is shown.
+
+    Attributes:
+        kind: an experimenter may do everything, a user holds the arm of one site, a watcher does nothing.
+        site: as which site the arms are shown; "": as they are, without delay.
+    """
+
+    kind: Literal["experimenter", "user", "watcher"] = "experimenter"
+    site: str = ""
+
+    def may(self, message: PageMessage) -> bool:
+        """True if a message is one that this role may send."""
+        if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
+            return True
+        own = isinstance(message, MoveHand) and message.site == self.site
+        return self.kind == "user" and (own or isinstance(message, StageMessage))
+
+    @property
+    def query(self) -> str:
+        """The query of this role's link."""
+        words = ["watch"] if self.kind == "watcher" else []
+        return "&".join([*words, f"as={self.site}"] if self.site else words)
+
+
+class RoleLinks:
+    """The links of a page that is served, a token for each role.
+
+    Args:
+        guarded: true: a link needs its token.
+    """
+
+    def __init__(self, *, guarded: bool) -> None:
+        self._secret = secrets.token_bytes(TOKEN_BYTES) if guarded else b""
+
+    def link(self, address: str, role: Role) -> str:
+        """Returns the link of a role; its token stands where a browser sends it to no server by itself."""
+        query = f"?{role.query}" if role.query else ""
+        return f"{address}{query}" + (f"#token={self._make_token(role)}" if self._secret else "")
+
+    def find(self, query: str) -> Role | None:
+        """Returns the role of whoever comes by a link with this query; None if no role has its token."""
+        asked = parse_qs(query, keep_blank_values=True)
+        token, site = (asked.get(key, [""])[0] for key in ("token", "as"))
+        able = Role(), Role("user", site), Role("watcher")
+        given = next((role for role in able if self._is_token(token, role)), None)
+        if given is None or given.kind == "user":
+            return given
+        if given.kind == "watcher" or "watch" in asked:
+            return Role("watcher", site)
+        return Role("user", site) if site else given
+
+    def _make_token(self, role: Role) -> str:
+        return hmac.digest(self._secret, f"{role.kind} {role.site}".encode(), "sha256")[:TOKEN_BYTES].hex()
+
+    def _is_token(self, token: str, role: Role) -> bool:
+        return not self._secret or hmac.compare_digest(token.encode(), self._make_token(role).encode())
 
 
 class PageHands:

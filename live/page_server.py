@@ -52,6 +52,8 @@ from .page_orders import (
     OrderDesk,
     PageHands,
     PageMessage,
+    Role,
+    RoleLinks,
     Seen,
     SetLink,
     SetShares,
@@ -61,7 +63,6 @@ from .page_orders import (
     TakePart,
     read_page_message,
 )
-from .page_roles import Role, RoleLinks
 from .session_frames import SessionFrames, show_event
 from .session_view import SessionView
 

@@ -13,8 +13,8 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, suppress
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -76,10 +76,7 @@ def examine_machine(
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
     """Yields all findings, one after the other, by the arguments of `doctor`."""
-    yield from examine_keys(keys)
-    owned: MemberKeys | None = None
-    with suppress(UsageError):
-        owned = None if keys is None else read_member_keys(keys)
+    owned = yield from examine_keys(keys)
     yield from examine_links(connection, keys, owned, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
@@ -91,16 +88,16 @@ def examine_machine(
     yield from examine_room(folder)
 
 
-def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
-    """Yields whose keys they are, until when they hold, and whether somebody else can get at them."""
+def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
+    """Yields whose keys they are, until when they hold, and if others can get at them; returns good ones."""
     if folder is None:
         yield DoctorFinding("keys", "ok", "none given: without --keys a member listens on this machine alone")
-        return
+        return None
     try:
         owned = read_member_keys(folder)
     except UsageError as error:
         yield DoctorFinding("keys", "fail", str(error))
-        return
+        return None
     left = owned.ends - datetime.now(UTC)
     text = f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
     if left < ENDS_SOON:
@@ -113,6 +110,7 @@ def examine_keys(folder: Path | None) -> Iterator[DoctorFinding]:
     if authority.exists():
         text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
         yield DoctorFinding("keys", "warn", text)
+    return owned
 
 
 def examine_links(
@@ -271,12 +269,12 @@ class Rehearsal(LoopStats):
 
     def __init__(self, scenario: Scenario, name: str) -> None:
         self._stepped, self._ticks = Site(scenario.setup(name)), scenario.ticks(name)
-        super().__init__(self._stepped, 1, [scenario.sites[peer].rate_hz for peer in self._stepped.peers])
+        super().__init__(self._stepped, 1)
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
         """Makes its ticks in real time; returns how late each began, us."""
-        inbox = PeerInbox((), (), (), (), (), self.dropped, ())
+        inbox = PeerInbox((), (), (), (), self.dropped)
         timing = SiteTiming(clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), "")
         timed: Any = (clock, inbox, timing, self, StateBlock(self._stepped, 1, lambda _: None), self)
         run_loop(self._stepped, 1, self._ticks, *timed)

@@ -7,13 +7,14 @@ time. What is refused is counted by reason.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
 from trilat_net.core.site_arrays import SiteArrays
+from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError
 from trilat_net.net.bus import Inbox
@@ -29,26 +30,36 @@ MESSAGES_KEPT = 32
 POLL_NS = 5_000_000
 
 
+def _read_messages(
+    inbox: Inbox, site: str, dropped: Counter[str], source: str | None = None
+) -> Iterator[HandMessage]:
+    """Yields the messages to a site of hands, or of one source; counts those that it drops."""
+    for _ in range(MESSAGES_KEPT):
+        if (waiting := inbox.poll()) is None:
+            return
+        try:
+            message = decode(waiting[1], HandMessage)
+        except WireError as error:
+            dropped[f"hand: {error.reason}"] += 1
+            continue
+        if message.site == site and source in (None, message.source):
+            yield message
+        else:
+            dropped["hand: stranger"] += 1
+
+
 class HandServer:
     """The live hand of one site.
 
-    `angles` returns the joint angles at the tick that is about to be made, rad; `news` are ticks, and
-    sentences on who has taken hold and let go that no event names yet.
+    `news` are ticks, and sentences on who has taken hold and let go that no event names yet.
     """
 
     def __init__(
-        self,
-        site: str,
-        rate_hz: int,
-        hand: LiveHand,
-        arm: ArmModel,
-        inbox: Inbox,
-        dropped: Counter[str],
-        angles: Callable[[], Sequence[float]],
+        self, site: Site, hand: LiveHand, arm: ArmModel, inbox: Inbox, dropped: Counter[str]
     ) -> None:
-        self._site, self._hand, self._inbox, self._dropped = site, hand, inbox, dropped
-        self._rules = hand.rules(rate_hz, arm.counts)
-        self._place = angles if hand.mode == "joint" else lambda: arm.end_effector(angles())
+        self._site, self._hand, self._inbox, self._dropped = site.name, hand, inbox, dropped
+        self._rules = hand.rules(site.rate_hz, arm.counts)
+        self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)
         self._names: dict[int, str] = {}
@@ -56,12 +67,8 @@ class HandServer:
 
     def take(self, k: int, _arrays: SiteArrays | None = None) -> list[float]:
         """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
-        commands = []
-        for _ in range(MESSAGES_KEPT):
-            if (message := self._inbox.poll()) is None:
-                break
-            if (command := self._read(message[1])) is not None:
-                commands.append(command)
+        came = _read_messages(self._inbox, self._site, self._dropped)
+        commands = [command for message in came if (command := self._read(message)) is not None]
         if not commands and not self._memory.target:
             return self._free
         t_ns = tick_ns(k, self._rules.rate_hz)
@@ -74,17 +81,10 @@ class HandServer:
             self.news.append((k, f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"))
         return step.vector
 
-    def _read(self, payload: bytes) -> HandCommand | None:
-        try:
-            message = decode(payload, HandMessage)
-        except WireError as error:
-            self._dropped[f"hand: {error.reason}"] += 1
-            return None
+    def _read(self, message: HandMessage) -> HandCommand | None:
         pushes = self._hand.mode == "force"
         target, other = (message.force, message.target)[:: 1 if pushes else -1]
-        if message.site != self._site:
-            self._dropped["hand: stranger"] += 1
-        elif message.grip and (other or len(target) != self._rules.size):
+        if message.grip and (other or len(target) != self._rules.size):
             self._dropped[f"hand: no {'force' if pushes else 'target'} of {self._rules.size} numbers"] += 1
         elif message.grip and math.hypot(*target) > self._rules.farthest:
             self._dropped["hand: out of range"] += 1
@@ -110,16 +110,15 @@ class RemoteHand(HandPlayer):
         inbox: Inbox,
         publish: Callable[[bytes], None],
         dropped: Counter[str],
+        clock: Clock,
     ) -> None:
         super().__init__(at, None)
         self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
-        self._asked, self._source = -1, at.source
+        self._clock, self._asked, self._source = clock, -1, at.source
 
     def take(self, k: int, arrays: SiteArrays) -> list[float]:
         """Returns what it does in tick k, by the decisions that have come."""
-        for _ in range(MESSAGES_KEPT):
-            if (message := self._read()) is None:
-                break
+        for message in self._read():
             self._decide(k, message)
         return super().take(k, arrays)
 
@@ -131,7 +130,7 @@ class RemoteHand(HandPlayer):
         self._asked = k
 
     def wait_for_first(
-        self, stopped: Callable[[], bool], clock: Clock, give_up_ns: int, say: Callable[[str], None]
+        self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
         """Waits until its program is there; False if `stopped` comes first.
 
@@ -140,30 +139,20 @@ class RemoteHand(HandPlayer):
         """
         say(f"waits for its hand {self._code}: trilat hand {self._site} --scenario FILE")
         while not stopped():
-            if self._read() is not None:
+            if any(self._read()):
                 return True
-            if clock.monotonic_ns() > give_up_ns:
+            if self._clock.monotonic_ns() > give_up_ns:
                 raise SessionError(f"{self._site} waited in vain for its hand {self._code}")
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
         return False
 
-    def _read(self) -> HandMessage | None:
-        while (waiting := self._inbox.poll()) is not None:
-            try:
-                message = decode(waiting[1], HandMessage)
-            except WireError as error:
-                self._dropped[f"hand: {error.reason}"] += 1
-                continue
-            if (message.site, message.source) == (self._site, self._source):
-                return message
-            self._dropped["hand: stranger"] += 1
-        return None
+    def _read(self) -> Iterator[HandMessage]:
+        return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
         asked = message.n * self.hand.every
-        is_here = (
-            message.n == 0 and not message.grip
-        )  # may come after the first question, and decides nothing
+        # that it is here may come after the first question, and decides nothing
+        is_here = message.n == 0 and not message.grip
         if self.failure or is_here or asked > self._asked:
             return
         self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))

@@ -7,6 +7,7 @@ answers in the slack of its ticks.
 from array import array
 
 from trilat_net.core.site_setup import Layout
+from trilat_net.core.site_step import Site
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
 from trilat_net.net.pinging import answer_backfill
@@ -78,32 +79,26 @@ class ChannelBuffer:
 class RetransmitBuffer:
     """The recently published messages of a site, by channel."""
 
-    def __init__(
-        self,
-        site: str,
-        boot: int,
-        rate_hz: int,
-        queries: QueryInbox,
-        layout: Layout = Layout(),  # noqa: B008
-    ) -> None:
-        self._site, self._boot, self._queries, self._rate_hz = site, boot, queries, rate_hz
-        records, statistics = min(KEPT_S * rate_hz, RECORDS_KEPT), KEPT_S * STATS_PER_SECOND
-        record_bytes = RECORD_BYTES + FLOAT_BYTES * (layout.floats - Layout().floats)
+    def __init__(self, site: Site, boot: int, queries: QueryInbox) -> None:
+        self._site, self._boot, self._queries = site, boot, queries
+        records, statistics = min(KEPT_S * site.rate_hz, RECORDS_KEPT), KEPT_S * STATS_PER_SECOND
+        record_bytes = RECORD_BYTES + FLOAT_BYTES * (site.layout.floats - Layout().floats)
         self.channels = {
             topics.STATE: ChannelBuffer(records, max(records * record_bytes, EVENTS_BYTES)),
             topics.LINK: ChannelBuffer(statistics, statistics * STATISTICS_BYTES),
             topics.EVENT: ChannelBuffer(EVENTS_KEPT, EVENTS_BYTES),
         }
 
-    def begin_at(self, tick: int, rate_hz: int) -> None:
+    def begin_at(self, tick: int) -> None:
         """Lets tick be the first one of the site."""
         self.channels[topics.STATE].begin_at(tick)
-        self.channels[topics.LINK].begin_at(count_messages(topics.LINK, tick, rate_hz))
+        self.channels[topics.LINK].begin_at(count_messages(topics.LINK, tick, self._site.rate_hz))
 
     def skip(self, first: int, next_tick: int) -> None:
         """Adds the numbers of what a site never publishes that makes no ticks from one on, up to another."""
         self.channels[topics.STATE].skip(next_tick - first)
-        number, first_skipped = skipped_numbers(topics.LINK, next_tick, next_tick - first, self._rate_hz)
+        ticks = next_tick, next_tick - first
+        number, first_skipped = skipped_numbers(topics.LINK, *ticks, self._site.rate_hz)
         self.channels[topics.LINK].skip(max(0, number - first_skipped))
 
     def answer_query(self) -> bool:
@@ -111,7 +106,7 @@ class RetransmitBuffer:
         query = self._queries.poll()
         if query is None:
             return False
-        answer_backfill(query, self._site, self._boot, self._find)
+        answer_backfill(query, self._site.name, self._boot, self._find)
         return True
 
     def _find(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:

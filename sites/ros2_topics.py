@@ -163,15 +163,15 @@ class SiteTopics:
         self.newest: State | None = None
 
     def show(self, record: State, rate_hz: float) -> None:
-        """Publishes a record if it is the first of its time at a rate; none is shown after a later one."""
+        """Publishes a record, as far as somebody listens, if it is the first of its time at a rate.
+
+        None is shown after a later one.
+        """
         last = self.newest
         times = [int(one.t_ns * rate_hz) // NS_PER_S for one in (record, last or record)]
-        if last is None or record.boot != last.boot or times[0] > times[1]:
-            self.newest = record
-            self.publish(record)
-
-    def publish(self, record: State) -> None:
-        """Publishes a record, as far as somebody listens."""
+        if last is not None and record.boot == last.boot and times[0] <= times[1]:
+            return
+        self.newest = record
         stamp_ns = max(0, self._epoch_unix_ns + record.t_ns)
         if self._states.heard:
             self._states.put(self._pack_states(stamp_ns, record.q, record.qd, record.tau))

@@ -53,21 +53,18 @@ class PeerInbox:
 
     def __init__(
         self,
-        peers: Sequence[str],
+        links: Sequence[LinkSetup],
         rings: Sequence[StampedInbox[PeerSample | WireError]],
-        rates: Sequence[int],
         boots: Sequence[int],
         monitors: Sequence[LinkTimingMonitor],
         dropped: Counter[str],
-        links: Sequence[LinkSetup],
         from_ns: int = 0,
     ) -> None:
-        self._links, self._from_ns = links, from_ns
-        self._peers, self._rings, self._rates = peers, rings, rates
+        self._links, self._rings, self._from_ns = links, rings, from_ns
         self._boots, self._monitors, self._dropped = list(boots), monitors, dropped
-        self._last = [first_tick_at(from_ns, rate_hz) - 1 for rate_hz in rates]
+        self._last = [first_tick_at(from_ns, link.rate_hz) - 1 for link in links]
         self._passed_over = list(self._last)
-        self._newest: list[PeerSample | None] = [None] * len(peers)
+        self._newest: list[PeerSample | None] = [None] * len(links)
         if from_ns:
             self.drain(from_ns)  # what came while it waited must not burden the first tick
 
@@ -98,13 +95,14 @@ class PeerInbox:
         if isinstance(sample, WireError):
             self._dropped[sample.reason] += 1
             return None
-        if sample.site != self._peers[index] or sample.boot != self._boots[index]:
+        link = self._links[index]
+        if sample.site != link.peer or sample.boot != self._boots[index]:
             self._dropped["stranger"] += 1
             return None
-        stamp_ns = sample.tick * NS_PER_S // self._rates[index]
+        stamp_ns = sample.tick * NS_PER_S // link.rate_hz
         if stamp_ns < self._from_ns:
             return None
-        guarded = bool(self._links[index].speed_limit)
+        guarded = bool(link.speed_limit)
         if stamp_ns - since_epoch_ns > (GUARDED_AHEAD_NS if guarded else AHEAD_LIMIT_NS):
             self._dropped["ahead"] += 1
             return None
@@ -115,18 +113,17 @@ class PeerInbox:
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].take(sample, arrived_ns)
-        link, delay_us = self._links[index], delay_ns // 1000
         ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
-        return Arrival(index, sample.tick, sample.q, sample.qd, delay_us, sample.tau_x, ch)
+        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x, ch)
 
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
-        limits, newest = self._links[index].speed_limit, self._newest[index]
-        for speed, limit in zip(sample.qd, limits, strict=True):
+        link, newest = self._links[index], self._newest[index]
+        for speed, limit in zip(sample.qd, link.speed_limit, strict=True):
             if not abs(speed) <= limit:
                 return False
         if newest is not None:
-            passed_s = abs(sample.tick - newest.tick) / self._rates[index]
-            for here, there, limit in zip(sample.q, newest.q, limits, strict=True):
+            passed_s = abs(sample.tick - newest.tick) / link.rate_hz
+            for here, there, limit in zip(sample.q, newest.q, link.speed_limit, strict=True):
                 if not abs(here - there) <= limit * passed_s + STEP_MARGIN_RAD:
                     return False
         if newest is None or sample.tick > newest.tick:
@@ -143,8 +140,7 @@ HELD_PER_S, HELD_DELAY_US = 200, 100_000
 def may_hold_samples(scenario: Scenario, name: str) -> bool:
     """True if all links from a site delay its samples so much, and it hears of changes of these links."""
     return all(
-        site in scenario.peers(name)
-        and max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT)) >= HELD_DELAY_US
+        max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT)) >= HELD_DELAY_US
         for site in scenario.names
         for link in scenario.setup(site).links
         for model in link.models

@@ -88,13 +88,8 @@ class SiteParts:
         self.setup = scenario.setup(name)
         self.site, self.boot = Site(self.setup), new_boot()
         peers, session = self.site.peers, options.session
-        self.rates = [scenario.sites[peer].rate_hz for peer in peers]
-        self.stats = LoopStats(self.site, self.boot, self.rates)
-        self.watchdog = CodeWatchdog()
-        self.step: Callable[[TickInput], TickRecord] = self.site.step
-        if isinstance(law := scenario.sites[name].control, ImportedLaw):
-            code, self.step = watch_law(self.site, law.code, clock)
-            self.watchdog.codes.append(code)
+        self.stats = LoopStats(self.site, self.boot)
+        self.watchdog, self.step = watch_law(scenario, self.site, clock)
         self.rings = [
             bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
             for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
@@ -109,7 +104,7 @@ class SiteParts:
         self.hand: HandServer | HandPlayer | None = None
         self._meet_hand()
         queries = bus.questions(topics.key(session, name, topics.PAST))
-        self.buffer = RetransmitBuffer(name, self.boot, self.site.rate_hz, queries, self.site.layout)
+        self.buffer = RetransmitBuffer(self.site, self.boot, queries)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
         single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
         send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
@@ -141,10 +136,9 @@ class SiteParts:
         inbox, dropped = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT), self.stats.dropped
         if at is not None:
             publish = bus.publisher(topics.key(session, name, topics.VIEW))
-            self.hand = RemoteHand(at, self.boot, inbox, publish, dropped)
+            self.hand = RemoteHand(at, self.boot, inbox, publish, dropped, self.clock)
             return
-        meets = (self.scenario.arms[name], inbox, dropped, lambda: self.site.q)
-        self.hand = HandServer(name, self.site.rate_hz, live, *meets)
+        self.hand = HandServer(self.site, live, self.scenario.arms[name], inbox, dropped)
 
     def _meet_outside_arm(self) -> None:
         name, session, dropped = self.name, self.options.session, self.stats.dropped
@@ -201,28 +195,30 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     Raises:
         LawFailed: a user law fails already with every arm at rest where it starts.
     """
-    setup, law = scenario.setup(name), scenario.sites[name].control
+    setup = scenario.setup(name)
     site = Site(setup)
+    watchdog, step = watch_law(scenario, site, clock or SystemClock())
     try:
-        if isinstance(law, ImportedLaw):
-            code, step = watch_law(site, law.code, clock or SystemClock())
-            with CodeWatchdog(code):
-                _warm(setup, site, step)
-        else:
-            _warm(setup, site, site.step)
+        with watchdog:
+            _warm(setup, site, step)
     except LawFailed as failed:
         problem = f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
         raise LawFailed(problem, site=name, code=failed.code, tick=failed.tick) from None
 
 
-def watch_law(site: Site, law: str, clock: Clock) -> tuple[WatchedCode, Callable[[TickInput], TickRecord]]:
-    """Returns a user's law as a watchdog knows it, and the step of its site."""
+def watch_law(
+    scenario: Scenario, site: Site, clock: Clock
+) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
+    """Returns what watches a site's law, if that is a user's, and the step of the site."""
+    law = scenario.sites[site.name].control
+    if not isinstance(law, ImportedLaw):
+        return CodeWatchdog(), site.step
 
     def fail(k: int, problem: str) -> LawFailed:
-        return LawFailed(problem, site=site.name, code=law, tick=k)
+        return LawFailed(problem, site=site.name, code=law.code, tick=k)
 
-    code = WatchedCode(f"the law {law}", site.rate_hz, fail, clock)
-    return code, lambda tick: code.run(tick.k, lambda: site.step(tick))
+    code = WatchedCode(f"the law {law.code}", site.rate_hz, fail, clock)
+    return CodeWatchdog(code), lambda tick: code.run(tick.k, lambda: site.step(tick))
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:

@@ -44,6 +44,7 @@ from trilat_net.scenario.run_changes import count_skipped_ticks
 from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
+from .external_arm import ExternalArm
 from .hand_server import RemoteHand
 from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
@@ -99,13 +100,10 @@ def take_part(parts: SiteParts) -> int:
         SessionError: the session could not begin.
         RunFailed: the run ended badly.
     """
-    stopped = parts.interrupt.requested
     give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
-    if parts.arm is not None and not parts.arm.wait_for_first(stopped, give_up_ns, parts.say):
-        return parts.interrupt.exit_code
-    if isinstance(parts.hand, RemoteHand):
-        waits = (stopped, parts.clock, give_up_ns, parts.say)
-        if not parts.hand.wait_for_first(*waits):
+    waits = parts.interrupt.requested, give_up_ns, parts.say
+    for awaited in (parts.arm, parts.hand):
+        if isinstance(awaited, ExternalArm | RemoteHand) and not awaited.wait_for_first(*waits):
             return parts.interrupt.exit_code
     running = join_session(parts, give_up_ns)
     if running is None:
@@ -166,7 +164,6 @@ class RunningSite:
         self._status_s = self._told_s = 0
         self._given_up, self._held_s = False, -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
-        self._step = parts.step
         self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.boots = epoch.boots
@@ -182,19 +179,11 @@ class RunningSite:
             for peer, boot in zip(site.peers, boots, strict=True)
         ]
         site.begin_at(epoch.first)
-        parts.buffer.begin_at(epoch.first, site.rate_hz)
+        parts.buffer.begin_at(epoch.first)
         self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0])
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
-        self._inbox = PeerInbox(
-            site.peers,
-            parts.rings,
-            parts.rates,
-            boots,
-            self._timing.meters,
-            parts.stats.dropped,
-            parts.setup.links,
-            tick_ns(epoch.first, site.rate_hz),
-        )
+        heard = (parts.rings, boots, self._timing.meters, parts.stats.dropped)
+        self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
         publisher.update(
             running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
         )
@@ -260,7 +249,7 @@ class RunningSite:
         try:
             if parts.plant is not None:
                 measured = parts.plant.state
-            self._output = self._step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
+            self._output = parts.step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
             if parts.plant is not None:
                 parts.plant.move(k, self._output.tau)
         except CodeFailed as failed:

@@ -50,7 +50,7 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
 
 def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
     site = Site(scenario.setup(name))
-    stats = LoopStats(site, BOOTS[name], [1000]).take(site.step(TickInput(0)))
+    stats = LoopStats(site, BOOTS[name]).take(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
     return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
 

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -122,7 +123,8 @@ class Served:
         assert live is not None
         key = topics.key("t", "m1", topics.HAND)
         inbox = network.join().inbox(key, MESSAGES_KEPT)
-        self.server = HandServer("m1", 1000, live, arm, inbox, self.dropped, lambda: [0.3, 0.4])
+        site: Any = SimpleNamespace(name="m1", rate_hz=1000, q=[0.3, 0.4])
+        self.server = HandServer(site, live, arm, inbox, self.dropped)
         self.publish = network.join().publisher(key)
         self.k = -1
 

@@ -47,7 +47,7 @@ class Alone:
     def __init__(self, clock: ManualClock, overrides: dict[str, object] | None = None) -> None:
         scenario = load_scenario("two_sites", {"duration_s": 2.0, **(overrides or {})})
         self.site = Site(scenario.setup("m"))
-        self.stats = LoopStats(self.site, 1, [scenario.sites["s"].rate_hz])
+        self.stats = LoopStats(self.site, 1)
         self.states: list[State] = []
         self.samples: list[PeerSample] = []
         self.links: list[LinkStats] = []
@@ -56,7 +56,7 @@ class Alone:
         self._clock, self._ticks = clock, scenario.ticks("m")
 
     def run(self, *, catches_up: bool = True) -> object:
-        inbox = PeerInbox((), (), (), (), (), self.stats.dropped, ())
+        inbox = PeerInbox((), (), (), (), self.stats.dropped)
         timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
         states = StateBlock(self.site, 1, self.publish_states, 0, single=True)
         timed = (self._clock, inbox, timing, self.stats, states, self)

@@ -59,7 +59,8 @@ class Desk:
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        self.intake = PeerInbox(PEERS, rings, rates, BOOTS, self.meters, self.dropped, links)
+        paced = [link._replace(rate_hz=rate_hz) for link, rate_hz in zip(links, rates, strict=True)]
+        self.intake = PeerInbox(paced, rings, BOOTS, self.meters, self.dropped)
 
     def wait(self, until_ns: int) -> None:
         self.clock.sleep_until(EPOCH_NS + until_ns)

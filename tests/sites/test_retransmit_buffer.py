@@ -1,10 +1,14 @@
 """A site's memory of what it has published: bounded, exact, and told in bounded chunks."""
 
+from types import SimpleNamespace
+from typing import Any
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sites.retransmit_buffer import EVENTS_KEPT, KEPT_S, RECORDS_KEPT, ChannelBuffer, RetransmitBuffer
 from tests.net.local_bus import LocalNetwork
+from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
 from trilat_net.net.messages import VERSION
@@ -19,7 +23,8 @@ class Desk:
     def __init__(self, rate_hz: int = 1000) -> None:
         network = LocalNetwork()
         self._asker = network.join()
-        self.history = RetransmitBuffer("m1", BOOT, rate_hz, network.join().questions(KEY))
+        site: Any = SimpleNamespace(name="m1", rate_hz=rate_hz, layout=Layout())
+        self.history = RetransmitBuffer(site, BOOT, network.join().questions(KEY))
 
     def ask(self, payload: bytes) -> Inbox:
         replies = self._asker.ask(KEY, payload)

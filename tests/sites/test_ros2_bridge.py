@@ -282,7 +282,7 @@ def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
         graph = Listener()
         ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
         shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
-        shown.publish(log[site].states[-1])
+        shown.show(log[site].states[-1], 1000.0)
         messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]]
         frames = [one for message in messages for one in message.transforms]
         tip = ROS.deserialize_cdr(graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped")

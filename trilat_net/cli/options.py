@@ -3,7 +3,6 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from enum import StrEnum
 from functools import wraps
 from importlib import import_module, resources
 from pathlib import Path
@@ -34,10 +33,6 @@ def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackP
     return check
 
 
-check_seconds = check_range(0.0, 86_400.0, "a number of seconds")
-"""Refuses a waiting time out of range."""
-
-
 def value(names: str, metavar: str, text: str = "", **more: Any) -> Any:
     """Returns an option that takes a value, with its help; several names are separated by spaces."""
     return typer.Option(*names.split(), metavar=metavar, help=text, **more)
@@ -50,7 +45,7 @@ def flag(names: str, text: str = "", **more: Any) -> Any:
 
 def seconds(name: str, text: str = "") -> Any:
     """Returns an option that takes a waiting time, s, with its help."""
-    return value(name, "S", text, callback=check_seconds)
+    return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
 
 
 _TOLD = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
@@ -188,30 +183,6 @@ ViewsOption = Annotated[
 JobsOption = Annotated[int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)]
 
 
-class Accepted(StrEnum):
-    """What `--accept` lets pass besides a stable run."""
-
-    BOUNDED = "bounded"
-    OPEN = "open"
-
-
-AcceptOption = Annotated[
-    list[Accepted] | None,
-    typer.Option("--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."),
-]
-OwnLawsOption = Annotated[
-    bool, flag("--own-laws", "Run code of imported laws for the energies that they declare.")
-]
-TwinsOption = Annotated[int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)]
-LawFilesOption = Annotated[
-    list[Path] | None, value("--law", "FILE", "Let this file run as a law that the log names; repeatable.")
-]
-OtherVersionOption = Annotated[
-    bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
-]
-RememberOption = Annotated[
-    bool, flag("--remember", "Let the --law FILE run for other logs that name its hash, too.")
-]
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
@@ -236,9 +207,6 @@ MinCoverageOption = Annotated[
 ]
 MIN_COVERAGE = 0.999
 """As in `log.accounting`, which takes long to import."""
-ResultsOption = Annotated[
-    Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
-]
 OnOption = Annotated[
     str | None,
     value(
@@ -353,9 +321,16 @@ class Reach(NamedTuple):
 class LawFiles(NamedTuple):
     """The options that let files run as the laws that a log names."""
 
-    law: LawFilesOption = None
-    other_version: OtherVersionOption = False
-    remember: RememberOption = False
+    law: Annotated[
+        list[Path] | None,
+        value("--law", "FILE", "Let this file run as a law that the log names; repeatable."),
+    ] = None
+    other_version: Annotated[
+        bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
+    ] = False
+    remember: Annotated[
+        bool, flag("--remember", "Let the --law FILE run for other logs that name its hash, too.")
+    ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
         """Returns a log; warns of code from outside that its execution runs, or may not run."""
@@ -370,7 +345,9 @@ class RunOptions(NamedTuple):
     """The options of a run that is live on this machine, and of its results."""
 
     duration: DurationOption = None
-    folder: ResultsOption = None
+    folder: Annotated[
+        Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
+    ] = None
     seed: SeedOption = None
     overrides: SetOption = None
     force: ForceOption = False

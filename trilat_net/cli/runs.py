@@ -88,13 +88,24 @@ def verify_command(
     raise typer.Exit(result.exit_code)
 
 
+Accepted = StrEnum("Accepted", ["BOUNDED", "OPEN"])
+"""What `--accept` lets pass besides a stable run."""
+
+
 @options.command("run.mcap")
 def certify_command(
     files: options.LogsArgument,
-    accept: options.AcceptOption = None,
+    accept: Annotated[
+        list[Accepted] | None,
+        typer.Option(
+            "--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."
+        ),
+    ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
-    own_laws: options.OwnLawsOption = False,
-    twins: options.TwinsOption = 8,
+    own_laws: Annotated[
+        bool, flag("--own-laws", "Run code of imported laws for the energies that they declare.")
+    ] = False,
+    twins: Annotated[int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)] = 8,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,

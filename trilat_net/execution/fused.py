@@ -247,8 +247,10 @@ class FusedRun:
             one.row, addresses[i] = rows[i], one.address
         self._law_arrays = LawArrays(addresses, rows, sent)
 
-    def _run_until(self, last_ns: int) -> None:
-        """Steps every site up to a time, and lets them take in the changes that come before it.
+    def step_to(self, last_ns: int) -> None:
+        """Makes the planned ticks up to a time, ns since the epoch, and takes in the changes before it.
+
+        A diverged run stays as it is.
 
         Raises:
             LawFailed: a plugged law failed.
@@ -334,7 +336,7 @@ class FusedRun:
             return
         rates_hz = self._progress["rate_hz"].tolist()
         self.plan([max(1, round(until_s * rate_hz)) for rate_hz in rates_hz])
-        self._run_until(round(until_s * NS_PER_S))
+        self.step_to(round(until_s * NS_PER_S))
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def plan(self, ticks: Sequence[int]) -> None:
@@ -353,11 +355,6 @@ class FusedRun:
             acts = np.zeros((len(ticks), max(ticks), feed.hands.shape[2]))
             acts[:, : feed.hands.shape[1]] = feed.hands
             self._inputs = self._inputs._replace(feed=feed._replace(hands=acts))
-
-    def step_to(self, last_ns: int) -> None:
-        """Makes the planned ticks up to a time, ns since the epoch; a diverged run stays as it is."""
-        if self.diverged_s is None:
-            self._run_until(last_ns)
 
     @cached_property
     def _state(self) -> RunState:

@@ -9,7 +9,6 @@ same instants: records of the log that the rerun executed too.
 """
 
 import io
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,7 +35,7 @@ from ..log.ros2.viz_channels import VIZ_HZ
 from ..log.site_log import SiteLog
 from ..net.messages import READABLE, State
 from ..net.wire import decode
-from ..results import Result
+from ..results import Result, finite_or_none
 from ..scenario.code_consent import find_user_laws
 from .rerun_execution import (
     RerunExecution,
@@ -286,10 +285,10 @@ class Rerun(Result):
             "identical": self.identical,
             "diverged": self.diverged,
             "sites": {
-                name: {**_nested_json(effect._asdict()), "first": effect.first and effect.first._asdict()}
+                name: {**_nest(effect), "first": effect.first and effect.first._asdict()}
                 for name, effect in self.sites.items()
             },
-            "links": {name: _nested_json(effect._asdict()) for name, effect in self.links.items()},
+            "links": {name: _nest(effect) for name, effect in self.links.items()},
             "notes": self.notes,
         }
 
@@ -370,16 +369,11 @@ def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iter
     yield channels.end()
 
 
-def _nested_json(values: dict[str, Any]) -> dict[str, Any]:
-    """Returns values with every pair spelt out and every number beyond JSON as None."""
-    return {
-        key: _nested_json(value._asdict())
-        if hasattr(value, "_asdict")
-        else None
-        if isinstance(value, float) and not math.isfinite(value)
-        else value
-        for key, value in values.items()
-    }
+def _nest(value: Any) -> Any:
+    """Returns a value for JSON: every tuple with names spelt out, and every number beyond JSON as None."""
+    if hasattr(value, "_asdict"):
+        return {key: _nest(one) for key, one in value._asdict().items()}
+    return finite_or_none(value) if isinstance(value, float) else value
 
 
 def _describe_limits(again: Rerun) -> Iterator[str]:

@@ -269,7 +269,7 @@ class RerunSite:
         self._recorded: list[int] = part.tick.tolist() if same_rate else []
         self._places = {tick: n for n, tick in enumerate(self._recorded)}
         self._boot = part.states[0].boot if len(part) else 0
-        self._stats = LoopStats(self._site, self._boot, [scenario.sites[p].rate_hz for p in self._site.peers])
+        self._stats = LoopStats(self._site, self._boot)
         self._certain = deliveries.first == 0
 
     @property

@@ -260,7 +260,7 @@ class _VirtualChannels(SiteChannels):
         boot = virtual_boot(scenario, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
         self._writer, self._runs = writer, site
-        self._stats = LoopStats(site, boot, [scenario.sites[p].rate_hz for p in site.peers])
+        self._stats = LoopStats(site, boot)
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
         payload = encode_state(self._site, self._boot, self.peers, output, arrivals, 0, 0)

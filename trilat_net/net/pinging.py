@@ -31,17 +31,12 @@ class RepeatedQuery:
         self._bus, self._clock, self._key = bus, clock, key
         self._open: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
-    def ask(self) -> int:
-        """Sends the query and returns the time, ns."""
-        asked_ns = self._clock.monotonic_ns()
-        self._open.append((asked_ns, self._bus.ask(self._key)))
-        return asked_ns
-
     def repeat(self, every_ns: int = QUERY_EVERY_NS) -> bool:
         """Sends the query if the last one is that long ago; True if so."""
-        due = not self._open or self._clock.monotonic_ns() - self._open[-1][0] >= every_ns
+        now_ns = self._clock.monotonic_ns()
+        due = not self._open or now_ns - self._open[-1][0] >= every_ns
         if due:
-            self.ask()
+            self._open.append((now_ns, self._bus.ask(self._key)))
         return due
 
     def poll(self) -> tuple[int, str, bytes] | None:

@@ -130,7 +130,8 @@ class SessionJoin:
         foreign = {info.boot for info in running if info.clock != own}
         if self._sites and not self.pinger.know(foreign):
             return None
-        for info in sorted(running, key=lambda info: (info.clock != own, *self._rank(info))):
+        places = {name: n for n, name in enumerate(self._sites)}  # ticks follow the grid of the first site
+        for info in sorted(running, key=lambda info: (info.clock != own, places.get(info.member, -1))):
             if info.clock == own or self.pinger.know([info.boot]):
                 # as the clocks stand now: their drift apart since the epoch is unknown
                 offset_ns = 0 if info.clock == own else self.pinger.estimate(info.boot).offset_at(now_ns)
@@ -140,10 +141,6 @@ class SessionJoin:
                 grid_ns = (info.grid_ns or info.epoch_mono_ns) - offset_ns
                 return self._ask_to_join(epoch._replace(mono_ns=grid_ns), running, now_ns)
         return None
-
-    def _rank(self, info: Info) -> tuple[int, ...]:
-        """Returns the place of a site in the scenario: ticks follow the grid of the first one."""
-        return (self._sites.index(info.member),) if info.member in self._sites else ()
 
     def _ask_to_join(self, epoch: Epoch, running: Sequence[Info], now_ns: int) -> Epoch | None:
         """Says `coming`, again and again; returns the epoch when every running site has admitted it."""

@@ -368,14 +368,15 @@ _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded"
 
 
 class LoopStats:
-    """Counters of a loop, since the last statistics and since the start; `rates` are those of the peers, Hz.
+    """Counters of a loop, since the last statistics and since the start.
 
     Attributes:
         overruns: ticks whose work began after the next one was due, or that were not made.
     """
 
-    def __init__(self, site: Site, boot: int, rates: list[int]) -> None:
-        self._site, self._boot, self._rates = site, boot, rates
+    def __init__(self, site: Site, boot: int) -> None:
+        self._site, self._boot = site, boot
+        self._rates = [site.peer_rate_hz(peer) for peer in range(len(site.peers))]
         self._every = ticks_per_stats(site.rate_hz)
         self._period_us = 1_000_000 / site.rate_hz
         self._late_max_us = self._busy_max_us = 0

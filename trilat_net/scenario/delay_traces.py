@@ -35,7 +35,7 @@ MAX_TRACE_POINTS = 200_000
 """Most points of one trace: 200 s of a log at 1 kHz."""
 
 _LOST = "lost"
-
+LONGEST_MS = MAX_DELAY_US / 1e3
 TracePoint = tuple[float, float]
 """A time, s, and a delay, ms; a delay of infinity is a sample lost."""
 
@@ -103,9 +103,10 @@ def format_trace(rows: Sequence[TracePoint]) -> str:
         where = f"point {number}: "
         if not math.isfinite(t_s) or t_s < 0.0:
             raise ValueError(f"{where}its time must be finite and not negative, is {t_s:g} s")
-        if math.isnan(delay_ms) or delay_ms < 0.0 or MAX_DELAY_US / 1000 < delay_ms < math.inf:
-            limit = MAX_DELAY_US / 1000
-            raise ValueError(f"{where}its delay must be from 0 to {limit:g} ms or {_LOST!r}, is {delay_ms:g}")
+        if math.isnan(delay_ms) or delay_ms < 0.0 or LONGEST_MS < delay_ms < math.inf:
+            raise ValueError(
+                f"{where}its delay must be from 0 to {LONGEST_MS:g} ms or {_LOST!r}, is {delay_ms:g}"
+            )
         t_us = round((t_s - rows[0][0]) * 1e6)
         if t_us <= before_us:
             raise ValueError(f"{where}its time, {t_s:g} s, must be later than that of the point before it")
@@ -140,7 +141,6 @@ def parse_trace(text: str) -> Points:
 
 WAYS = ("half", "send", "receive", "whole")
 """Half of a round trip, one way of `irtt` there or back, or what stands there as it is."""
-LONGEST_MS = MAX_DELAY_US / 1e3
 _MOST_BYTES = 2**30
 _SEQUENCES = 2**16
 """After so many `ping` counts from 0 again."""
@@ -150,9 +150,6 @@ _PING = re.compile(
 _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIMES, _DELAYS = ("t", "time", "timestamp", "pub_time"), ("delay", "rtt", "latency")
-
-Sent = list[tuple[float, float]]
-"""Times of sending, s, and what was measured, ms; infinite of a sample without an answer."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -264,7 +261,7 @@ def import_trace(
         raise ScenarioError(f"{path}: is not of the form {form}: {error}") from None
 
 
-def _arrange(sent: Sent) -> MeasuredTrace:
+def _arrange(sent: list[TracePoint]) -> MeasuredTrace:
     if not sent:
         raise ValueError("it has no samples")
     sent.sort(key=lambda one: one[0])
@@ -289,10 +286,10 @@ def _arrange(sent: Sent) -> MeasuredTrace:
     return found
 
 
-def _read_irtt(text: str, way: str, *_: object) -> Sent:
+def _read_irtt(text: str, way: str, *_: object) -> list[TracePoint]:
     """Reads `irtt client -o`: nanoseconds, and a status of loss in words."""
     key, share = {"half": ("rtt", 0.5), "whole": ("rtt", 1.0)}.get(way or "half", (way, 1.0))
-    sent: Sent = []
+    sent: list[TracePoint] = []
     for trip in json.loads(text)["round_trips"]:
         times = trip["timestamps"]["client"]["send"]
         answered = trip["lost"] == "false"
@@ -301,7 +298,7 @@ def _read_irtt(text: str, way: str, *_: object) -> Sent:
     return sent
 
 
-def _read_ping(text: str, way: str, _: str, every_s: float) -> Sent:
+def _read_ping(text: str, way: str, _: str, every_s: float) -> list[TracePoint]:
     """Reads the lines of `ping`, best of `ping -D`; numbers that are missing are samples lost."""
     share, seen = (1.0 if way == "whole" else 0.5), {}
     number, stamped = -1, True
@@ -325,7 +322,7 @@ def _read_ping(text: str, way: str, _: str, every_s: float) -> Sent:
     return [(float(t), seen.get(int(n), (0.0, math.inf))[1]) for n, t in zip(numbers, at_s, strict=True)]
 
 
-def _read_table(text: str, way: str, column: str, _: float) -> Sent:
+def _read_table(text: str, way: str, column: str, _: float) -> list[TracePoint]:
     """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or t_s,delay_ms."""
     numbered = enumerate(text.splitlines(), start=1)
     (_, head), *lines = [(n, line) for n, line in numbered if line.strip() and not line.startswith("#")]
@@ -334,7 +331,7 @@ def _read_table(text: str, way: str, column: str, _: float) -> Sent:
     delay, delay_s = _find_column(cells, _DELAYS, column)
     half = way == "half" or (not way and "rtt" in cells[delay].lower())
     unit_ms = delay_s * (500.0 if half else 1e3)
-    sent: Sent = []
+    sent: list[TracePoint] = []
     for number, line in lines:
         row = _split_cells(line)
         try:
@@ -360,7 +357,7 @@ def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple
     raise ValueError(f"its head has no {wanted or f'column like {names[0]}_ms'}")
 
 
-_READERS: dict[str, Callable[[str, str, str, float], Sent]] = {
+_READERS: dict[str, Callable[[str, str, str, float], list[TracePoint]]] = {
     "irtt": _read_irtt,
     "ping": _read_ping,
     "csv": _read_table,
