@@ -1,4 +1,4 @@
-"""The page's server: its files and its socket, from one `websockets` server in a thread of its own.
+"""The page's server: its socket, and its files by HTTP, from one `websockets` server in a thread of its own.
 
 It is an onlooker of a session that is started for it, or of one that runs already: the session neither waits
 for it nor needs it, and runs on if it fails. In an experiment it shows one session after the other, with a
@@ -13,7 +13,6 @@ serves all pages and takes in the session's messages.
 import asyncio
 import logging
 import os
-import secrets
 import socket
 import ssl
 import sys
@@ -24,14 +23,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import msgspec
 from websockets.asyncio.server import ServerConnection, serve
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.http11 import Request, Response
 
@@ -42,6 +39,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 
+from .page_files import PageFiles
 from .page_orders import (
     MAX_MESSAGE_BYTES,
     AnswerPage,
@@ -92,40 +90,10 @@ _SILENT.propagate = False
 """For the library of sockets: what strangers send is counted, and prints no tracebacks."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
-LONGEST_S = 3600.0
-"""A session with a page runs for so long at most, unless told otherwise, s."""
-
-_KINDS = {
-    "html": "text/html; charset=utf-8",
-    "css": "text/css; charset=utf-8",
-    "js": "text/javascript; charset=utf-8",
-    "svg": "image/svg+xml",
-    "LICENSE": "text/plain; charset=utf-8",
-}
-_REPORT_POLICY = (
-    "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
-    "style-src 'unsafe-inline'; img-src data: blob:"
-)
-LARGEST_BYTES = 256 << 20
-"""A larger log is not sent to a page: it is read from its folder."""
 OFFERED_NS = 600_000_000_000
 """So long an open page has report and log at most."""
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-
-
-def _list_assets() -> dict[str, tuple[str, bytes]]:
-    plots = (resources.files("trilat_net.reporting") / "assets").iterdir()
-    files = {}
-    for file in [*(resources.files("live") / "assets").iterdir(), *plots]:
-        kind = _KINDS.get(file.name.rpartition(".")[2].rpartition("-")[2])
-        if kind is not None and not file.name.startswith("report.") and "/" + file.name not in files:
-            files["/" + file.name] = kind, file.read_bytes()
-    files["/"] = files["/index.html"]
-    return files
-
+LONGEST_S = 3600.0
+"""A session with a page runs for so long at most, unless told otherwise, s."""
 
 _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
@@ -238,7 +206,7 @@ class PageServer:
     Attributes:
         address: where a browser finds the page of an experimenter, token included.
         end_requested: set once a page has asked for the end.
-        results: report and log by their addresses, once the session has ended.
+        files: what it sends by HTTP.
     """
 
     def __init__(
@@ -262,9 +230,8 @@ class PageServer:
         self._turn_to(bus, session)
         self._guarded = options.host not in LOOPBACK
         self._links, self._told = RoleLinks(guarded=self._guarded), False
-        self._files = _list_assets()
+        self.files = PageFiles()
         self._ages = stage is None or stage.shows_ages
-        self.results: dict[str, Path] = {}
         self._n = 0
         self.end_requested = threading.Event()
         self.address = ""
@@ -428,12 +395,8 @@ class PageServer:
                 self.refused["too many pages"] += 1
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages\n")
             return None
-        if (result := self.results.get(target.path)) is not None and result.is_file():
-            kind = _KINDS.get(result.suffix[1:], "application/octet-stream")
-            return _send_file(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
-        if (file := self._files.get(target.path)) is None:
-            return connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
-        return _send_file(*file, _POLICY, "no-store" if target.path in ("/", "/index.html") else "no-cache")
+        found = self.files.find(target.path)
+        return found or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
 
     def _problem_of(self, request: Request, query: str) -> str | None:
         host = request.headers.get("Host", "")
@@ -608,7 +571,7 @@ class PageServer:
         return {
             "n": self._n,
             **shown,
-            "results": list(self.results) if page.role == Role() else [],
+            "results": list(self.files.results) if page.role == Role() else [],
             "notices": notices,
             "ages": self._ages,
             "pages": len(self._pages),
@@ -640,19 +603,6 @@ class PageServer:
         return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
 
-def _send_file(kind: str, content: bytes, policy: str, cache: str) -> Response:
-    headers = {
-        "Content-Type": kind,
-        "Content-Length": str(len(content)),
-        "Content-Security-Policy": policy,
-        "X-Content-Type-Options": "nosniff",
-        "Referrer-Policy": "no-referrer",
-        "Cache-Control": cache,
-        "Connection": "close",
-    }
-    return Response(HTTPStatus.OK, "OK", Headers(headers), content)
-
-
 class PageAttendant(ExitStack):
     """The page of a session that is run here; a context, as the page outlives the session for its report."""
 
@@ -677,10 +627,9 @@ class PageAttendant(ExitStack):
 
         The address of a file cannot be guessed, and only these pages are told.
         """
-        page, secret, clock = self._page, secrets.token_urlsafe(), self._clock
+        page, clock = self._page, self._clock
         assert page is not None  # a session was attended
-        small = (path for path in paths if path.stat().st_size <= LARGEST_BYTES)
-        page.results = {f"/{secret}/{path.name}": path for path in small}
+        page.files.offer(paths)
         give_up_ns = clock.monotonic_ns() + OFFERED_NS
         with suppress(KeyboardInterrupt):
             while page.experimenters and clock.monotonic_ns() < give_up_ns:

@@ -484,7 +484,7 @@ def test_report_and_log_are_the_experimenters_alone(
     monkeypatch.setattr(server._frames, "narrow", lambda *_, **__: {"t": 0.0})
     report = tmp_path / "report.html"
     report.write_text("<p>a report</p>")
-    server.results = {"/secret/report.html": report}
+    server.files.results = {"/secret/report.html": report}
     told = {}
     for link in ("", "?as=m1", "?watch", "?watch&as=m1"):
         with socket(server, link=server.address + link) as page:

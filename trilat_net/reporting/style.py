@@ -367,7 +367,8 @@ class TimeFigure:
         lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
         modes = {interval.meaning for intervals in self._modes.values() for interval in intervals}
         if modes:
-            doing = ", ".join(one.does + " (lighter)" * (one.mode is Mode.RETURN) for one in sorted(modes))
+            told = {one: " (lighter)" if one.mode is Mode.RETURN else "" for one in sorted(modes)}
+            doing = ", ".join(one.does + how for one, how in told.items())
             lines += textwrap.wrap(f"Shaded in the color of a site: it {doing}", letters)
         if lines:
             text = typeset("\n".join(lines))

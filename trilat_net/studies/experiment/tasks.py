@@ -40,8 +40,8 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def needs_pair(self) -> bool:
-        """Whether it is of two users: one hands over to the other, or they are shown different targets."""
-        return bool(getattr(self, "handover_s", None) or getattr(self, "apart_m", 0.0))
+        """Whether it is of two users."""
+        return False
 
     def begin(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
         """Returns what is asked in a trial, by the number of its target from 0.
@@ -146,6 +146,11 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
     corridor_m: Metres | None = None
     handover_s: Seconds | None = None
     ramp_s: Seconds = 1.0
+
+    @property
+    def needs_pair(self) -> bool:
+        """Whether one hands over to the other."""
+        return self.handover_s is not None
 
     def ask(self, slave: str) -> str:
         """Returns what users are asked for, with what is forbidden and what comes next."""
@@ -310,6 +315,11 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     duration_s: Seconds = 10.0
     width_m: Metres = 0.04
     apart_m: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+
+    @property
+    def needs_pair(self) -> bool:
+        """Whether users are shown different targets."""
+        return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
