@@ -36,7 +36,7 @@ from trilat_net.errors import UsageError, WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
-from trilat_net.net.member_keys import CERTIFICATE, PRIVATE_KEY, read_member_keys
+from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 
 from .page_files import PageFiles
@@ -88,7 +88,6 @@ _SILENT = logging.getLogger("trilat.page")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 """For the library of sockets: what strangers send is counted, and prints no tracebacks."""
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 OFFERED_NS = 600_000_000_000
 """So long an open page has report and log at most."""
@@ -181,7 +180,7 @@ class PageOptions:
         Raises:
             UsageError: with the reason.
         """
-        if self.make_context() is None and self.host not in LOOPBACK and not self.insecure:
+        if self.make_context() is None and self.host not in HERE and not self.insecure:
             raise UsageError(
                 f"--host {self.host}: whoever reads the network reads the page's token and could take part; "
                 "give the keys of a member with --tls, say --insecure if that network is yours, or leave out "
@@ -228,7 +227,7 @@ class PageServer:
         self.refused: Counter[str] = Counter()
         self._next: tuple[Bus, str] | None = None
         self._turn_to(bus, session)
-        self._guarded = options.host not in LOOPBACK
+        self._guarded = options.host not in HERE
         self._links, self._told = RoleLinks(guarded=self._guarded), False
         self.files = PageFiles()
         self._ages = stage is None or stage.shows_ages
@@ -401,7 +400,7 @@ class PageServer:
     def _problem_of(self, request: Request, query: str) -> str | None:
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
-        if not self._guarded and name not in LOOPBACK:
+        if not self._guarded and name not in HERE:
             return "foreign host"  # a name of somebody else's that leads here
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{self._scheme}://{host}":

@@ -23,14 +23,9 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
 from trilat_net.net.wire import decode, split_states
-from trilat_net.scenario import (
-    Scenario,
-    initial_link_tables,
-    parse_core_change,
-    parse_embedded,
-    scheduled_link_tables,
-)
+from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
 from trilat_net.scenario.operators.kernel_operators import find_live_hand
+from trilat_net.scenario.run_changes import initial_link_tables, scheduled_link_tables
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0

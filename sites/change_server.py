@@ -18,15 +18,14 @@ from trilat_net.net.bus import Query, QueryInbox
 from trilat_net.net.messages import MODE_WORDS
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
-from trilat_net.scenario import (
-    Scenario,
-    find_owner,
+from trilat_net.scenario import Scenario, find_owner
+from trilat_net.scenario.run_changes import (
     initial_link_tables,
+    make_site_order,
     resolve_change,
     scheduled_link_tables,
     to_core_change,
 )
-from trilat_net.scenario.run_changes import make_site_order
 from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100

@@ -22,7 +22,7 @@ from trilat_net.net.connection import Connection, open_bus
 from trilat_net.net.membership import read_messages
 from trilat_net.net.requests import HandMessage, HandViewMessage
 from trilat_net.process import Interrupt
-from trilat_net.scenario import Scenario, find_site
+from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
 
 POLL_NS = 500_000
@@ -109,7 +109,6 @@ def run_hand(
         SessionError: the site does not ask in time.
         RunFailed: its class failed.
     """
-    find_site(scenario, name)
     at = place_own_hand(scenario, name)
     if at is None or not at.runs_alone:
         problem = "has no hand of kind 'own' with process = true"

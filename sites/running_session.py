@@ -21,7 +21,6 @@ from trilat_net.net.discovery import (
     REPLY_TIMEOUT_S,
     connect_to_session,
     find_members,
-    find_site_info,
     list_past_events,
     send_change,
 )
@@ -113,7 +112,7 @@ class RunningSession:
             give_up_ns = self._clock.monotonic_ns() + int(timeout_s * 1e9)
             while True:
                 with suppress(SessionError) if self._clock.monotonic_ns() < give_up_ns else nullcontext():
-                    info = _find_running(bus, self._clock, self.name, site)
+                    info = self._find_running(bus, site)
                     break
                 self._clock.sleep_until(self._clock.monotonic_ns() + 50_000_000)
             yield bus, parse_embedded(info.scenario, self.name)
@@ -218,6 +217,26 @@ class RunningSession:
             )
         return scenario, found
 
+    def _find_running(self, bus: Bus, site: str) -> Info:
+        """Returns what a site answers that runs.
+
+        Raises:
+            SessionError: the session has no such site, or has not begun, or the site does not answer in time.
+        """
+        clock, session, names = self._clock, self.name, embedded_names_reader(self.name)
+        for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
+            if info.member == site and not info.running:
+                raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
+            if info.member == site:
+                return info
+            sites = names(info.scenario) if info.scenario else ()
+            if sites and site not in sites:
+                known = f"its sites are {', '.join(sites)}"
+                raise SessionError(f"session {session!r} has no site {site!r}; {known}")
+        raise SessionError(
+            f"site {site!r} of session {session!r} does not answer; other endpoints are named with --connect"
+        )
+
     def set_link(self, link: str, **to: Any) -> str:
         """Changes keys of a link such as "m1->s", as in `delay_ms=350`; as `trilat set link`."""
         return self._change(link.partition("->")[2], link=link, to=to)
@@ -239,7 +258,7 @@ class RunningSession:
             SessionError: the session has no such site, has not begun, or the site does not reply.
         """
         with self.reach() as bus:
-            _find_running(bus, self._clock, self.name, site)
+            self._find_running(bus, site)
             return send_change(bus, self._clock, self.name, site, request)
 
     @contextmanager
@@ -281,7 +300,7 @@ class RunningSession:
                 if not as_site or as_site not in newest:
                     return {} if as_site else newest
                 if as_site not in pictures:
-                    info = _find_running(bus, self._clock, self.name, as_site)
+                    info = self._find_running(bus, as_site)
                     pictures[as_site] = PictureDelay(parse_embedded(info.scenario, self.name), as_site)
                 own = newest[as_site]
                 shown = pictures[as_site].at(own.tick, own.used)
@@ -317,7 +336,7 @@ class RunningSession:
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
         """Listens to a site; yields a function that returns its present shares in its peers, by name."""
         with self.reach("") as bus:
-            info = _find_running(bus, self._clock, self.name, site)
+            info = self._find_running(bus, site)
             kinds = topics.STATE, topics.EVENT
             records, events = (bus.inbox(topics.key(self.name, site, kind), 256) for kind in kinds)
             scenario, now_ns = parse_embedded(info.scenario, self.name), 0
@@ -339,13 +358,6 @@ class RunningSession:
         found = ping_session(self._connection, self._clock, self.name, count, timeout_s, lambda: False)
         assert found is not None  # nothing stops it
         return found
-
-
-def _find_running(bus: Bus, clock: Clock, session: str, site: str) -> Info:
-    info = find_site_info(bus, clock, session, site, embedded_names_reader(session))
-    if not info.running:
-        raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
-    return info
 
 
 def session(

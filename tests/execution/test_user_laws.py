@@ -14,9 +14,9 @@ from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
-from trilat_net.scenario import load_scenario, to_core_change
+from trilat_net.scenario import load_scenario
 from trilat_net.scenario.code_consent import find_user_laws
-from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
+from trilat_net.scenario.run_changes import initial_link_tables, resolve_change, to_core_change
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}

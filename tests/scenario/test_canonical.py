@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenario.links import links
-from trilat_net.scenario import list_shipped, load_scenario, parse_scenario, read_shipped
+from trilat_net.scenario import list_shipped, load_scenario, parse_scenario
+from trilat_net.scenario.scenario_reader import read_shipped
 
 TEXT = read_shipped("paper")
 NAMES = ("m1", "m2", "s")

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from trilat_net.core.channel import LOST
 from trilat_net.core.delay import MAX_DELAY_US, TraceEnd
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import load_scenario, parse_scenario, read_shipped
+from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario.delay_traces import MAX_TRACE_POINTS, format_trace, parse_trace, read_trace
+from trilat_net.scenario.scenario_reader import read_shipped
 
 POINTS = [[0, 41_200], [1_000, LOST], [2_500, 0]]
 TEXT = "0 41200, 1000 lost, 2500 0"

@@ -16,14 +16,11 @@ from trilat_net.execution import virtual
 from trilat_net.scenario import (
     Scenario,
     find_owner,
-    initial_link_tables,
     load_scenario,
     parse_core_change,
-    read_shipped,
-    resolve_change,
-    to_core_change,
 )
-from trilat_net.scenario.scenario_reader import parse_scenario
+from trilat_net.scenario.run_changes import initial_link_tables, resolve_change, to_core_change
+from trilat_net.scenario.scenario_reader import parse_scenario, read_shipped
 
 S = 10**9
 LINK = {"at_s": 8.0, "link": "m1->s", "to": {"delay_ms": 350.0}}

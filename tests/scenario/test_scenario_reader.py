@@ -16,9 +16,9 @@ from trilat_net.scenario import (
     list_shipped,
     load_scenario,
     parse_scenario,
-    read_shipped,
     read_template,
 )
+from trilat_net.scenario.scenario_reader import read_shipped
 
 TEXT = read_shipped("paper")
 

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -467,11 +467,9 @@ def router_command(
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
-        try:
+        with closing(bus):
             _say_of_router(f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
             run_router(bus, clock, interrupt.requested, _say_of_router, until_idle)
-        finally:
-            bus.close()
         raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
 
 

@@ -157,23 +157,6 @@ def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterato
             first, made = past.first + len(past.payloads), past.made
 
 
-def find_site_info(bus: Bus, clock: Clock, session: str, site: str, names: SiteNamesOf) -> Info:
-    """Returns the identity of a site of a session.
-
-    Raises:
-        SessionError: the session has no such site, or it does not answer in time.
-    """
-    for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
-        if info.member == site:
-            return info
-        sites = names(info.scenario) if info.scenario else ()
-        if sites and site not in sites:
-            raise SessionError(f"session {session!r} has no site {site!r}; its sites are {', '.join(sites)}")
-    raise SessionError(
-        f"site {site!r} of session {session!r} does not answer; other endpoints are named with --connect"
-    )
-
-
 def open_playback_bus(
     connection: Connection,
     clock: Clock,

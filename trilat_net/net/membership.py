@@ -134,9 +134,6 @@ class LateSites(NamedTuple):
     rate_hz: int = 1
 
 
-NEVER_LATE = LateSites()
-
-
 class Membership:
     """The other members of a session, as one member knows them; a recorder, without sites, learns these.
 
@@ -152,7 +149,7 @@ class Membership:
         session: str,
         publisher: EventPublisher,
         sites: Sequence[str],
-        late: LateSites = NEVER_LATE,
+        late: LateSites,
     ) -> None:
         self.met: dict[str, Info] = {}
         self.alive: set[str] = set()

@@ -20,7 +20,6 @@ from .bus import Bus
 from .clock import Clock
 from .membership import (
     LATE_GATHER_NS,
-    NEVER_LATE,
     Epoch,
     EventPublisher,
     LateSites,
@@ -51,7 +50,7 @@ class SessionJoin:
         session: str,
         publisher: EventPublisher,
         sites: Sequence[str],
-        late: LateSites = NEVER_LATE,
+        late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
         self._clock, self._session, self._publisher = clock, session, publisher
         self._sites, self._late = tuple(sites), late

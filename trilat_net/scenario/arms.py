@@ -17,15 +17,13 @@ from msgspec import Meta
 from .. import fields
 from ..core.chain import (
     ChainJoint,
+    Three,
     apply,
     build_chain,
     mass_matrix,
     multiply,
     place_end_effector,
     place_joints,
-)
-from ..core.chain import (
-    Three as Vector3,
 )
 from ..core.rotation import rotation_matrix, turn_between
 from ..core.site_setup import ChainSetup, Gains, Law, RestGains, TaskSetup
@@ -34,7 +32,7 @@ from ..core.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
-Three = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
+ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
 TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
 STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
@@ -90,13 +88,13 @@ class Arm(fields.Frozen, frozen=True):
     known: bool = True
     dead_man: bool = False
     urdf: str = ""
-    base_xyz_m: Three = (0.0, 0.0, 0.0)
-    base_rpy_rad: Three = (0.0, 0.0, 0.0)
+    base_xyz_m: ThreeReals = (0.0, 0.0, 0.0)
+    base_rpy_rad: ThreeReals = (0.0, 0.0, 0.0)
     base: str = ""
     tip: str = ""
-    down: Three = (0.0, 0.0, -1.0)
+    down: ThreeReals = (0.0, 0.0, -1.0)
     payload_kg: fields.NotNegative = 0.0
-    payload_com_m: Three = (0.0, 0.0, 0.0)
+    payload_com_m: ThreeReals = (0.0, 0.0, 0.0)
     payload_inertia_kg_m2: Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length=6)] = (0.0,) * 6
     armature_kg_m2: fields.NotNegativeJoints = (0.0,)
     stops: bool = True
@@ -324,8 +322,8 @@ _read_cached = lru_cache(maxsize=64)(read_urdf)
 
 
 def _place_base(
-    arm: Arm, joints: tuple[ChainJoint, ...], gravity: Vector3
-) -> tuple[tuple[ChainJoint, ...], Vector3]:
+    arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
+) -> tuple[tuple[ChainJoint, ...], Three]:
     """Returns the joints of a chain, and gravity, in the frame that the sites share."""
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity

@@ -104,9 +104,8 @@ def format_trace(rows: Sequence[TracePoint]) -> str:
         if not math.isfinite(t_s) or t_s < 0.0:
             raise ValueError(f"{where}its time must be finite and not negative, is {t_s:g} s")
         if math.isnan(delay_ms) or delay_ms < 0.0 or LONGEST_MS < delay_ms < math.inf:
-            raise ValueError(
-                f"{where}its delay must be from 0 to {LONGEST_MS:g} ms or {_LOST!r}, is {delay_ms:g}"
-            )
+            bounds = f"from 0 to {LONGEST_MS:g} ms or {_LOST!r}"
+            raise ValueError(f"{where}its delay must be {bounds}, is {delay_ms:g}")
         t_us = round((t_s - rows[0][0]) * 1e6)
         if t_us <= before_us:
             raise ValueError(f"{where}its time, {t_s:g} s, must be later than that of the point before it")

@@ -18,7 +18,6 @@ from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
-JointPose = Joints  # of an expectation: written out, never one number for all
 
 _WHERE = ("from_s", "to_s", "site")
 ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
@@ -196,7 +195,7 @@ class Expect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     end_error_max_rad: NotNegative | None = None
     end_error_min_rad: NotNegative | None = None
     end_spread_max_rad: NotNegative | None = None
-    end_pose_rad: dict[str, JointPose] = {}
+    end_pose_rad: dict[str, Joints] = {}  # written out, never one number for all joints
     end_pose_within_rad: Positive = 0.01
     peak_torque_max_nm: NotNegative | None = None
     peak_speed_max_rad_s: NotNegative | None = None
