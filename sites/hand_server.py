@@ -65,7 +65,7 @@ class HandServer:
         self._names: dict[int, str] = {}
         self.news: list[tuple[int, str]] = []
 
-    def take(self, k: int, _arrays: SiteArrays | None = None) -> list[float]:
+    def track(self, _site: Site, k: int) -> list[float]:
         """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
         came = _read_messages(self._inbox, self._site, self._dropped)
         commands = [command for message in came if (command := self._read(message)) is not None]
@@ -116,11 +116,11 @@ class RemoteHand(HandPlayer):
         self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
         self._clock, self._asked, self._source = clock, -1, at.source
 
-    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+    def track(self, site: Site, k: int) -> list[float]:
         """Returns what it does in tick k, by the decisions that have come."""
         for message in self._read():
             self._decide(k, message)
-        return super().take(k, arrays)
+        return super().track(site, k)
 
     def ask(self, k: int, arrays: SiteArrays) -> None:
         """Sends it what it sees."""

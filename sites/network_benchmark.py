@@ -139,9 +139,8 @@ def _open(endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bo
         raise UsageError(f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s")
     used = keys if encrypted else None
     at_end = Connection(listen=[endpoint]) if listens else Connection(connect=[endpoint])
-    return secure_connection(
-        at_end, used, insecure=insecure
-    ).open(), used.member if used else FAR if listens else NEAR
+    bus = secure_connection(at_end, used, insecure=insecure).open()
+    return bus, used.member if used else FAR if listens else NEAR
 
 
 def run_far_end(

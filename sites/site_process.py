@@ -245,7 +245,7 @@ class RunningSite:
         """Steps the site; None if its law failed, which ends the run."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
-        hand = () if parts.hand is None else parts.hand.take(k, parts.site.arrays)
+        hand = () if parts.hand is None else parts.hand.track(parts.site, k)
         try:
             if parts.plant is not None:
                 measured = parts.plant.state

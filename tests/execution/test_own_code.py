@@ -81,7 +81,7 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
     def take(site: Site, k: int) -> list[float]:
         if player.hand.is_asked(k):
             seen.append(player.hand.view(k, site.arrays, scenario.layout("m2")))
-        return player.take(k, site.arrays)
+        return player.track(site, k)
 
     log = simulate_scenario(scenario, hands={"m2": take})
     for view in seen[15:]:

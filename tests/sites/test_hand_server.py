@@ -123,8 +123,8 @@ class Served:
         assert live is not None
         key = topics.key("t", "m1", topics.HAND)
         inbox = network.join().inbox(key, MESSAGES_KEPT)
-        site: Any = SimpleNamespace(name="m1", rate_hz=1000, q=[0.3, 0.4])
-        self.server = HandServer(site, live, arm, inbox, self.dropped)
+        self._site: Any = SimpleNamespace(name="m1", rate_hz=1000, q=[0.3, 0.4])
+        self.server = HandServer(self._site, live, arm, inbox, self.dropped)
         self.publish = network.join().publisher(key)
         self.k = -1
 
@@ -132,7 +132,7 @@ class Served:
         for message in messages:
             self.publish(message)
         self.k += 1
-        return HandInForce.read(self.server.take(self.k))
+        return HandInForce.read(self.server.track(self._site, self.k))
 
 
 def message(**fields: Any) -> bytes:

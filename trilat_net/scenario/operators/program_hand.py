@@ -133,15 +133,11 @@ class HandPlayer:
         self._rate_hz = at.scenario.sites[at.name].rate_hz
         self.hand = at.make_hand()
 
-    def take(self, k: int, arrays: SiteArrays) -> list[float]:
+    def track(self, site: Site, k: int) -> list[float]:
         """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
-        step = self.hand.advance(k, self._begin(k, arrays))
+        step = self.hand.advance(k, self._begin(k, site.arrays))
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
-
-    def track(self, site: Site, k: int) -> list[float]:
-        """Does as `take` at a site."""
-        return self.take(k, site.arrays)
 
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
