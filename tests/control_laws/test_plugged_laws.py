@@ -62,7 +62,7 @@ def test_its_log_is_executed_again(law: str) -> None:
 
 DIGITAL = ("wave", "tdpa", "tanks")
 FOR_TWO = ("p_f", *DIGITAL)
-RULE = {"action": "glide", "align_limit_rad": 4.0, "align_speed_rad_s": 2.0}
+RULE: dict[str, Any] = {"action": "glide", "align_limit_rad": 4.0, "align_speed_rad_s": 2.0}
 
 
 @pytest.mark.long
@@ -94,3 +94,29 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
         assert largest_step(log, site) <= RATE_NM_S * 1e-3 * (1.0 + 1e-9), site
         assert np.isfinite(log[site].tau).all()
     assert verify(log).differing == 0
+
+
+CALM = [law for law in ALL_LAWS if law not in ("own", "six_channel", "adaptive_kinematics", "sync")]
+"""Those that are stable with these arms and shares, from so far apart."""
+
+
+@pytest.mark.parametrize(
+    "law", [x if x in DIGITAL else pytest.param(x, marks=pytest.mark.long) for x in CALM]
+)
+def test_arms_that_begin_far_apart_come_together_slowly(law: str) -> None:
+    """3 rad apart, at 2 rad/s and what the law adds, at the start and after a stop; no spring is wound up."""
+    name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
+    first, *others = load_scenario(name).names
+    keys = {
+        "duration_s": 6.0,
+        "control.law": law,
+        "link.delay_ms": 20.0,
+        **{f"sites.{site}.hands": [] for site in (first, *others)},
+        f"sites.{first}.q0_rad": [3.2, 1.2],
+        **{f"sites.{other}.q0_rad": [0.2, 1.5] for other in others},
+        **{f"on_stale.{key}": value for key, value in RULE.items()},
+        **({"scheme": "digital"} if law in DIGITAL else {}),
+    }
+    log = ordered(load_scenario(name, {**settings, **keys}), {"s": {1200: "stop", 4000: "enable"}})
+    for site in log.sites:
+        assert np.abs(log[site].qd).max() < 2.5 * RULE["align_speed_rad_s"], site

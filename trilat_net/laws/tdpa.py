@@ -4,7 +4,8 @@ Invariant: in every directed coupling of a follower to a leader each end books, 
 the energy that it puts in; the other end takes out no more than it knows of.
 
 A follower is moved by F = K (goal - q) + B (v - qd), goal += h v, v = sum alpha_j v_j: the velocities of the
-peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a coupling each way.
+peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a coupling each way. While a site
+waits, aligns or holds, what its reference lacks of the way to the peers adds to the goal, at no cost.
 """
 
 import math
@@ -175,7 +176,8 @@ def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
 
     What the damper takes in other periods repays that, and no more.
     """
-    unpaid = law.force[i] * (now.q[i] - now.q_before[i]) + spring - law.spring[i] - law.paid[i]
+    moved = now.q[i] - now.q_before[i] - law.aligned[i]
+    unpaid = law.force[i] * moved + spring - law.spring[i] - law.paid[i]
     for j in range(len(now.peers)):
         at = j * now.joints + i
         if law.by_step and now.k > 0:
@@ -207,7 +209,7 @@ def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float
         part = law.left[j * n + i] / room if room > 0.0 else 0.0
         book_follower(law, now, j, i, now.peers[j].alpha * force, part * force * more * h)
     law.goal[i] += h * velocity
-    law.force[i], law.paid[i] = force, force * velocity * h
+    law.force[i], law.paid[i] = force, force * velocity * h + force * law.aligned[i]
 
 
 @compiled
@@ -220,7 +222,9 @@ def follow(law: Any, now: LawInput, i: int) -> None:
         velocity += now.peers[j].alpha * now.peers[j].qd[i]
     if now.k == 0:
         law.goal[i] = target
-    stretch = law.goal[i] - now.q[i]
+    way = now.q_des[i] - target
+    law.aligned[i] = 0.5 * h * (now.qd_des[i] - velocity) if way != 0.0 else 0.0  # in half a period
+    stretch = law.goal[i] + way - now.q[i]
     pull = max(law.low[i], min(law.high[i], K * stretch))
     charge_unpaid(law, now, i, pull * (stretch - 0.5 * pull / K) if K > 0.0 else 0.0)
     law.force[i] = max(law.low[i], min(law.high[i], K * stretch + B * (velocity - now.qd[i])))
@@ -291,7 +295,7 @@ class Tdpa(EnergyLaw):
         self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
         self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
         self.goal, self.ahead, self.low, self.high = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n
-        self.change = [0.0] * n
+        self.change, self.aligned = [0.0] * n, [0.0] * n
         self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
         self.E_moved, self.E_yielded, self.lent, self.E_settled = ([0.0] * (n * peers) for _ in range(4))
         self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
