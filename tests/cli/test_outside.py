@@ -52,7 +52,7 @@ def test_law_of_page_holds_arms_together_as_it_says(tmp_path: Path, monkeypatch:
     assert tn.certify(log).stability == "stable"
     errors = np.abs(np.stack([log[name].e for name in log.scenario.names]))
     rest = np.stack([log[name].q[-1] for name in log.scenario.names])
-    for said, measured in (("%.3f rad from", errors.max()), ("at (%.3f, %.3f) rad", rest.mean(axis=0))):
+    for said, measured in (("more than %.3f rad,", errors.max()), ("at (%.3f, %.3f) rad", rest.mean(axis=0))):
         assert said % (measured if measured.ndim == 0 else tuple(measured)) in DOC.read_text()
     assert errors[:, -1].max() < 1e-6
     assert np.ptp(rest, axis=0).max() < 1e-6
