@@ -65,29 +65,37 @@ FOR_TWO = ("p_f", *DIGITAL)
 RULE: dict[str, Any] = {"action": "glide", "align_limit_rad": 4.0, "align_speed_rad_s": 2.0}
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("law", [law for law in ALL_LAWS if law != "own"])
-def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> None:
-    """Arms begin 3 rad apart, links are cut, a site is stopped, the first one in fault; from tick 0 on."""
+def set_apart(law: str, **more: Any) -> Scenario:
+    """Arms 3 rad apart, which align at 2 rad/s."""
     name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
     first, *others = load_scenario(name).names
     keys = {
-        "duration_s": 9.0,
         "control.law": law,
         "link.delay_ms": 20.0,
-        "link.outages_s": [[4.0, 4.5]],
-        "limits.tau_rate_limit_nm_s": RATE_NM_S,
         f"sites.{first}.q0_rad": [3.2, 1.2],
         **{f"sites.{other}.q0_rad": [0.2, 1.5] for other in others},
         **{f"on_stale.{key}": value for key, value in RULE.items()},
         **({"scheme": "digital"} if law in DIGITAL else {}),
+    }
+    return load_scenario(name, {**settings, **keys, **more})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", [law for law in ALL_LAWS if law != "own"])
+def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> None:
+    """Arms begin 3 rad apart, links are cut, a site is stopped, the first one in fault; from tick 0 on."""
+    more: dict[str, Any] = {
+        "duration_s": 9.0,
+        "link.outages_s": [[4.0, 4.5]],
+        "limits.tau_rate_limit_nm_s": RATE_NM_S,
         **({"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}),  # elbows bent, and none hangs
     }
+    apart = set_apart(law, **more)
     orders = {
         "s": {2800: "stop", 3200: "enable", 3230: "stop", 3300: "enable", 7000: "stop", 7040: "enable"},
-        first: {5500: "arm_lost", 5530: "stop", 6000: "reset", 6050: "arm_lost", 6400: "reset"},
+        apart.names[0]: {5500: "arm_lost", 5530: "stop", 6000: "reset", 6050: "arm_lost", 6400: "reset"},
     }
-    log = ordered(load_scenario(name, {**settings, **keys}), orders)
+    log = ordered(apart, orders)
     modes = {str(mode) for site in log.sites for mode in log[site].mode}
     assert {"waiting", "return", "run", "hold", "stopped", "fault"} <= modes
     for site in log.sites:
@@ -105,18 +113,8 @@ CALM = [law for law in ALL_LAWS if law not in ("own", "six_channel", "adaptive_k
 )
 def test_arms_that_begin_far_apart_come_together_slowly(law: str) -> None:
     """3 rad apart, at 2 rad/s and what the law adds, at the start and after a stop; no spring is wound up."""
-    name, settings = LAWS.get(law, ("two_sites" if law in FOR_TWO else "paper", {}))
-    first, *others = load_scenario(name).names
-    keys = {
-        "duration_s": 6.0,
-        "control.law": law,
-        "link.delay_ms": 20.0,
-        **{f"sites.{site}.hands": [] for site in (first, *others)},
-        f"sites.{first}.q0_rad": [3.2, 1.2],
-        **{f"sites.{other}.q0_rad": [0.2, 1.5] for other in others},
-        **{f"on_stale.{key}": value for key, value in RULE.items()},
-        **({"scheme": "digital"} if law in DIGITAL else {}),
-    }
-    log = ordered(load_scenario(name, {**settings, **keys}), {"s": {1200: "stop", 4000: "enable"}})
+    apart = set_apart(law, duration_s=6.0)
+    unheld = load_scenario(apart, {f"sites.{site}.hands": [] for site in apart.names})
+    log = ordered(unheld, {"s": {1200: "stop", 4000: "enable"}})
     for site in log.sites:
         assert np.abs(log[site].qd).max() < 2.5 * RULE["align_speed_rad_s"], site

@@ -132,12 +132,11 @@ class ExperimentAnalysis(Result):
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the threshold of each participant and condition, of a staircase that turned often enough."""
         plan, choices = self._experiment.plan, self._experiment.list_choices()
-        for trial in plan.trials:
-            stairs = plan.protocol.staircase
-            if stairs is None or trial.trial > 1 or (who := "-".join(trial.group)) in self._exclude:
-                continue
+        if (stairs := plan.protocol.staircase) is None:
+            return
+        for trial in (one for one in plan.trials if one.trial == 1):
             threshold = stairs.find_threshold(plan.judge_choices(trial, choices))
-            if threshold is not None:
+            if threshold is not None and (who := "-".join(trial.group)) not in self._exclude:
                 yield {self.unit: who, "condition": trial.condition, stairs.measure: threshold}
 
     def _write_methods(self) -> str:

@@ -112,7 +112,7 @@ class Experiment(Result):
     def list_choices(self) -> Choices:
         """Returns what was chosen of the pairs of a staircase so far."""
         found = dict[tuple[tuple[str, ...], int], list[float]]()
-        for note in self.read_notes():
+        for note in self.read_notes() if self.plan.protocol.staircase else ():
             if note.text == CHOICE:
                 last = self.plan.trials[note.number - 1]
                 found.setdefault((last.group, last.block), []).append(note.answers[CHOICE])
