@@ -34,7 +34,7 @@ COPY containers/entry.py /opt/trilat/entry.py
 ENV XDG_CACHE_HOME=/opt/trilat/cache
 RUN /opt/trilat/bin/trilat sim paper --duration 0.1 -o /tmp/run.mcap \
     && /opt/trilat/bin/trilat report /tmp/run.mcap \
-    && /opt/trilat/bin/python -c 'import sites.site_process, recorder.record_process' \
+    && /opt/trilat/bin/python -c 'import recorder.record_process, sites.site_process, trilat_net as tn; from sites.site_parts import warm_up; warm_up(tn.load_scenario("paper"), "m1")' \
     && chmod -R a+rX /opt/trilat
 
 FROM ${BASE}

@@ -28,7 +28,7 @@ from trilat_net.studies.experiment.protocol import PlannedTrial, Step
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .experiment_stage import Stage, TrialWatch
-from .page_server import PageOptions, PageServer, serve_page
+from .page_server import PageOptions, PageServer
 
 TRIES = "tries"
 POLL_NS = 20_000_000
@@ -209,7 +209,7 @@ def run_with_people(experiment: Experiment, options: PageOptions, say: Callable[
     with Interrupt() as interrupt, closing(ZenohBus()) as idle:
         for scenario in plan.scenarios.values():
             compile_core(scenario, say, interrupt)
-        with serve_page(idle, clock, name, options, say, ends=True, stage=stage) as page:
+        with PageServer(idle, clock, name, options, ends=True, say=say, stage=stage) as page:
 
             def run_session(watch: TrialWatch, folder: Path, begins: Callable[[], bool]) -> SessionResult:
                 attend = partial(_attend, page, idle, watch)

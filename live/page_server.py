@@ -136,8 +136,7 @@ class Page:
         self.hands, self.takes_part = hands, takes_part
         self.asks: tuple[set[Page], int] | None = None
         self.wake = asyncio.Event()
-        self.drawn = self.sent = 0
-        self.notified = 0
+        self.drawn = self.sent = self.notified = 0
         self.unseen: deque[int] = deque()
         self.points = self.energies = self.events = 0
         self.greeted = False
@@ -194,7 +193,7 @@ class PageOptions:
 
 
 class PageServer:
-    """Serves one session's page; a context, inside of which the server's thread runs.
+    """Serves one session's page; a context, at whose beginning a browser is opened at it.
 
     Args:
         options: how it is served; at another address than this machine's links need their tokens.
@@ -222,16 +221,15 @@ class PageServer:
         self._clock, self._ends, self._say, self._stage = clock, ends, say, stage
         self._host, self._port, self._tls = options.host, options.port, options.make_context()
         self._scheme = "http" if self._tls is None else "https"
-        self._met = 0
         self._pages: set[Page] = set()
         self.refused: Counter[str] = Counter()
         self._next: tuple[Bus, str] | None = None
         self._turn_to(bus, session)
-        self._guarded = options.host not in HERE
+        self._guarded, self._opens = options.host not in HERE, options.opens
         self._links, self._told = RoleLinks(guarded=self._guarded), False
         self.files = PageFiles()
         self._ages = stage is None or stage.shows_ages
-        self._n = 0
+        self._met = self._n = 0
         self.end_requested = threading.Event()
         self.address = ""
         self._ready = threading.Event()
@@ -246,6 +244,11 @@ class PageServer:
         self._ready.wait()
         if self._problem is not None:
             raise UsageError(f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}")
+        self._say(f"experimenter: {self.address}")
+        screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if self._opens and sys.stdout.isatty() and (screen or not sys.platform.startswith("linux")):
+            with suppress(OSError, webbrowser.Error):
+                webbrowser.open(self.address)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -616,8 +619,8 @@ class PageAttendant(ExitStack):
     ) -> Iterator[Callable[[], bool]]:
         """The `SessionAttendant` that serves the page, until that asks for the end of the session."""
         bus = self.enter_context(closing(ZenohBus([], endpoints)))
-        serving = serve_page(bus, self._clock, session, self._options, say, ends=True)
-        self._page = self.enter_context(serving)
+        page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
+        self._page = self.enter_context(page)
         yield self._page.end_requested.is_set
         self._page.tell_refused()
 
@@ -636,32 +639,10 @@ class PageAttendant(ExitStack):
 
 
 @contextmanager
-def serve_page(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    options: PageOptions,
-    say: Callable[[str], None],
-    *,
-    ends: bool,
-    stage: "Stage | None" = None,
-) -> Iterator[PageServer]:
-    """Serves a page inside the block, and opens a browser at it."""
-    with PageServer(bus, clock, session, options, ends=ends, say=say, stage=stage) as page:
-        say(f"experimenter: {page.address}")
-        with suppress(OSError, webbrowser.Error):
-            screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-            shows = bool(screen) or not sys.platform.startswith("linux")
-            if options.opens and shows and sys.stdout.isatty():
-                webbrowser.open(page.address)
-        yield page
-
-
-@contextmanager
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
     """The `SessionOnlooker` of a page."""
-    with serve_page(bus, clock, session, options, say, ends=False) as page:
+    with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None
         page.tell_refused()

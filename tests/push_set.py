@@ -1,4 +1,4 @@
-"""Which tests a push waits for: those that take little processor time, and of every file the cheapest few.
+"""Which tests a push waits for: those that take little processor time, and of every file the cheapest.
 
     python -m tests.push_set
 
@@ -20,14 +20,13 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LONG_TESTS = Path(__file__).with_name("long_tests.txt")
-DEAR_S = 0.25
+DEAR_S = 0.15
 """Processor time of a test, children included, that makes it dear."""
 COSTLY = ("core", "execution", "log", "golden", "analysis", "certificate")
-COSTLY_DEAR_S = 1.0
+COSTLY_DEAR_S = 0.5
 """The same where an error costs most: bits, logs and verdicts."""
-FEW = 3
-"""So many tests of a file stay, however dear they are, if they take no more than `MOST_S`."""
-MOST_S = 2.0
+MOST_S = 2.5
+"""The cheapest test of a file stays, however dear it is, if it takes no more than this."""
 _TIMES = "TRILAT_TEST_TIMES"
 
 
@@ -54,7 +53,7 @@ def choose_long_tests(times_s: dict[str, float]) -> list[str]:
         name
         for names in files.values()
         for place, name in enumerate(names)
-        if times_s[name] > (_dear_s(name) if place >= FEW else MOST_S)
+        if times_s[name] > (_dear_s(name) if place else MOST_S)
     )
 
 

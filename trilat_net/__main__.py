@@ -4,6 +4,7 @@ Invariant: what is printed into a file or pipe is UTF-8 with the line ends of PO
 text that is written; a terminal that lacks a letter shows its number.
 """
 
+import atexit
 import io
 import os
 import sys
@@ -17,6 +18,17 @@ def main() -> None:
             if not stream.isatty():
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
+    code = 1
+    atexit.register(lambda: _leave(code))  # first, so that it is called last
+    try:
+        _run()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        raise
+
+
+def _run() -> None:
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
             with suppress(OSError):  # before the other programs of a busy machine, if it may
@@ -30,6 +42,13 @@ def main() -> None:
     from .cli import main as run
 
     run()
+
+
+def _leave(code: int) -> None:
+    if "zenoh" in sys.modules:  # one of its threads that is left aborts a process without an interpreter
+        with suppress(OSError):  # which Python says itself
+            sys.stdout.flush()
+            os._exit(code & 0xFF)
 
 
 if __name__ == "__main__":

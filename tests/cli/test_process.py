@@ -5,6 +5,7 @@ import io
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pandas
@@ -14,6 +15,8 @@ from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
 from trilat_net import __main__, cli
 from trilat_net.files import STUDY_LIBRARIES
+from trilat_net.net.connection import find_free_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.scenario.scenario_reader import read_template
 
 from .running import PLAIN, started, trilat
@@ -36,6 +39,35 @@ def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> No
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err
+
+
+CALLED = """
+import sys, threading, time
+from trilat_net import __main__, cli
+from trilat_net.net.zenoh_bus import ZenohBus
+called = threading.Event()
+def take(key, payload):
+    called.set()
+    time.sleep(0.001)
+def run():
+    bus.tap("key", take)
+    assert called.wait(30.0)
+    sys.exit(3)
+bus = ZenohBus([], [sys.argv[1]])
+cli.main = run
+__main__.main()
+"""
+
+
+def test_a_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
+    """One whose session nobody has closed; it would mostly be aborted, as a closed one is now and then."""
+    endpoints = find_free_endpoints(1)
+    with closing(ZenohBus(endpoints)) as bus:
+        put = bus.publisher("key")
+        process = subprocess.Popen([sys.executable, "-c", CALLED, *endpoints])
+        while process.poll() is None:
+            put(b"")
+    assert process.returncode == 3
 
 
 PROGRAM = """

@@ -411,8 +411,9 @@ def test_a_browser_gets_in_by_the_token_of_its_link() -> None:
     options = PageOptions(host="0.0.0.0", insecure=True)
     with PageServer(LocalNetwork().join(), SystemClock(), "s1", options, say=said.append) as server:
         server.view.scenario = load_scenario("paper")
-        until(lambda: said)
-        link = said[0].removeprefix("user m1: ").replace("0.0.0.0", "127.0.0.1")
+        until(lambda: any(line.startswith("user m1: ") for line in said))
+        (line,) = (line for line in said if line.startswith("user m1: "))
+        link = line.removeprefix("user m1: ").replace("0.0.0.0", "127.0.0.1")
         with browser_page(link, gl=False) as page:
             shows(page, "trilat.hello?.role === 'user' && trilat.hello.as === 'm1'")
             page.goto(link.replace("as=m1", "as=m2"))
