@@ -140,13 +140,10 @@ IN_USE = ("link.delay_ms=300",)
 PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss=0.2")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "delays"),
-    [
-        (150, IN_USE),
-        pytest.param(150, PICTURE, marks=pytest.mark.long),
-        pytest.param(1000, IN_USE, marks=pytest.mark.long),
-    ],
+    [(150, IN_USE), (150, PICTURE), (1000, IN_USE)],
     ids=["in use", "picture", "in use, long"],
 )
 def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...], stage: Stage) -> None:
