@@ -8,7 +8,7 @@ LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
 INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
-.PHONY: help demo play setup test pytest compiled sessions containers push-set lint platforms test-long faults docs bench lock clean
+.PHONY: help demo play setup test pytest sessions containers push-set lint platforms test-long faults docs bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -60,19 +60,13 @@ $(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
 	@touch $@
 
 test:
-	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp compiled
+	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp setup
 	@$(MAKE) --no-print-directory -j2 pytest lint
 	@$(MAKE) --no-print-directory sessions # by itself: real sessions need the time of the cores
 
 pytest: $(VENV)/dev.stamp
 	nice -n 19 $(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal \
-		-m "not live and not long" # some wait
-
-compiled: $(VENV)/core.stamp
-
-$(VENV)/core.stamp: $(VENV)/compiled.stamp
-	$(BIN)/python -m tests.compile_core "six joints" "task space"
-	@touch $@
+		-m "not live and not long" --ignore tests/live # some wait
 
 sessions: $(VENV)/dev.stamp
 	flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep

@@ -1,6 +1,6 @@
 """Compiles the core on all processors, a process for each part: `python -m tests.compile_core [PART...]`.
 
-Without names for the layouts that tests of a push run: else every worker of a test run that begins without
+Without names for the layouts that most tests run: else every worker of a long test run that begins without
 compiled code compiles all of them by itself. `make setup` names what the first demo and its report need. With
 `--into FOLDER` the layouts of the scenarios that ship are compiled for the generic processor of the platform,
 into a folder for a wheel (`.ci/compile-wheel`).

@@ -20,10 +20,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LONG_TESTS = Path(__file__).with_name("long_tests.txt")
-DEAR_S = 0.15
+DEAR_S = 0.1
 """Processor time of a test, children included, that makes it dear."""
 COSTLY = ("core", "execution", "log", "golden", "analysis", "certificate")
-COSTLY_DEAR_S = 0.5
+COSTLY_DEAR_S = 0.3
 """The same where an error costs most: bits, logs and verdicts."""
 MOST_S = 2.5
 """The cheapest test of a file stays, however dear it is, if it takes no more than this."""

@@ -21,6 +21,7 @@ def motion(rate_hz: int, times_s: Array) -> Array:
     return made[..., :6]
 
 
+@pytest.mark.long
 def test_second_order_follows_the_stored_motion() -> None:
     errors = [float(np.abs(motion(rate_hz, TIMES_S) - exact_motion()).max()) for rate_hz in (500, 1000)]
     assert errors[1] <= 5e-5
