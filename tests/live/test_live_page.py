@@ -100,7 +100,7 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
 
 @pytest.mark.long
 def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
-    running = live(stage, "play")
+    running = live(stage, "play", "--set", "rate_hz=250")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     with browser_page(page_address(running), **phone) as page:
         shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
@@ -247,7 +247,7 @@ def test_a_gamepad_rumbles_as_its_arm_meets_the_wall(stage: Stage) -> None:
 @pytest.mark.parametrize("killed", ["browser", "server"])
 def test_an_arm_in_grip_is_free_after_its_page_dies(killed: str, stage: Stage) -> None:
     """The force is 0 at most 320 ms after the last message, and the log says that the hand let go."""
-    session = Session(stage, "play", PAPER, "--duration", "25")
+    session = Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=250")
     session.all()
     ways = connections(session.endpoints)
     page_server = stage.start("page", "live", "--session", "t", "--no-browser", *ways)
@@ -272,7 +272,7 @@ def test_an_arm_in_grip_is_free_after_its_page_dies(killed: str, stage: Stage) -
 @pytest.mark.long
 def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
     """A flood, ten megabytes, NaN, a target a kilometre away: refused and counted, every record is there."""
-    running = live(stage, "play")
+    running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     socket_address = address.replace("http", "ws") + "socket"
     with browser_page(address) as page:
@@ -338,8 +338,9 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
 
 @pytest.mark.long
 def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
-    glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
-    running = live(stage, "two_sites", "--duration", "60", *glide)
+    glide = ("rate_hz=250", "on_stale.action=glide", "on_stale.align_limit_rad=3")
+    options = chain.from_iterable(("--set", one) for one in glide)
+    running = live(stage, "two_sites", "--duration", "60", *options)
     with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.frame.sites.s.mode === 'run'")
         assert page.locator("#alarms .raised").count() == 0
@@ -356,7 +357,9 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
         assert box["height"] > 50.0
         assert 0.0 < box["y"] < page.evaluate("innerHeight") - box["height"]
         assert page.locator(".arm").first.bounding_box() == arm  # what somebody holds stays under the pointer
-        assert page.inner_text("#state") == "s STOPPED"
+        shows(page, "document.querySelector('#state').textContent === 's STOPPED'")
+        page.evaluate("document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'")
+        assert page.locator(".arm").first.bounding_box() == arm
         if "TRILAT_PICTURES" in os.environ:
             page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
         enable = stage.start("enable", "enable", "--session", name, "s", *ways)

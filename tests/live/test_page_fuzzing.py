@@ -101,6 +101,7 @@ def answer_to(address: str, request: bytes) -> bytes:
             return b""
 
 
+@pytest.mark.filterwarnings("ignore:Do not use the .random. module")  # its socket does, in a thread
 @pytest.mark.parametrize(
     ("count", "raw"), [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
 )
