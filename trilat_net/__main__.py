@@ -18,11 +18,10 @@ def main() -> None:
             if not stream.isatty():
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
-    code = 1
+    code: int | None = None
     atexit.register(lambda: _leave(code))  # first, so that it is called last
     try:
         _run()
-        code = 0
     except SystemExit as ended:
         code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
         raise
@@ -44,8 +43,8 @@ def _run() -> None:
     run()
 
 
-def _leave(code: int) -> None:
-    if "zenoh" in sys.modules:  # one of its threads that is left aborts a process without an interpreter
+def _leave(code: int | None) -> None:
+    if code is not None and "zenoh" in sys.modules:  # whose threads abort a process without Python
         with suppress(OSError):  # which Python says itself
             sys.stdout.flush()
             os._exit(code & 0xFF)

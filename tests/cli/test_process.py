@@ -42,13 +42,13 @@ def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> No
 
 
 CALLED = """
-import sys, threading, time
+import sys, threading
 from trilat_net import __main__, cli
 from trilat_net.net.zenoh_bus import ZenohBus
 called = threading.Event()
 def take(key, payload):
     called.set()
-    time.sleep(0.001)
+    threading.Event().wait(0.001)
 def run():
     bus.tap("key", take)
     assert called.wait(30.0)
@@ -59,7 +59,7 @@ __main__.main()
 """
 
 
-def test_a_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
+def test_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
     """One whose session nobody has closed; it would mostly be aborted, as a closed one is now and then."""
     endpoints = find_free_endpoints(1)
     with closing(ZenohBus(endpoints)) as bus:
@@ -68,6 +68,19 @@ def test_a_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
         while process.poll() is None:
             put(b"")
     assert process.returncode == 3
+
+
+GOES_ON = """
+import sys, zenoh
+from trilat_net import __main__, cli
+cli.main = lambda: None
+__main__.main()
+sys.exit(5)
+"""
+
+
+def test_program_that_called_the_command_ends_with_its_own_code() -> None:
+    assert subprocess.run([sys.executable, "-c", GOES_ON], check=False).returncode == 5
 
 
 PROGRAM = """

@@ -67,7 +67,7 @@ def enter(page: Page) -> Controllers:
 
 def served(stage: Stage) -> Process:
     keys = create_keys(stage.folder / "keys", ["operator"])[0]
-    served_by = "--out", str(stage.folder / "out"), "--tls", str(keys), "--set", "rate_hz=100"
+    served_by = "--out", str(stage.folder / "out"), "--tls", str(keys), "--set", "rate_hz=250"
     return stage.start("live", "live", str(SCENARIO), "--no-browser", *served_by)
 
 
