@@ -76,7 +76,7 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
         take_hold(page, 0, 60.0, 10.0)
         shows(page, "trilat.frame.holds.includes('m1')")
         shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
-        assert "you hold it" in page.inner_text(".arm >> nth=0")
+        shows(page, "document.querySelector('.arm').innerText.includes('you hold it')")  # once it is drawn
         page.mouse.up()
         page.fill("#mark-text", "felt it")
         page.click("#mark")
@@ -365,7 +365,7 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
         enable = stage.start("enable", "enable", "--session", name, "s", *ways)
         assert enable.code() == 0, enable
         shows(page, "trilat.frame.sites.s.mode === 'run' && !document.querySelector('#alarms .raised')")
-        assert "takes in" in page.inner_text("#event-list")
+        shows(page, "document.querySelector('#event-list').innerText.includes('takes in')")
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
     assert "*** s STOPPED" in running.text()

@@ -11,7 +11,7 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import OUTSIDE, PATIENCE_S, PLAIN, Session, Stage, executed_again, whole
+from .processes import OUTSIDE, PATIENCE_S, PLAIN, TALKING, Session, Stage, executed_again, whole
 
 ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
 SLOW = """
@@ -49,7 +49,7 @@ def test_law_that_is_too_slow_ends_session_in_order(stage: Stage, monkeypatch: p
 
 def test_a_foreign_arm_joins_a_session_of_two_sites(stage: Stage) -> None:
     """All with a law that is none of ours either, and that sends to all and to each."""
-    options = (*OUTSIDE, "--duration", "2", "--set", "control.law=tests.channel_law:Talking")
+    options = (*OUTSIDE, *TALKING, "--duration", "4", "--set", "rate_hz=250")
     session = Session(stage, "paper", ("m1", "m2", "s"), *options)
     session.all()
     session.processes["s"].prints("waiting for its arm on trilat/t/s/measured")
@@ -57,7 +57,7 @@ def test_a_foreign_arm_joins_a_session_of_two_sites(stage: Stage) -> None:
     session.ends_well()
     log = whole(session.log)
     executed_again(log)
-    assert compare_with_virtual(log).fed.identical == 6000 - log["s"].skipped
+    assert compare_with_virtual(log).fed.identical == 3000 - log["s"].skipped
     assert log["m1"].sent["target[s]"].any()
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01  # it moved, and not by our equations
     assert not log["s"].tau_x.any()  # it measured none
