@@ -61,12 +61,11 @@ $(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
 
 test:
 	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp setup
-	@$(MAKE) --no-print-directory -j2 pytest lint
-	@$(MAKE) --no-print-directory sessions # by itself: real sessions need the time of the cores
+	@$(MAKE) --no-print-directory -j3 sessions pytest lint # real sessions come first: the others give way
 
 pytest: $(VENV)/dev.stamp
-	nice -n 19 $(BIN)/python -m pytest -q -n $$(($$(getconf _NPROCESSORS_ONLN) + 1)) --dist worksteal \
-		-m "not live and not long" --ignore tests/live # some wait
+	nice -n 19 $(BIN)/python -m pytest -q -n $$(getconf _NPROCESSORS_ONLN) --dist worksteal \
+		-m "not live and not long" --ignore tests/live
 
 sessions: $(VENV)/dev.stamp
 	flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
@@ -82,10 +81,10 @@ containers: setup
 	.ci/compose
 
 lint: $(VENV)/dev.stamp
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+	nice -n 19 $(BIN)/ruff check .
+	nice -n 19 $(BIN)/ruff format --check .
+	nice -n 19 $(BIN)/mypy
+	nice -n 19 $(BIN)/lint-imports
 
 platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
