@@ -1,6 +1,8 @@
 """Hypothesis profiles, and the runs that many tests look at."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         own = getattr(getattr(item, "function", None), "_hypothesis_internal_use_settings", None)
         if own is not None and own.max_examples > 10 and _on_a_push(config):  # a test's own number precedes
             item.function._hypothesis_internal_use_settings = settings(own, max_examples=10)
+
+
+@pytest.fixture(autouse=True)
+def _process_as_it_was() -> Iterator[None]:
+    """A site's settings, as a real-time priority and no collector, are not those of the tests after it."""
+    yield
+    assert gc.isenabled()
 
 
 @pytest.fixture

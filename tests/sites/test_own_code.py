@@ -12,7 +12,7 @@ from trilat_net.core.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual import simulate_scenario
-from trilat_net.log.log_reader import Log, open_log
+from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.topics import HAND, key
@@ -73,22 +73,17 @@ def assert_same(log: Log, other: Log) -> None:
             assert np.array_equal(getattr(log[name], signal), getattr(other[name], signal)), (name, signal)
 
 
-def run(session: Session) -> Log:
-    session.relay.run()
-    return open_log(session.path)
-
-
 @pytest.mark.parametrize("kind", [Circle, Follower])
 def test_records_are_alike_wherever_a_hand_runs(kind: type[Any], tmp_path: Path) -> None:
     """In virtual time, live in the process of its site, and live in a process of its own."""
     alone = at_m2(kind.__name__, process=True)
     at, session = begin(alone, tmp_path)
     add_program(session, kind(at.describe()))
-    log = run(session)
+    log = session.run()
     assert_same(log, simulate_scenario(alone))
     (tmp_path / "within").mkdir()
     within = at_m2(kind.__name__)
-    found = run(Session.whole(within, tmp_path / "within"))
+    found = Session.whole(within, tmp_path / "within").run()
     assert_same(found, simulate_scenario(within))
     assert_same(log, found)
     assert verify(log).passed
@@ -98,7 +93,7 @@ def test_thinking_that_is_shorter_than_the_delay_changes_nothing(tmp_path: Path)
     scenario = at_m2("Follower", process=True, delay_ms=20.0)
     at, session = begin(scenario, tmp_path)
     add_program(session, Follower(at.describe()), thinks_ns=15 * MS_NS)
-    assert_same(run(session), simulate_scenario(scenario))
+    assert_same(session.run(), simulate_scenario(scenario))
     assert not any("hand:" in text for text in session.said)
 
 
@@ -106,7 +101,7 @@ def test_a_program_that_is_too_slow_is_counted(tmp_path: Path) -> None:
     scenario = at_m2("Circle", process=True, delay_ms=20.0)
     at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), thinks_ns=70 * MS_NS)
-    log = run(session)
+    log = session.run()
     assert any("hand: late" in text for text in session.said)
     assert log["m2"].hand[-1, 2] == 1.0
     assert verify(log).passed
@@ -116,7 +111,7 @@ def test_a_killed_program_lets_go_and_the_session_goes_on(tmp_path: Path) -> Non
     scenario = at_m2("Circle", process=True)
     at, session = begin(scenario, tmp_path)
     add_program(session, Circle(at.describe()), dies_ns=2_100 * MS_NS)
-    log = run(session)
+    log = session.run()
     assert log.complete
     held = log["m2"].hand[:, 2] > 0.0
     assert held.any()
@@ -141,7 +136,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
                 ended.append(str(failed))
 
     session.relay.add("hand", serve)
-    log = run(session)
+    log = session.run()
     assert ended == [
         "the hand tests.own_code:Failing of m2 failed at tick 400: RuntimeError: no idea; it has let go"
     ]
@@ -166,7 +161,7 @@ def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
             clock.sleep_until(clock.monotonic_ns() + 5 * MS_NS)
 
     session.relay.add("stranger", meddle)
-    assert_same(run(session), simulate_scenario(scenario))
+    assert_same(session.run(), simulate_scenario(scenario))
     assert any("hand: stranger" in text for text in session.said)
 
 
@@ -183,13 +178,13 @@ def test_saying_that_it_is_here_decides_nothing(tmp_path: Path) -> None:
             clock.sleep_until(clock.monotonic_ns() + MS_NS)
 
     session.relay.add("here", say)
-    assert_same(run(session), simulate_scenario(scenario))
+    assert_same(session.run(), simulate_scenario(scenario))
 
 
 @pytest.mark.parametrize("how", ["raise", "nan"])
 def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> None:
     scenario = at_m2("Failing", settings={"how": how})
-    log = run(Session.whole(scenario, tmp_path))
+    log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
     assert [event.text for event in log.events if event.kind == "hand" and "failed at tick 300" in event.text]
     assert log.complete
@@ -197,7 +192,7 @@ def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> 
 
 def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0})
-    log = run(Session.whole(scenario, tmp_path))
+    log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
     assert verify(log).passed
 
@@ -205,7 +200,7 @@ def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
 def test_a_plant_that_fails_ends_the_run_named(tmp_path: Path) -> None:
     scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Torn", "duration_s": 1.0})
     ends: dict[str, object] = {}
-    log = run(Session.whole(scenario, tmp_path, ends=ends))
+    log = Session.whole(scenario, tmp_path, ends=ends).run()
     assert isinstance(ends["s"], PlantFailed)
     assert "the belt is torn" in str(ends["s"])
     assert [event.text for event in log.events if event.kind == "failed" and event.member == "s"]

@@ -48,7 +48,7 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
                 way.__exit__(*error)
 
     watch(session, Both)
-    session.relay.run()
+    session.play()
     log = open_log(session.path)
     for one, true in list(zip(seen, newest, strict=True))[5:]:  # it listens for longer than the delay
         own = one["m1"]
@@ -72,7 +72,7 @@ def test_marks_and_episodes_stand_in_the_log(tmp_path: Path) -> None:
                     judge(success)
 
     session.relay.add("program", run)
-    session.relay.run()
+    session.play()
     told = [event.text for event in open_log(session.path).events if event.kind == "mark"]
     ends = ["succeeded", "failed", "ended"]
     named = zip(("one", "two", "three"), ends, strict=True)
