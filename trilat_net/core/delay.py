@@ -14,7 +14,7 @@ import numpy as np
 from .jit import leaf
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 from .plugged import call_at
-from .vectors import Points, Row
+from .vectors import Points, Row, count_begun
 
 MAX_DELAY_US = 10_000_000
 """No delay is longer; the tail of a distribution is cut off here."""
@@ -196,7 +196,7 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     if model.at_end == _LOOP and count > 1:
         end_us = points[first + count - 1, 0]
         t_us %= 2 * end_us - points[first + count - 2, 0]
-    before = int(np.searchsorted(points[first : first + count, 0], t_us, side="right")) - 1
+    before = count_begun(points, first, count, t_us) - 1
     delay_us: int = points[first + max(before, 0), 1]
     return delay_us
 

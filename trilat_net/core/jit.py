@@ -199,14 +199,16 @@ class _LeafCache(FunctionCache):
         self._shipped = files(str(_SHIPPED / place.name), base, stamp)
         self._within = files(str(place), f"{base}-within", stamp)
 
-    def _load_overload(self, signature: Any, context: Any) -> Any:
-        found = super()._load_overload(signature, context)
-        if found is None and _ships:
-            triple = context.codegen().magic_tuple()[0]
-            generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
-            kept = self._shipped.load(self._index_key(signature, generic))
-            found = None if kept is None else self._impl.rebuild(context, kept)
-        return found
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Returns what is kept, or None; Numba first readies itself to compile, which takes far longer."""
+        with self._guard_against_spurious_io_errors():
+            found = self._load_overload(signature, context)
+            if found is None and _ships:
+                triple = context.codegen().magic_tuple()[0]
+                generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
+                kept = self._shipped.load(self._index_key(signature, generic))
+                found = None if kept is None else self._impl.rebuild(context, kept)
+            return found
 
     def _save_overload(self, signature: Any, made: Any) -> None:
         if _CACHE is not None:
@@ -346,7 +348,7 @@ def compile_named(function: Callable[..., None], name: str, signature: Any, **op
     The name goes into the symbols of the machine code: no two closures may share one in any process.
     """
     function.__qualname__ = name
-    dispatcher = numba.njit(**options)(function)
+    dispatcher = numba.njit(**{**_OPTIONS, **options})(function)
     dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)
     return dispatcher

@@ -11,7 +11,7 @@ from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .jit import leaf
 from .site_setup import Law
 from .two_link_arm import forward_dynamics, inertia, regressor
-from .vectors import Array, Pair, Row, Vector, five, pair, put_five, put_pair
+from .vectors import Array, Pair, Row, Vector, five, pair, put
 
 _ADAPTIVE = int(Law.ADAPTIVE)
 
@@ -24,19 +24,19 @@ def update_errors(s: Row) -> None:
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
     Y = regressor(s.g, q, qd, v, a)
-    put_pair(s.e, e)
-    put_pair(s.ed, ed)
-    put_pair(s.r, r)
-    put_five(s.Y[0], Y[0])
-    put_five(s.Y[1], Y[1])
-    put_five(s.Yr, control.regressor_transpose_times(Y, r))
+    put(s.e, e)
+    put(s.ed, ed)
+    put(s.r, r)
+    put(s.Y[0], Y[0])
+    put(s.Y[1], Y[1])
+    put(s.Yr, control.regressor_transpose_times(Y, r))
 
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
     """Advances the estimate by a time of `gain_s`, Eq. (15), within its box."""
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
-    put_five(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
+    put(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
 
 
 @leaf
@@ -55,7 +55,7 @@ def update_torque(s: Row) -> None:
         gains = (s.K, s.d, s.Kd, s.k_f)
         tau = control.damped_torque(s.known, s.g, *gains, s.q, s.qd, s.e, s.ed, s.felt, inf)
     limit = s.tau_limit
-    put_pair(s.tau, (control.limit_torque(tau[0], limit[0]), control.limit_torque(tau[1], limit[1])))
+    put(s.tau, (control.limit_torque(tau[0], limit[0]), control.limit_torque(tau[1], limit[1])))
 
 
 @leaf
@@ -68,7 +68,7 @@ def put_gravity_torque(s: Row, torque: Array) -> None:
 def put_gravity(s: Row, theta: Array, torque: Array) -> None:
     """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
     outer = s.Y[1, 4] * theta[4]
-    put_pair(torque, (s.Y[0, 3] * theta[3] + outer, outer))
+    put(torque, (s.Y[0, 3] * theta[3] + outer, outer))
 
 
 @leaf
@@ -78,8 +78,8 @@ def update_model(s: Row) -> None:
     if s.needs_model != 0:
         q, qd = pair(s.q), pair(s.qd)
         M = inertia(s.known, q)
-        put_pair(s.M[0], M[0])
-        put_pair(s.M[1], M[1])
+        put(s.M[0], M[0])
+        put(s.M[1], M[1])
         Y = regressor(s.g, q, qd, qd, (0.0, 0.0))
         for i in range(2):
             s.bias[i] = 0.0
@@ -100,7 +100,7 @@ def put_source_torque(
     """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
     q, qd = (state[0], state[1]), (state[2], state[3])
     on_arm = torque_on_arm(t_s, q, qd, pair(s.lengths), actors, table, sampled)
-    put_pair(torque, (on_arm[0], on_arm[1]))
+    put(torque, (on_arm[0], on_arm[1]))
 
 
 @leaf
@@ -109,9 +109,9 @@ def update_external_torque(t_s: float, s: Row, actors: TorqueSourceRows, table: 
     q, qd, lengths = pair(s.q), pair(s.qd), pair(s.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
     now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
-    put_pair(s.held, (held[0], held[1]))
+    put(s.held, (held[0], held[1]))
     s.wall_n = max(held[2], now[2])
-    put_pair(s.on_arm, (now[0] + held[0], now[1] + held[1]))
+    put(s.on_arm, (now[0] + held[0], now[1] + held[1]))
     if s.external != 0:
         for i in range(2):
             s.on_arm[i] += s.sensed[i]
@@ -179,6 +179,6 @@ def advance_arm(t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table:
     )
     if not (isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])):
         return False
-    put_pair(s.q, q)
-    put_pair(s.qd, qd)
+    put(s.q, q)
+    put(s.qd, qd)
     return True

@@ -1,7 +1,7 @@
 """Types of the core's numbers: arrays, rows of structured arrays, and vectors of fixed length as tuples.
 
 Invariant: a leaf takes vectors (tuples or rows of arrays, read by index) and returns tuples, which stay in
-registers while a tick is computed; only the `put_` functions write.
+registers while a tick is computed; only `put` writes.
 """
 
 from collections.abc import Sequence
@@ -33,12 +33,6 @@ def five(a: Vector) -> Five:
 
 
 @leaf
-def put_pair(a: Any, values: Pair) -> None:
-    """Writes two numbers into a row."""
-    a[0], a[1] = values
-
-
-@leaf
 def put(a: Any, values: Any) -> None:
     """Writes one row into another of the same length."""
     for i in range(a.shape[0]):
@@ -46,9 +40,16 @@ def put(a: Any, values: Any) -> None:
 
 
 @leaf
-def put_five(a: Any, values: Five) -> None:
-    """Writes five numbers into a row."""
-    a[0], a[1], a[2], a[3], a[4] = values
+def count_begun(table: Any, first: int, count: int, now: float) -> int:
+    """Returns how many of so many rows, in the order of their times, begin at a time or before it."""
+    low, high = first, first + count
+    while low < high:
+        half = (low + high) // 2
+        if table[half, 0] <= now:
+            low = half + 1
+        else:
+            high = half
+    return low - first
 
 
 Array = NDArray[np.float64]

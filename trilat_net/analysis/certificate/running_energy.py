@@ -38,12 +38,10 @@ from .energy_balance import (
 )
 from .premises import describe_closed_groups, explain_no_functional
 
-STEP_S = 0.1
+STEP_S = 0.25
 """The least time that is computed at once, s."""
 LONGEST_STEP_S = 2.0
 """The longest, s: what is behind by more catches up in several steps."""
-
-
 KEPT_S = 12.0
 """Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
 
