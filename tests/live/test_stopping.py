@@ -58,7 +58,7 @@ def own_terminal() -> None:
 
 def live(stage: Stage, scenario: str, *options: str) -> Process:
     """A session with a page, at a rate that leaves time to its page on a machine that others use too."""
-    rate = ("--set", "rate_hz=250")
+    rate = ("--set", "rate_hz=100")
     out = str(stage.folder / "out")
     return stage.start("live", "live", scenario, "--no-browser", "--out", out, *rate, *options)
 
