@@ -28,7 +28,8 @@ QUIET = (
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
 
-def launch(playwright: Playwright, *, gl: bool = True) -> Browser:
+def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
+    """A browser; one that draws WebGL by software leaves a page no time to hold an arm."""
     drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if gl else ("--disable-3d-apis",)
     return playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *drawing])
 
@@ -52,7 +53,7 @@ def _descends(pid: int) -> bool:
 
 
 @contextmanager
-def browser_page(url: str, *, gl: bool = True, script: str = "", **options: Any) -> Iterator[Page]:
+def browser_page(url: str, *, gl: bool = False, script: str = "", **options: Any) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = launch(playwright, gl=gl)
         try:

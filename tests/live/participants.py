@@ -142,7 +142,7 @@ def join(browser: Browser, running: Process, site: str) -> Participant:
 @contextmanager
 def participants(running: Process, sites: Sequence[str] = ("m1", "m2")) -> Iterator[list[Participant]]:
     with sync_playwright() as playwright:
-        browser = launch(playwright, gl=False)
+        browser = launch(playwright)
         try:
             found, problems = [join(browser, running, site) for site in sites], list[str]()
             for one in found:

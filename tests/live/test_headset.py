@@ -102,7 +102,7 @@ def leads(page: Page, hands: Controllers) -> bool:
 def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
     """By the log: half as far, ahead as x, left as y, up as z; what jumps by 0.6 m moves nothing."""
     running = served(stage)
-    with browser_page(f"{page_address(running)}?flat", script=RUNTIME, **VIEW) as page:
+    with browser_page(f"{page_address(running)}?flat", script=RUNTIME, gl=True, **VIEW) as page:
         assert page.evaluate("isSecureContext && location.protocol === 'https:'")
         hands = enter(page)
         assert any(leads(page, hands) for _ in range(5))
@@ -131,7 +131,7 @@ def test_a_lost_controller_lets_go_and_a_button_stops_all(stage: Stage) -> None:
     """On the page of a user, whose controllers both lead its own arm."""
     running = served(stage)
     link = role_address(running, "user m1")
-    with browser_page(f"{link}&flat", script=RUNTIME, **VIEW) as page:
+    with browser_page(f"{link}&flat", script=RUNTIME, gl=True, **VIEW) as page:
         hands = enter(page)
         hands.place("left", -0.2, 1.2, -0.3)
         hands.press("left", "squeeze", 1.0)

@@ -67,8 +67,8 @@ def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float
 
 
 def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")  # drawing takes what a machine of two cores has
-    with browser_page(page_address(running), gl=False) as page:
+    running = live(stage, "play", "--set", "rate_hz=100")  # drawing takes what a machine of two cores has
+    with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         assert page.locator(".arm").count() == 3
         page.click("#link-presets button:has-text('300 ms')")
@@ -100,7 +100,7 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
 
 @pytest.mark.long
 def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=250")
+    running = live(stage, "play", "--set", "rate_hz=100")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     with browser_page(page_address(running), **phone) as page:
         shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
@@ -149,7 +149,7 @@ PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss
 def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...], stage: Stage) -> None:
     """At 300 ms, while the user moves: every frame that the browser draws, held against the log."""
     running = live(stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays)))
-    with browser_page(role_address(running, "user m1"), gl=False) as page:
+    with browser_page(role_address(running, "user m1")) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         page.evaluate(KEEP_DRAWN)
         take_hold(page, 0, 60.0, 10.0)
@@ -189,7 +189,7 @@ window.pad = pad;
 @pytest.mark.long
 def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
     """The browser's own interface, with a pad that is none: no machine of the tests has one."""
-    running = live(stage, "play")
+    running = live(stage, "play", "--set", "rate_hz=250")
     with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[1].graspable")
         page.evaluate(PAD)
@@ -219,7 +219,7 @@ pad.vibrationActuator = { playEffect: (kind, how) => {
 def test_a_gamepad_rumbles_as_its_arm_meets_the_wall(stage: Stage) -> None:
     """Ten times a second at most, as strong as the wall pushes; not before, and not once it is let go."""
     running = live(stage, "play", "--set", "rate_hz=250")
-    with browser_page(page_address(running), gl=False) as page:
+    with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[2].graspable")
         page.evaluate(PAD)
         page.evaluate(MOTORS)
@@ -336,6 +336,13 @@ def test_a_second_page_only_watches_until_it_asks(stage: Stage) -> None:
     assert running.code(180.0) == 0, running
 
 
+LARGE = """
+const card = trilat.parts.arms.cards[0], large = [-100, 100];
+card.nextWords = 0;
+card.numbers({ ...trilat.frame.sites[card.name], e: 100, tau: large, pull: large, hand: large });
+"""
+
+
 @pytest.mark.long
 def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
     glide = ("rate_hz=250", "on_stale.action=glide", "on_stale.align_limit_rad=3")
@@ -360,6 +367,9 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
         shows(page, "document.querySelector('#state').textContent === 's STOPPED'")
         page.evaluate("document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'")
         assert page.locator(".arm").first.bounding_box() == arm
+        drawn = page.locator(".arm canvas").first.bounding_box()
+        page.evaluate(LARGE)
+        assert page.locator(".arm canvas").first.bounding_box() == drawn
         if "TRILAT_PICTURES" in os.environ:
             page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
         enable = stage.start("enable", "enable", "--session", name, "s", *ways)
@@ -386,7 +396,7 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
     running = live(stage, "play", "--set", "rate_hz=250")
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     link = role_address(running, who)
-    with browser_page(link, gl=False, **(phone if way == "finger" else {})) as page:
+    with browser_page(link, **(phone if way == "finger" else {})) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1")
         if way == "key":
             page.keyboard.press("Escape")
@@ -414,7 +424,7 @@ def test_a_browser_gets_in_by_the_token_of_its_link() -> None:
         until(lambda: any(line.startswith("user m1: ") for line in said))
         (line,) = (line for line in said if line.startswith("user m1: "))
         link = line.removeprefix("user m1: ").replace("0.0.0.0", "127.0.0.1")
-        with browser_page(link, gl=False) as page:
+        with browser_page(link) as page:
             shows(page, "trilat.hello?.role === 'user' && trilat.hello.as === 'm1'")
             page.goto(link.replace("as=m1", "as=m2"))
             shows(page, "document.querySelector('#notice').textContent.includes('no token')")

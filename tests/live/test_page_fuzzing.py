@@ -106,7 +106,7 @@ def answer_to(address: str, request: bytes) -> bytes:
     ("count", "raw"), [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
 )
 def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage) -> None:
-    rare = ("--set", "rate_hz=250")  # records are few, messages are not
+    rare = ("--set", "rate_hz=100")  # records are few, messages are not
     words = ("live", "play", "--no-browser", "--duration", "600", "--out", str(stage.folder / "out"), *rare)
     running: Process = stage.start("live", *words)
     address = page_address(running)

@@ -102,7 +102,7 @@ def test_every_held_arm_is_stopped_from_everywhere_and_follows_again(scenario: s
 def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
     running = live(stage, "play")
     modes = "Object.values(trilat.frame.sites).every((site) => site.mode === '{}')".format
-    with browser_page(page_address(running), gl=False) as page:
+    with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && " + modes("run"))
         for stop in (lambda: page.click("#stop"), lambda: page.keyboard.press("Escape")):
             stop()
@@ -120,7 +120,7 @@ def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
 def test_whoever_holds_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
     running = live(stage, "play")
     address = page_address(running)
-    with browser_page(address, gl=False) as first:
+    with browser_page(address) as first:
         shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
         second = first.context.browser.new_page()  # type: ignore[union-attr]
         second.goto(address)

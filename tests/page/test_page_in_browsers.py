@@ -37,7 +37,7 @@ def address() -> Iterator[str]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = launch(playwright, gl=False)
+        browser = launch(playwright)
         yield browser
         browser.close()
 
