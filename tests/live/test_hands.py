@@ -12,7 +12,7 @@ import pytest
 import trilat_net
 from tests.cli.running import trilat
 from tests.net.waiting import until
-from trilat_net.analysis.certificate.stability_certificate import CLEAR_BREAK_SHARE, StabilityFinding
+from trilat_net.analysis.certificate.stability_certificate import BROKEN_BALANCE_SHARE
 from trilat_net.log.log_reader import Log
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
@@ -99,17 +99,14 @@ def test_a_minute_of_hands_and_changes_is_verified_and_repeated(stage: Stage) ->
     """The certificate books what the hands gave: V never rises by more."""
     orders = [("link", f"{a}->{b}", "--delay", f"{20 * n + 20}ms") for n, (a, b) in enumerate(LINKS)]
     orders += [("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s") for share in SHARED]
-    rare = ("--set", "rate_hz=250")  # a machine of two cores has a browser and seven processes here
-    log = held(Session(stage, "play", PAPER, "--duration", "60", *rare), 40.0, orders, 300)
+    log = held(Session(stage, "play", PAPER, "--duration", "60"), 40.0, orders, 300)
     said = [event.text for event in log.events if event.kind == "hand"]
     assert any(text.startswith("s: page 1 takes hold") for text in said)
     assert np.abs(log["s"].hand[:, 0]).max() == 1.0
     assert sum(len(log.changes(name)) for name in PAPER) == 10
     found = trilat_net.certify(log)
     assert found.balance is not None
-    assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    unexplained_J = np.abs(found.balance.residual).max()  # by a period of 4 ms
-    assert unexplained_J < CLEAR_BREAK_SHARE * found.balance.scale
+    assert np.abs(found.balance.residual).max() < BROKEN_BALANCE_SHARE * found.balance.scale
 
 
 LINKS = [("m1", "s"), ("m2", "s"), ("s", "m1"), ("s", "m2"), ("m1", "m2"), ("m2", "m1")]

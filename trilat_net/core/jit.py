@@ -348,7 +348,7 @@ def compile_named(function: Callable[..., None], name: str, signature: Any, **op
     The name goes into the symbols of the machine code: no two closures may share one in any process.
     """
     function.__qualname__ = name
-    dispatcher = numba.njit(**{**_OPTIONS, **options})(function)
+    dispatcher = numba.njit(**{**options, **_OPTIONS})(function)  # what is only loaded counts no references
     dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)
     return dispatcher
