@@ -13,18 +13,27 @@ from trilat_net import process
 
 FIFO_PRIORITY = 50
 NICE = -10
+SITES_PER_PROCESSOR = 4
+"""More loops with priority would keep Zenoh and recorders from running, and connections would be lost."""
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
-def prepare(cpu: int | None) -> dict[str, str]:
-    """Requests every setting that helps a loop, on a processor or any; returns what was obtained, by name."""
+def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
+    """Requests every setting that helps a loop; returns what was obtained, by name.
+
+    Args:
+        cpu: the processor that it is bound to, if any.
+        sites: how many sites of the session run on this machine.
+    """
+    cpus = os.cpu_count() or 1
+    crowd = f"normal ({sites} sites share {cpus} processors)" * (sites > SITES_PER_PROCESSOR * cpus)
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
         "memory": lambda: _call_libc("locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT),
-        "scheduling": _set_scheduling,
+        "scheduling": lambda: crowd or _set_scheduling(),
         "collector": _stop_collector,
     }
     obtained = {}

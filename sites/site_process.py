@@ -208,7 +208,8 @@ class RunningSite:
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
-        obtained = realtime.prepare(parts.options.cpu)
+        here = 1 + sum(meter.peer.estimator is None for meter in self._timing.meters)
+        obtained = realtime.prepare(parts.options.cpu, here)
         self._publisher.publish(
             "setup",
             ", ".join([*(f"{key}: {value}" for key, value in obtained.items()), *texts]),

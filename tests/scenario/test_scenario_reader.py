@@ -1,5 +1,7 @@
 """Scenarios: what loads runs, and what cannot be right is refused where it stands."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -368,3 +370,28 @@ def test_a_stale_rule_below_the_delay_is_refused() -> None:
         with pytest.raises(ScenarioError, match=r"sites\.m1\.on_stale\.age_ms.*never follow"):
             load_scenario("paper", {**rule, **link})
     load_scenario("paper", {"on_stale.age_ms": 1.0})  # nothing follows from it
+
+
+FIRST_READERS = """
+import os, sys, threading
+from trilat_net.scenario import load_scenario
+
+def read(together):
+    together.wait()
+    load_scenario("play")
+
+sys.setswitchinterval(1e-6)
+for _ in range(8):
+    if not (child := os.fork()):
+        together = threading.Barrier(4)
+        threads = [threading.Thread(target=read, args=(together,)) for _ in range(4)]
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+def test_threads_may_be_the_first_readers_together() -> None:
+    """A program that opens two hands at once reads one scenario in two threads."""
+    subprocess.run([sys.executable, "-c", FIRST_READERS], check=True, timeout=60)

@@ -61,6 +61,17 @@ def test_another_priority_is_better_than_none() -> None:
     assert prepared(before=refuse)[0]["scheduling"] == "nice -10 (SCHED_FIFO was not permitted)"
 
 
+@pytest.mark.parametrize(("sites", "crowded"), [(8, False), (9, True)])
+def test_many_sites_leave_processors_to_recorders(
+    sites: int, crowded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for step in ("_call_libc", "_set_affinity", "_set_scheduling", "_stop_collector"):
+        monkeypatch.setattr(realtime, step, lambda *_: "as asked")
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    expected = "normal (9 sites share 2 processors)" if crowded else "as asked"
+    assert realtime.prepare(None, sites)["scheduling"] == expected
+
+
 def test_other_platforms_have_less_and_go_on() -> None:
     lack = (
         "sys.platform = 'darwin'\n"

@@ -75,6 +75,7 @@ class RecordedNetwork:
         self._schedule = schedule
         self._peers = peers
         self._sent: dict[tuple[str, int], TickRecord] = {}
+        self._came = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
         """See `Network`."""
@@ -82,8 +83,13 @@ class RecordedNetwork:
 
     def ready(self, receiver: str, k: int) -> bool:
         """See `Network`. A loop that was late received samples of ticks ahead of its own."""
-        peers = self._peers[receiver]
-        return all((peers[j], tick) in self._sent for j, tick, _ in self._schedule[receiver].get(k, ()))
+        peers, entries = self._peers[receiver], self._schedule[receiver].get(k, ())
+        asked, n = self._came[receiver]
+        n *= asked == k  # entries that were there when it was asked last
+        while n < len(entries) and (peers[entries[n][0]], entries[n][1]) in self._sent:
+            n += 1
+        self._came[receiver] = k, n
+        return n == len(entries)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """See `Network`. A sample that its sender never made does not arrive.

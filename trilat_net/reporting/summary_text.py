@@ -160,7 +160,7 @@ def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) ->
         "duplicates": counts.duplicate + counts.copies,
     }
     judged = max(counts.judged, 1)
-    words = [f"{name} {count} ({100 * count / judged:.2g} %)" for name, count in losses.items() if count]
+    words = [f"{name} {count} ({100 * count / judged:.3g} %)" for name, count in losses.items() if count]
     if use.burst is not None and use.burst > 1.005:
         words.append(f"{_number(use.burst)} in a row")
     return ", ".join(words) or "nothing lost"
@@ -356,7 +356,7 @@ def _judgement(one: dict[str, Any], needs: dict[str, Any]) -> str:
     elif needs["stable_ms"] is not None:
         parts.append("at which the loop is not stable")
     if one["lost_share"]:
-        parts.append(f"{100 * one['lost_share']:.2g} % lost")
+        parts.append(f"{100 * one['lost_share']:.3g} % lost")
     parts.append(f"a play-out of {one['playout_ms']} ms would hold every one of these samples")
     return ", ".join(parts[:-1]) + "; " + parts[-1]
 

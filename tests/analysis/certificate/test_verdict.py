@@ -67,7 +67,7 @@ def test_a_rise_is_named_with_time_amount_and_giver() -> None:
     assert sum(rise.causes.values()) >= rise.amount
     assert all("->" in cause for cause in rise.causes)
     share = 100.0 * rise.amount / found.balance.V.max()
-    assert f"V rose by {rise.amount:.3g} J ({share:.2g} % of its largest value) " in found.verdict.text
+    assert f"V rose by {rise.amount:.3g} J ({share:.3g} % of its largest value) " in found.verdict.text
     assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
 
 

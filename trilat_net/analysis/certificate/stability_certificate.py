@@ -349,7 +349,7 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
         held = "though the premises of the theorem hold, which is one of continuous time"
         causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4])
         who = f"; given by {causes}" if causes else "; nobody gave it"
-        share = f"{100.0 * rise.amount / balance.V.max():.2g} % of its largest value"
+        share = f"{100.0 * rise.amount / balance.V.max():.3g} % of its largest value"
         text = f"V rose by {rise.amount:.3g} J ({share}) from {rise.from_s:.4g} to {rise.at_s:.4g} s{who}"
         return StabilityVerdict(StabilityFinding.ROSE, f"{outside if failed else held}: {text}", rise)
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))

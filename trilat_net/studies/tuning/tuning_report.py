@@ -115,7 +115,7 @@ def _score_cells(score: CandidateScore) -> tuple[str, ...]:
     error = _with_interval(score.error_rad, score.error_half_rad)
     effort = _with_interval(score.effort_nm, score.effort_half_nm)
     spread, pose, settled = map(_number, (score.spread_rad, score.pose_rad, score.settled_s))
-    return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.2g}"
+    return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.3g}"
 
 
 def _with_interval(mean: float | None, half: float | None) -> str:
