@@ -26,6 +26,10 @@ headset.installRuntime({ forceInstall: true });
 headset.stereoEnabled = false;
 window.lost = false; // IWER calls all its poses emulated; a headset those that it does not see
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => lost });
+const { getContext } = HTMLCanvasElement.prototype; // smooth edges take most of what software draws with
+HTMLCanvasElement.prototype.getContext = function (kind, how) {
+  return getContext.call(this, kind, { ...how, antialias: false });
+};
 """
 VIEW: dict[str, Any] = {"viewport": {"width": 480, "height": 320}, "ignore_https_errors": True}
 RUNTIME = (Path(__file__).parent / "iwer.min.js").read_text(encoding="utf-8") + INSTALLED
@@ -36,7 +40,7 @@ MOVE = """([side, x, y, z]) => {
 HELD = "trilat.parts.headset.controllers.right.card !== null && trilat.frame.holds.includes('m1')"
 PRESS = "([side, button, value]) => headset.controllers[side].updateButtonValue(button, value)"
 SCENARIO = Path(__file__).parents[2] / "examples" / "headset.toml"
-SETTLED = 50
+SETTLED = 20
 """Ticks from taking hold of an arm, which moves, until its target rests where the arm was seen."""
 
 
@@ -67,7 +71,7 @@ def enter(page: Page) -> Controllers:
 
 def served(stage: Stage) -> Process:
     keys = create_keys(stage.folder / "keys", ["operator"])[0]
-    served_by = "--out", str(stage.folder / "out"), "--tls", str(keys), "--set", "rate_hz=250"
+    served_by = "--out", str(stage.folder / "out"), "--tls", str(keys), "--set", "rate_hz=100"
     return stage.start("live", "live", str(SCENARIO), "--no-browser", *served_by)
 
 
