@@ -21,17 +21,18 @@ from trilat_net.net.zenoh_bus import ZenohBus
 
 MOVES, DURATION_S = 1000, 60
 FLOOD_S, DEVICE_S = 5.0, 8.0
+DEVICE_STATES = 5000
 
 
 def run() -> list[str]:
     """Returns the figures of one session of `play`, three sites at 1 kHz and a recorder."""
     with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(Path(folder))
+        stage, alone_per_s = Stage(Path(folder)), _ask_alone()
         try:
             session = Session(stage, "play", PAPER, "--duration", str(DURATION_S))
             session.all()
             moved = _move(session)
-            led = _lead(session)
+            led = f"{_lead(session)}; {alone_per_s:.0f} states/s where nothing else runs"
             killed_ns = _kill(session)
             flooded = _flood(session)
             session.ends_well()
@@ -61,6 +62,16 @@ def _move(session: Session) -> list[tuple[int, int]]:
             called_ns = time.monotonic_ns()
             moved.append((hand.move(x + 0.05 * n / MOVES, y), called_ns))
     return moved
+
+
+def _ask_alone() -> float:
+    """Returns how many states a second such a device gives where nothing else runs."""
+    with HaplyService() as service, trilat_net.HaplyInverse3(service.address) as device:
+        begun_s = time.monotonic()
+        for _ in range(DEVICE_STATES):
+            device.read()
+            device.render((0.0, 0.0, 0.0))
+    return DEVICE_STATES / (time.monotonic() - begun_s)
 
 
 def _lead(session: Session) -> str:
