@@ -8,12 +8,14 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 from trilat_net import process
 
 FIFO_PRIORITY = 50
 NICE = -10
-SITES_PER_PROCESSOR = 4
+SITES_PER_PROCESSOR = 2
 """More loops with priority would keep Zenoh and recorders from running, and connections would be lost."""
 
 _PR_SET_TIMERSLACK = 29
@@ -64,14 +66,26 @@ def _call_libc(obtained: str, function: str, *arguments: int) -> str:
 
 def _set_scheduling() -> str:
     try:
+        _set_threads(
+            lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1))
+        )
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError):
         try:
-            os.setpriority(os.PRIO_PROCESS, 0, NICE)
+            _set_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE))
         except (OSError, AttributeError):
             return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
         return f"nice {NICE} (SCHED_FIFO was not permitted)"
     return f"SCHED_FIFO {FIFO_PRIORITY}"
+
+
+def _set_threads(change: Callable[[int], None]) -> None:
+    """Changes this thread and all others: one that waits for a processor may hold the interpreter."""
+    change(0)
+    tasks = Path("/proc/self/task")
+    for thread in tasks.iterdir() if tasks.is_dir() else ():
+        with suppress(ProcessLookupError):  # it has ended
+            change(int(thread.name))
 
 
 def _stop_collector() -> str:

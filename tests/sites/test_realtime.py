@@ -61,15 +61,38 @@ def test_another_priority_is_better_than_none() -> None:
     assert prepared(before=refuse)[0]["scheduling"] == "nice -10 (SCHED_FIFO was not permitted)"
 
 
-@pytest.mark.parametrize(("sites", "crowded"), [(8, False), (9, True)])
+@pytest.mark.parametrize(("sites", "crowded"), [(4, False), (5, True)])
 def test_many_sites_leave_processors_to_recorders(
     sites: int, crowded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for step in ("_call_libc", "_set_affinity", "_set_scheduling", "_stop_collector"):
         monkeypatch.setattr(realtime, step, lambda *_: "as asked")
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    expected = "normal (9 sites share 2 processors)" if crowded else "as asked"
+    expected = "normal (5 sites share 2 processors)" if crowded else "as asked"
     assert realtime.prepare(None, sites)["scheduling"] == expected
+
+
+BESIDE = """
+import threading
+for wait in [threading.Event().wait] * 2:
+    threading.Thread(target=wait, daemon=True).start()
+"""
+POLICIES = """
+def policy(thread):
+    return os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority
+beside = [int(thread) for thread in os.listdir("/proc/self/task") if int(thread) != os.getpid()]
+print(json.dumps([policy(0), [policy(thread) for thread in beside]]))
+"""
+
+
+def test_a_thread_beside_the_loop_gives_back_the_interpreter_at_once() -> None:
+    """Of all that is not a loop nothing comes before it; else it keeps what the loop waits for."""
+    program = f"{PROGRAM.format(before=BESIDE, cpu=None)}{POLICIES}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    obtained, policies = map(json.loads, done.stdout.splitlines())
+    if obtained[0]["scheduling"] != "SCHED_FIFO 50":
+        pytest.skip("needs the right to use SCHED_FIFO")
+    assert policies == [[os.SCHED_FIFO, 50], [[os.SCHED_FIFO, 49]] * 2]
 
 
 def test_other_platforms_have_less_and_go_on() -> None:
