@@ -26,12 +26,7 @@ from trilat_net.files import require_libraries
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, StampedInbox
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import (
-    ENCRYPTED,
-    Connection,
-    find_free_endpoints,
-    secure_connection,
-)
+from trilat_net.net.connection import ENCRYPTED, Connection, find_free_endpoints, secure_connection
 from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
 from trilat_net.net.messages import VERSION, PeerSample
 from trilat_net.net.zenoh_bus import ZenohBus

@@ -24,12 +24,7 @@ from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import find_members, list_past_events
 from trilat_net.net.membership import read_messages, read_records
 from trilat_net.net.messages import Event, Info
-from trilat_net.net.ros2_graph import (
-    Attachment,
-    Refusals,
-    Ros2Graph,
-    TopicPublisher,
-)
+from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPublisher
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded

@@ -25,13 +25,21 @@ QUIET = (
     "--disable-component-update",
     "--disable-sync",
 )
-PAINTED_BY_SOFTWARE = ("--disable-gpu-rasterization", "--disable-accelerated-2d-canvas", "--disable-gpu-compositing")
+PAINTED_BY_SOFTWARE = (
+    "--disable-gpu-rasterization",
+    "--disable-accelerated-2d-canvas",
+    "--disable-gpu-compositing",
+)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
 
 def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
     """A browser; one that draws WebGL by software leaves a page no time to hold an arm."""
-    drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", *PAINTED_BY_SOFTWARE) if gl else ("--disable-3d-apis",)
+    drawing = (
+        ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", *PAINTED_BY_SOFTWARE)
+        if gl
+        else ("--disable-3d-apis",)
+    )
     program, env = Path(__file__).with_name("chromium.sh"), {**os.environ, "CHROMIUM": str(CHROMIUM)}
     return playwright.chromium.launch(executable_path=program, env=env, args=[*QUIET, *drawing])
 

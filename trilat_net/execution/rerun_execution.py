@@ -26,13 +26,7 @@ from ..net.timing import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
 from ..scenario.describe import describe_law, describe_value, flatten_table
-from .resumption import (
-    ReceivedMotion,
-    RecordedInputs,
-    find_recorded_hand,
-    make_arrival,
-    read_output,
-)
+from .resumption import ReceivedMotion, RecordedInputs, find_recorded_hand, make_arrival, read_output
 from .verify import PROGRESS_EVERY, RecordDifference, equal_bits, equal_record, find_first_difference
 from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
 

@@ -21,13 +21,7 @@ from ..log.mcap_reader import Progress
 from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
-from .verify import (
-    RecordDifference,
-    describe_law_failure,
-    equal_bits,
-    equal_record,
-    find_first_difference,
-)
+from .verify import RecordDifference, describe_law_failure, equal_bits, equal_record, find_first_difference
 from .virtual_network import Network, RecordedNetwork, complete_deliveries
 
 

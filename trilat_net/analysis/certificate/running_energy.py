@@ -16,13 +16,7 @@ from ...core.ticks import CoreChange
 from ...core.vectors import Array
 from ...net.messages import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
-from ..aligned import (
-    RECORD_COLUMNS,
-    RESUMING_S,
-    AlignedRecords,
-    PeerTrajectory,
-    find_unlimited,
-)
+from ..aligned import RECORD_COLUMNS, RESUMING_S, AlignedRecords, PeerTrajectory, find_unlimited
 from ..dominance_history import (
     DominanceHistory,
     evaluate_ramps,

@@ -5,13 +5,14 @@ in one file of this folder, and in docs/metrics.md; whoever shows, compares or a
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.task_space import PLACE
+from ...core.vectors import Array
 from ..run_view import RunView
 
 
@@ -31,8 +32,10 @@ class Metric(NamedTuple):
 MetricValues = dict[str, Metric]
 """Metrics by the keys of their quantities."""
 
+_NOT_FINITE = "it is no finite number"
 
-def metric(value: float | None, why: str = "it is no finite number") -> Metric:
+
+def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
     """Returns a metric of a number; with the reason if it is None or not finite."""
     return Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
 
@@ -42,10 +45,23 @@ def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> 
     return {q.key: Metric(None, why, applies) for q in quantities() if q.group == group and of in ("", q.of)}
 
 
-def measure_shared(group: str, space: str, measure: Callable[[slice], dict[str, Metric]]) -> MetricValues:
-    """Returns the quantities of a group of what sites share: angles, rad, or places, m, or both of a pose.
+def measure_shared(
+    group: str,
+    space: str,
+    keys: Sequence[str],
+    off: Array,
+    at_end: NDArray[np.bool_],
+    none: str = _NOT_FINITE,
+) -> MetricValues:
+    """Returns what sites share, angles, rad, or places, m, or both of a pose: RMS, peak, peak at the end.
 
-    `measure` takes the columns of what is shared, and gives the quantities by their keys without the unit.
+    Args:
+        group: that of the quantities.
+        space: in which sites share.
+        keys: of the three quantities, without the unit.
+        off: by how much it is off, shape (K, n).
+        at_end: which rows are of the last second, shape (K,).
+        none: why there may be none of them.
     """
     found = unavailable(group, "sites share angles, not places", applies=False)
     if space == "joints":
@@ -54,7 +70,9 @@ def measure_shared(group: str, space: str, measure: Callable[[slice], dict[str, 
         found = unavailable(group, "sites share places, not angles", applies=False)
         parts = [("m", slice(0, PLACE)), ("rad", slice(PLACE, None))][: 1 + (space == "pose")]
     for unit, columns in parts:
-        found |= {f"{key}_{unit}": one for key, one in measure(columns).items()}
+        part = off[:, columns]
+        values = metric(rms(part)), metric(peak(part)), metric(peak(part[at_end]), none)
+        found |= {f"{key}_{unit}": value for key, value in zip(keys, values, strict=True)}
     return found
 
 

@@ -21,13 +21,7 @@ from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
 from ..aligned import AlignedRecords, Bools, find_common_rows
-from ..arm_rows import (
-    ArmRows,
-    PlanarArmRows,
-    build_arm_rows,
-    find_base_parameters,
-    find_consistent_links,
-)
+from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows, find_base_parameters, find_consistent_links
 from ..file_overview import describe_site_health
 from ..run_view import RunView
 from ..torque_sources import wall_depth, wall_force
@@ -76,16 +70,9 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     unit = "rad" if space == "joints" else "m" if space == "position" else "m or rad"
     unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
 
-    def measure(columns: slice) -> MetricValues:
-        errors = e[:, columns]
-        return {
-            "rms_error": metric(rms(errors)),
-            "max_error": metric(peak(errors)),
-            "max_error_end": metric(peak(errors[part.t_s > part.t_s[-1] - END_WINDOW_S])),
-        }
-
+    keys, at_end = ("rms_error", "max_error", "max_error_end"), part.t_s > part.t_s[-1] - END_WINDOW_S
     return {
-        **measure_shared(TRACKING, space, measure),
+        **measure_shared(TRACKING, space, keys, e, at_end),
         "settle_s": metric(site_signals.settling_time_s(part), unsettled),
     }
 
@@ -121,16 +108,8 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     end_s = min(float(records.t_s[-1]) for records in sites)
     last = sites[0].t_s[known] > end_s - END_WINDOW_S
     none = "no instant of the last second of which every site has a record"
-
-    def measure(columns: slice) -> MetricValues:
-        spread = apart[:, columns]
-        return {
-            "spread_rms": metric(rms(spread)),
-            "spread_max": metric(peak(spread)),
-            "spread_end": metric(peak(spread[last]), none),
-        }
-
-    return measure_shared(SPREAD, log.scenario.sites[log.sites[0]].task.space, measure)
+    space, keys = log.scenario.sites[log.sites[0]].task.space, ("spread_rms", "spread_max", "spread_end")
+    return measure_shared(SPREAD, space, keys, apart, last, none)
 
 
 @measures(
@@ -166,15 +145,8 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     there = master.shared[row]
     apart = find_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
     off, last = apart[known], slave.known_at_end(END_WINDOW_S)[known]
-
-    def measure(columns: slice) -> MetricValues:
-        return {
-            "following_rms": metric(rms(off[:, columns])),
-            "following_max": metric(peak(off[:, columns])),
-            "following_end": metric(peak(off[last, columns]), "no sample in the last second"),
-        }
-
-    return measure_shared(FOLLOWING, log.scenario.sites[site].task.space, measure)
+    space, keys = log.scenario.sites[site].task.space, ("following_rms", "following_max", "following_end")
+    return measure_shared(FOLLOWING, space, keys, off, last, "no sample in the last second")
 
 
 @measures(
