@@ -30,12 +30,12 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
         sites: how many sites of the session run on this machine.
     """
     cpus = os.cpu_count() or 1
-    crowd = f"normal ({sites} sites share {cpus} processors)" * (sites > SITES_PER_PROCESSOR * cpus)
+    shared = f"normal ({sites} sites share {cpus} processors)"
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
         "memory": lambda: _call_libc("locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT),
-        "scheduling": lambda: crowd or _set_scheduling(),
+        "scheduling": _set_scheduling if sites <= SITES_PER_PROCESSOR * cpus else lambda: shared,
         "collector": _stop_collector,
     }
     obtained = {}

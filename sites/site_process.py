@@ -208,7 +208,8 @@ class RunningSite:
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
-        here = 1 + sum(meter.peer.estimator is None for meter in self._timing.meters)
+        there = [one.peer for one in self._timing.meters if one.peer.name in self._epoch.boots]
+        here = 1 + sum(peer.estimator is None for peer in there)
         obtained = realtime.prepare(parts.options.cpu, here)
         self._publisher.publish(
             "setup",

@@ -394,4 +394,4 @@ for _ in range(8):
 
 def test_threads_may_be_the_first_readers_together() -> None:
     """A program that opens two hands at once reads one scenario in two threads."""
-    subprocess.run([sys.executable, "-c", FIRST_READERS], check=True, timeout=60)
+    assert subprocess.run([sys.executable, "-c", FIRST_READERS], check=False, timeout=60).returncode == 0

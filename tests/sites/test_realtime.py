@@ -85,7 +85,7 @@ print(json.dumps([policy(0), [policy(thread) for thread in beside]]))
 """
 
 
-def test_a_thread_beside_the_loop_gives_back_the_interpreter_at_once() -> None:
+def test_threads_beside_a_loop_give_back_the_interpreter_at_once() -> None:
     """Of all that is not a loop nothing comes before it; else it keeps what the loop waits for."""
     program = f"{PROGRAM.format(before=BESIDE, cpu=None)}{POLICIES}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)

@@ -84,8 +84,8 @@ class RecordedNetwork:
     def ready(self, receiver: str, k: int) -> bool:
         """See `Network`. A loop that was late received samples of ticks ahead of its own."""
         peers, entries = self._peers[receiver], self._schedule[receiver].get(k, ())
-        asked, n = self._came[receiver]
-        n *= asked == k  # entries that were there when it was asked last
+        asked, came = self._came[receiver]
+        n = came if asked == k else 0
         while n < len(entries) and (peers[entries[n][0]], entries[n][1]) in self._sent:
             n += 1
         self._came[receiver] = k, n

@@ -405,7 +405,7 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
         rows = []
         for pair in found.sharing_ratios:
             pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
-            off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.2g} %"
+            off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %"
             when, which = f"{pair.from_s:.1f} - {pair.to_s:.1f} s", found.label(pair.joint)
             row = [when, which, pushed, _write_value(pair.pushed_nm)]
             rows.append([*row, pair.holds, _write_value(pair.felt_nm), _write_metric(pair.expected_nm), off])
