@@ -143,31 +143,28 @@ class ExperimentAnalysis(Result):
         plan = self._experiment.plan
         protocol, scenario = plan.protocol, next(iter(plan.scenarios.values()))
         who = dict.fromkeys(row[self.unit] for row in self.rows)
+        rows_of = {
+            name: [row for row in self.rows if row["condition"] == name] for name in protocol.conditions
+        }
         delays = {
-            name: {
-                "delay_ms": round(
-                    float(np.mean([r["delay_ms"] for r in self.rows if r["condition"] == name])), 1
-                )
-            }
-            for name in protocol.conditions
-            if any(row["condition"] == name for row in self.rows)
+            name: {"delay_ms": round(float(np.mean([row["delay_ms"] for row in rows])), 1)}
+            for name, rows in rows_of.items()
+            if rows
         }
         control = msgspec.to_builtins(scenario.sites[protocol.users[0]].control)
-        law = str(control.pop("law"))
-        pairs = {"pairs": len(who)} if self.unit == "pair" else {}
         reasons = ", ".join(f"{name}: {why}" if why else name for name, why in self._exclude.items())
-        facts: dict[str, Any] = {
+        facts: dict[str, Any] = {  # "": there is nothing to say of it
             "participants": len(who) * len(protocol.users),
-            **pairs,
+            "pairs": len(who) if self.unit == "pair" else "",
             "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
-            **({"exclusions": reasons} if reasons else {}),
-            **({"training": protocol.training.describe()} if protocol.training else {}),
-            **({"staircase": protocol.staircase.describe()} if protocol.staircase else {}),
+            "exclusions": reasons,
+            "training": protocol.training.describe() if protocol.training else "",
+            "staircase": protocol.staircase.describe() if protocol.staircase else "",
             "design": protocol.design,
             "blocks": len(protocol.conditions),
             "trials": protocol.trials,
             "conditions": delays,
-            "law": law,
+            "law": control.pop("law"),
             "rate_hz": scenario.sites[protocol.users[0]].rate_hz,
             "gains": control,
             "seeds": [protocol.seed],
@@ -182,13 +179,13 @@ class ExperimentAnalysis(Result):
     def write(self, folder: Path) -> "ExperimentAnalysis":
         """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
         made = make_folder(folder)
-        for name, rows in (("conditions.csv", self._list_means()), ("comparisons.csv", self.to_rows())):
-            write_whole(made / name, encode_csv([dict(_flatten(row)) for row in rows]), force=True)
-        write_whole(made / "methods.txt", self.methods + "\n", force=True)
-        write_whole(made / "analysis.json", json.dumps(self.to_dict(), indent=1) + "\n", force=True)
-        self.paths = [
-            made / name for name in ("conditions.csv", "comparisons.csv", "methods.txt", "analysis.json")
-        ]
+        tables = {"conditions.csv": self._list_means(), "comparisons.csv": self.to_rows()}
+        texts = {name: encode_csv([dict(_flatten(row)) for row in rows]) for name, rows in tables.items()}
+        whole = json.dumps(self.to_dict(), indent=1)
+        texts |= {"methods.txt": f"{self.methods}\n", "analysis.json": f"{whole}\n"}
+        for name, text in texts.items():
+            write_whole(made / name, text, force=True)
+        self.paths = [made / name for name in texts]
         for measure in self.means:
             path = made / f"{measure}.png"
             draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)

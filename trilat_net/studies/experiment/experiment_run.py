@@ -111,16 +111,12 @@ class Experiment(Result):
 
     def list_choices(self) -> Choices:
         """Returns what was chosen of the pairs of a staircase so far."""
-        found = dict[tuple[tuple[str, ...], int], list[float]]()
-        for note in self.read_notes() if self.plan.protocol.staircase else ():
-            if note.text == CHOICE:
-                last = self.plan.trials[note.number - 1]
-                found.setdefault((last.group, last.block), []).append(note.answers[CHOICE])
-        return found
+        notes = self.read_notes() if self.plan.protocol.staircase else ()
+        return {note.number: note.answers[CHOICE] for note in notes if note.text == CHOICE}
 
     def _choose(self, stairs: Staircase) -> None:
         """Notes what synthetic participants choose, of all pairs: a function of the plan."""
-        chosen = dict[tuple[tuple[str, ...], int], list[float]]()
+        chosen = dict[int, float]()
         with self.open_notes() as notes:
             for step in self.plan.list_steps():
                 if step.form is None or step.form.name != CHOICE:
@@ -128,10 +124,9 @@ class Experiment(Result):
                 last, who = step.planned, "-".join(step.planned.group)
                 right, more = self.plan.judge_choices(last, chosen), 1 + (last.phase == COMPARISON)
                 choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
-                chosen.setdefault((last.group, last.block), []).append(choice)
-                notes.add(
-                    Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, {CHOICE: choice})
-                )
+                chosen[last.number] = choice
+                answers: dict[str, float] = {CHOICE: choice}
+                notes.add(Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, answers))
 
     def status(self) -> ExperimentStatus:
         """Returns how far it is."""

@@ -196,8 +196,8 @@ class PlannedTrial(NamedTuple):
         return f"{self.number:05d}-{who}-b{self.block}-t{self.trial:02d}-{self.condition}.mcap"
 
 
-Choices = Mapping[tuple[tuple[str, ...], int], Sequence[float]]
-"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by group and block."""
+Choices = Mapping[int, float]
+"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by the number of its second trial."""
 
 
 class Step(NamedTuple):
@@ -242,30 +242,24 @@ class ExperimentPlan(Result):
 
     def list_steps(self) -> Iterator[Step]:
         """Yields what people do, in order."""
-        forms = self.protocol.questionnaires
-        for before, planned, after in zip(
-            (None, *self.trials), self.trials, (*self.trials[1:], None), strict=False
-        ):
-            if self.protocol.consent and (before is None or before.group != planned.group):
+        protocol = self.protocol
+        for planned in self.trials:
+            if protocol.consent and planned.block == planned.trial == 1:
                 yield Step("consent", planned)
             yield Step("trial", planned)
-            if (stairs := self.protocol.staircase) is not None and self._is_second(planned):
+            counted = planned.trial - protocol.practice
+            if (stairs := protocol.staircase) is not None and counted > 0 and counted % 2 == 0:
                 yield Step("questionnaire", planned, stairs.form)
-            left = after is None or after.group != planned.group
-            if left or (after is not None and after.block != planned.block):
-                asked = [form for form in forms if left or form.after == "block"]
+            if planned.trial == self.trials[-1].trial:
+                left = planned.block == len(protocol.conditions)
+                asked = [form for form in protocol.questionnaires if left or form.after == "block"]
                 yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
-
-    def _is_second(self, planned: PlannedTrial) -> bool:
-        """Returns whether a pair ends with a trial."""
-        return planned.trial > self.protocol.practice and (planned.trial - self.protocol.practice) % 2 == 0
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
         """Returns whether each choice of a trial's block is the trial that had more."""
         block = self.trials[planned.number - planned.trial :][: self.trials[-1].trial]
-        more = (1 + (second.phase == COMPARISON) for second in filter(self._is_second, block))
-        chosen = choices.get((planned.group, planned.block), ())
-        return [choice == one for choice, one in zip(chosen, more, strict=False)]
+        seconds = [one for one in block if one.number in choices]
+        return [choices[second.number] == 1 + (second.phase == COMPARISON) for second in seconds]
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
         """Returns the difference in a trial's pair, and whether the choice was right; None: it is to come."""
@@ -423,7 +417,7 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     for user in protocol.users:
         if user not in scenario.names:
             raise ScenarioError(f"has no site {user}; there are {', '.join(scenario.names)}", path="users")
-        if not any(getattr(hand, "is_open", False) for hand in scenario.sites[user].hands):
+        if find_live_hand(scenario.sites[user].hands, is_open=True) is None:
             raise ScenarioError(
                 "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",

@@ -10,6 +10,7 @@ What the numbers cannot tell is None. Equal rows and seeds give equal numbers.
 
 import math
 import warnings
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
@@ -160,14 +161,14 @@ class Comparison(NamedTuple):
     first: str
     second: str
     number: int
-    difference: float | None
-    interval: tuple[float, float] | None
-    t: float | None
-    p: float | None
-    p_holm: float | None
-    d_z: float | None
-    d_av: float | None
-    p_wilcoxon: float | None
+    difference: float | None = None
+    interval: tuple[float, float] | None = None
+    t: float | None = None
+    p: float | None = None
+    p_holm: float | None = None
+    d_z: float | None = None
+    d_av: float | None = None
+    p_wilcoxon: float | None = None
 
 
 def compare_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> list[Comparison]:
@@ -187,7 +188,7 @@ def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[
     both = [unit for unit in means[first] if unit in means[second]]
     one, other = (np.array([means[name][unit] for unit in both]) for name in (first, second))
     differences = other - one
-    empty = Comparison(measure, first, second, len(both), None, None, None, None, None, None, None, None)
+    empty = Comparison(measure, first, second, len(both))
     if len(both) < 2:
         return empty._replace(difference=float(differences[0])) if both else empty
     mean, spread = float(differences.mean()), float(differences.std(ddof=1))
@@ -341,15 +342,11 @@ def find_least_number(d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, m
     Raises:
         UsageError: more than `most` are needed.
     """
-    low, high = 1, most
     if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
         raise UsageError(
             f"power {wanted} at d_z = {d_z}: not with {most} units; give a larger effect, or less power"
         )
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if power(d_z, middle, alpha=alpha) >= wanted else (middle, high)
-    return high
+    return bisect_left(range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha))
 
 
 class SimulatedPower(NamedTuple):

@@ -6,9 +6,8 @@ and into its log, which then lasts just that long.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,6 +26,8 @@ from ...execution.virtual import write_virtual_log
 from ...files import digest_file
 from ...log.log_file import LogFile
 from ...log.log_reader import Log, open_log
+from ...log.record_columns import Ints
+from ...log.site_log import SiteLog
 from ...scenario import Scenario, parse_scenario
 from ...scenario.operators.kernel_operators import find_live_hand
 from ...scenario.operators.program_hand import HandPlayer, HandSite
@@ -76,17 +77,15 @@ class TrialJudge:
         outcome: how it ended; None: it goes on.
     """
 
-    def __init__(self, goal: TrialGoal, arm: Any, find_force_n: Callable[[Array, Array], Array]) -> None:
-        self.goal, self._arm, self._find_force_n = goal, arm, find_force_n
+    def __init__(self, trial: "ExperimentTrial") -> None:
+        self.goal, self._trial = trial.make_goal(), trial
         self.outcome: Outcome | None = None
 
     def take(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
         """Takes in angles and exogenous torques of a record; returns the outcome, once there is one."""
         if self.outcome is None:
-            force_n = 0.0
-            if self.goal.force_n:
-                (force_n,) = self._find_force_n(np.array([q]), np.array([tau_x]))
-            self.outcome = self.goal.judge(t_s, np.array(self._arm.end_effector(q)), force_n)
+            force_n = self._trial.find_force_n(q, tau_x) if self.goal.force_n else 0.0
+            self.outcome = self.goal.judge(t_s, np.array(self._trial.arm.end_effector(q)), force_n)
         return self.outcome
 
 
@@ -143,10 +142,15 @@ class ExperimentTrial:
 
     def begin(self) -> TrialJudge:
         """Returns what judges it, from its first record on."""
-        return TrialJudge(self.make_goal(), self.arm, self._find_force_n)
+        return TrialJudge(self)
 
-    def _find_force_n(self, q: Array, tau_x: Array) -> Array:
-        """Returns the magnitude of what presses on the slave's end effector, shape (K,), N."""
+    def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
+        """Returns the magnitude of what presses on the slave's end effector, N."""
+        (force_n,) = self._find_forces_n(np.array([q]), np.array([tau_x]))
+        return float(force_n)
+
+    def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
+        """Returns the same of K records, shape (K,)."""
         force_n: Array = np.linalg.norm(self._place(q).find_force(tau_x), axis=1)
         return force_n
 
@@ -202,32 +206,37 @@ class ExperimentTrial:
         age_ms = sample_ages_ns(log, self.slave, self.protocol.users[0]) / 1e6
         return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
 
+    def _follow(
+        self, part: SiteLog | AlignedRecords, from_s: float, until_s: float
+    ) -> tuple[Ints, Array, Array, float]:
+        """Returns which records of the slave are measured, its places and velocities, and their rate, Hz."""
+        rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::EVERY]
+        places, rate_hz = self._place(part.q[rows]).at, part.rate_hz / EVERY
+        return rows, places, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz
+
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
         """Returns what two users do to the slave, as if each pushed at its end effector."""
         slave = aligned[self.slave]
-        rows = np.flatnonzero(slave.t_s <= ended_s)[::EVERY]
-        rate_hz, t_s = slave.rate_hz / EVERY, slave.t_s[rows]
-        places = self._place(slave.q[rows]).at
+        rows, _, moves, rate_hz = self._follow(slave, 0.0, ended_s)
+        t_s = slave.t_s[rows]
         one, other = (
             np.column_stack([np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T])
             for user, force in zip(self.protocol.users, forces, strict=True)
         )
-        found = measure_pair(one, other, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz)
+        found = measure_pair(one, other, moves, rate_hz)
         return {name: value for name, value in found._asdict().items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns what the slave did from when the target appears until the trial ends."""
         goal, part = self.make_goal(), log[self.slave]
-        rows = np.flatnonzero((part.t_s >= goal.appears_s) & (part.t_s <= ended_s))[::EVERY]
-        t_s, rate_hz = part.t_s[rows], part.rate_hz / EVERY
-        places = self._place(part.q[rows]).at
+        rows, places, moves, rate_hz = self._follow(part, goal.appears_s, ended_s)
+        t_s, speed = part.t_s[rows], np.linalg.norm(moves, axis=1)
         wanted = np.array([goal.place(t) for t in t_s])
         apart_m = np.linalg.norm(places - wanted, axis=1)
-        speed = np.linalg.norm(np.gradient(places, 1.0 / rate_hz, axis=0), axis=1)
         smooth = sparc(speed, rate_hz)
-        force_n = self._find_force_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
+        force_n = self._find_forces_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
         ends = {"start": goal.start_m, "target": wanted[-1], "end": places[-1]}
         return {
             "completion_s": ended_s - goal.appears_s,
@@ -256,11 +265,7 @@ class SyntheticTrial(ExperimentTrial):
             assert hand is not None  # see `plan_experiment`
             at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
-            model, before = self.protocol.model.draw(own), self.planned.before
-            goal, slave = self.make_goal(), (self.slave, self.arm, self._find_force_n)
-            act = SyntheticParticipant(
-                at.describe(), model, goal, slave, before, self.planned.seed, len(found)
-            )
+            act = SyntheticParticipant(at.describe(), self.protocol.model.draw(own), self, len(found))
             found[user] = HandPlayer(at, act)
         return found
 
