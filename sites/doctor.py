@@ -237,16 +237,21 @@ def examine_offsets(connection: Connection, clock: Clock, session: str) -> Itera
             yield DoctorFinding("clock", "ok" if bound_us <= BOUND_US else "warn", text)
 
 
+def _ask_process(code: str) -> Any:
+    """Returns what a process of its own prints last, as JSON; None if it fails."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
+    return None if done.returncode else json.loads(done.stdout.splitlines()[-1])
+
+
 _RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
     """Yields which real-time settings a site would get."""
-    done = subprocess.run([sys.executable, "-c", _RIGHTS], capture_output=True, encoding="utf-8", check=False)
-    if done.returncode:
+    obtained: dict[str, str] | None = _ask_process(_RIGHTS)
+    if obtained is None:
         yield DoctorFinding("rights", "warn", "could not be tried")
         return
-    obtained: dict[str, str] = json.loads(done.stdout)
     good = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
     for name, start in good.items():
         got = obtained[name].startswith(start)
@@ -326,10 +331,10 @@ def examine_rate() -> DoctorFinding:
     """Returns the highest tick rate that a site alone holds here and now, measured for a second each."""
     if not is_core_cached():
         return DoctorFinding("rate", "warn", "not measured: the core is not yet compiled, see below")
-    done = subprocess.run([sys.executable, "-c", _RATES], capture_output=True, encoding="utf-8", check=False)
-    if done.returncode:
+    found: list[tuple[int, int, int]] | None = _ask_process(_RATES)
+    if found is None:
         return DoctorFinding("rate", "warn", "could not be measured")
-    *missed, (rate_hz, late_us, largest_us) = json.loads(done.stdout.splitlines()[-1])
+    *missed, (rate_hz, late_us, largest_us) = found
     within = f"{HELD_SHARE:.0%} of the ticks began within {late_us / 1e3:.2f} ms of their time"
     text = f"{within}, all within {largest_us / 1e3:.1f} ms"
     if not is_held(rate_hz, late_us):

@@ -191,7 +191,7 @@ class RunningSite:
     def run(self) -> None:
         """Runs every tick, or until the run ends."""
         parts = self._parts
-        parts.states.holds_samples &= all(meter.peer.estimator is None for meter in self._timing.meters)
+        parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.meters)
         self._publish_setup()
         order, name = encode(ChangeRequest(order="stop")), parts.name
         here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
@@ -209,7 +209,7 @@ class RunningSite:
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
         there = [one.peer for one in self._timing.meters if one.peer.name in self._epoch.boots]
-        here = 1 + sum(peer.estimator is None for peer in there)
+        here = 1 + sum(peer.is_own for peer in there)
         obtained = realtime.prepare(parts.options.cpu, here)
         self._publisher.publish(
             "setup",

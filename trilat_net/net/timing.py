@@ -106,6 +106,11 @@ class PeerClock(NamedTuple):
     estimate: OffsetEstimate
     estimator: OffsetEstimator | None
 
+    @property
+    def is_own(self) -> bool:
+        """True if it is this site's clock, too."""
+        return self.estimator is None
+
 
 class LinkTimingMonitor:
     """Timing of one link, at its receiving end.
@@ -133,7 +138,7 @@ class LinkTimingMonitor:
         self._heard_ns = self._acknowledged_ns = -1
         self._acknowledged = -1
         self._epoch_ns, self._place = peer.epoch_ns, peer.place
-        self._shared_ns = peer.estimate.offset_ns if peer.estimator is None else None
+        self._shared_ns = peer.estimate.offset_ns if peer.is_own else None
         self._windows = 0
         self._opened_ns: int | None = None
         self._open_window()
@@ -250,7 +255,7 @@ class SiteTiming:
 
     def opening(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
-        meters = (meter for meter in self.meters if meter.peer.estimator is not None)
+        meters = (meter for meter in self.meters if not meter.peer.is_own)
         return [_estimate_notice(meter, 0, self._epoch_ns) for meter in meters]
 
     def admit(self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None) -> list[ClockNotice]:
@@ -309,13 +314,10 @@ class SiteTiming:
             if meter.unheard is meter.hears(now_ns):  # None, of a silent peer, is neither
                 meter.unheard = not meter.unheard
                 notices.append(_hearing_notice(meter, k))
-        names = [meter.peer.name for meter in self.meters if meter.peer.estimator is not None]
-        if self._leader_name in names:
-            leader = next(meter for meter in self.meters if meter.peer.name == self._leader_name)
-            offset = leader.offset
-            leader_ns = due_ns + offset.at(due_ns) - leader.peer.epoch_ns
-            error_ns = leader_ns - k * NS_PER_S // self._rate_hz
-            self.schedule.steer(k, error_ns, offset.estimate.drift)
+            if meter.peer.name == self._leader_name and not meter.peer.is_own:
+                leader_ns = due_ns + meter.offset.at(due_ns) - meter.peer.epoch_ns
+                error_ns = leader_ns - k * NS_PER_S // self._rate_hz
+                self.schedule.steer(k, error_ns, meter.offset.estimate.drift)
         return notices
 
     def measured(self, now_ns: int) -> dict[str, Any]:
