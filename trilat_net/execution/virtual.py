@@ -346,6 +346,7 @@ def record_virtual(
     force: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     views_hz: float = VIZ_HZ,
+    hands: HandTracks = {},  # noqa: B006
 ) -> bool:
     """Runs a scenario in virtual time into a file, see `write_virtual_log`; `force` lets it replace one.
 
@@ -356,7 +357,7 @@ def record_virtual(
         LawFailed: a user law failed; the file is finished with the ticks before.
     """
     with LogFile(path, force=force) as stream:
-        return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz)
+        return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz, hands=hands)
 
 
 class SimulatedLog(Log):

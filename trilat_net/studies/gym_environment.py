@@ -19,10 +19,8 @@ from ..core.ticks import tick_ns
 from ..core.vectors import Array
 from ..errors import UsageError
 from ..execution.fused import FusedRun
-from ..execution.virtual import write_virtual_log
+from ..execution.virtual import record_virtual
 from ..files import import_extra
-from ..log.log_file import LogFile
-from ..log.ros2.viz_channels import VIZ_HZ
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
@@ -300,8 +298,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise UsageError("an episode has a log once it has a step")
         player = ActedHand(self._place(self.scenario), self._actions, self._every)
         lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
-        with LogFile(Path(path), force=force) as stream:
-            write_virtual_log(lasted, stream, views_hz=VIZ_HZ, hands={self._user: player.track})
+        record_virtual(lasted, Path(path), force=force, hands={self._user: player.track})
         return Path(path)
 
 

@@ -93,12 +93,10 @@ class ExperimentAnalysis(Result):
 
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows that have a measure."""
-        if measure.startswith("throughput"):
-            return self.throughput_rows
-        if measure.startswith("gain_"):
-            return self.gain_rows
-        if measure.startswith("threshold_"):
-            return self.threshold_rows
+        found = {"throughput": self.throughput_rows, "gain": self.gain_rows, "threshold": self.threshold_rows}
+        kind, named, _ = measure.partition("_")
+        if named and kind in found:
+            return found[kind]
         return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:

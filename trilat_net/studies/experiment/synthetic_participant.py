@@ -103,7 +103,8 @@ class SyntheticParticipant:
             return self._follow(now, way, slave.age_s)
         ended_s = max(self._begins_s + self._takes_s, self._still_s)
         waits_s = self._model.reaction_s + (0.0 if math.isinf(self._begins_s) else slave.age_s)
-        if now.t_s >= max(ended_s, 0.0) + waits_s and self._is_off(target - seen):
+        is_off = float(np.linalg.norm(target - seen)) > 0.35 * self._goal.width_m
+        if now.t_s >= max(ended_s, 0.0) + waits_s and is_off:
             self._start(now.t_s, target - seen)
         return self._reach(now.t_s)
 
@@ -113,9 +114,6 @@ class SyntheticParticipant:
         towards = (self._goal.place(t_s) - self._goal.start_m)[: self._size]
         way: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
         return way * (1.0 - felt_n / self._goal.force_n) if felt_n else 0.0 * way
-
-    def _is_off(self, way: Array) -> bool:
-        return float(np.linalg.norm(way)) > 0.35 * self._goal.width_m
 
     def _start(self, t_s: float, way: Array) -> None:
         """Begins a movement by what is missing, with the noise of its length."""

@@ -22,9 +22,8 @@ from ...core.vectors import Array
 from ...errors import LogError
 from ...execution.fused import FusedRun
 from ...execution.verify import verify
-from ...execution.virtual import write_virtual_log
+from ...execution.virtual import record_virtual
 from ...files import digest_file
-from ...log.log_file import LogFile
 from ...log.log_reader import Log, open_log
 from ...log.record_columns import Ints
 from ...log.site_log import SiteLog
@@ -289,8 +288,7 @@ class SyntheticTrial(ExperimentTrial):
         """Runs the trial into its log, and returns what that says."""
         lasts = replace(self.scenario, duration_s=self.find_end_s() + REST_S)
         hands = {name: player.track for name, player in self._make_players(lasts).items()}
-        with LogFile(path, force=True) as stream:
-            write_virtual_log(lasts, stream, hands=hands)
+        record_virtual(lasts, path, force=True, views_hz=0.0, hands=hands)
         return self.settle(path)
 
 
