@@ -53,7 +53,6 @@ class ArmFrames:
         counts = self._model.counts.joints
         limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
         self._tau_limit = limits
-        self._scale = self._model.chain.task.scale if self._model.chain and self._model.chain.task else 1.0
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
@@ -102,7 +101,7 @@ class ArmFrames:
         hand, wall = self._hand_force(own, split), self._wall_force(own, split)
         e, tau = np.linalg.norm(own.e, axis=1), np.abs(own.tau)
         if self._model.shares_pose:
-            ghost = own.q_des[-1, :3][np.newaxis] / self._scale
+            ghost = own.q_des[-1, :3][np.newaxis] / self._spec.task.scale
         else:
             ghost = joint_positions_m(self._model, own.q_des[last])[0]
         now = {

@@ -136,8 +136,7 @@ class SiteTopics:
         self, ends: Ends, scenario: Scenario, site: str, epoch_unix_ns: int, frames: TopicPublisher
     ) -> None:
         self._arm, self._epoch_unix_ns, self._frames = scenario.arms[site], epoch_unix_ns, frames
-        task = None if self._arm.chain is None else self._arm.chain.task
-        self._scale, self._mode = (*[1.0 if task is None else task.scale] * 3, 1.0, 1.0, 1.0), ""
+        self._scale, self._mode = (*[scenario.sites[site].task.scale] * 3, 1.0, 1.0, 1.0), ""
         self._robot, names = RobotModel(scenario, site), Ros2SiteChannels(scenario, site).joints
         self._pack_states = cdr.JointStatePacker(names).pack
         self._pack_reference = cdr.JointStatePacker(names, effort=False).pack

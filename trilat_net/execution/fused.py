@@ -52,8 +52,7 @@ from ..scenario.validate import refuse_external_arms
 
 def _float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
     if dtype.fields is None:
-        base = dtype.base if dtype.subdtype is None else dtype.subdtype[0]
-        return np.full(max(1, dtype.itemsize // 8), base.kind == "f")
+        return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
     words = np.zeros(dtype.itemsize // 8, dtype=bool)
     for field, offset, *_ in dtype.fields.values():
         words[offset // 8 : (offset + field.itemsize) // 8] = _float_words(field)
@@ -540,27 +539,21 @@ def read_run_inputs(log: Log) -> RunInputs:
     ]
     changes = [one for _, one in sorted(listed, key=lambda timed: timed[0])]
     models = [change.model for _, _, change in changes if change.model is not None]
-    first, samples, late_ns = _list_arrivals(log, ticks)
-    return RunInputs(
-        RecordedFeed(first, samples, *_stack_hands(log, ticks)),
-        changes,
-        late_ns,
-        max_delay_us(models, [None] * len(models)) if models else 0,
-    )
+    longest_us = max_delay_us(models, [None] * len(models)) if models else 0
+    feed, late_ns = make_prompt_inputs(len(log.scenario.names)).feed, 0
+    if log.driver != "virtual":
+        first, samples, late_ns = _list_arrivals(log, ticks)
+        feed = feed._replace(first=first, samples=samples)
+    return RunInputs(_add_hands(feed, log, ticks), changes, late_ns, longest_us)
 
 
 def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
-    """Returns arrivals as a feed has them, and by how much the latest came after its stamp, ns.
-
-    A run in virtual time has none to list: there every sample came at once.
-    """
+    """Returns arrivals as a feed has them, and by how much the latest came after its stamp, ns."""
     names = log.scenario.names
-    peers = max(len(names) - 1, 1)
-    virtual = log.driver == "virtual"
-    first = np.zeros((len(names), peers, 0 if virtual else ticks + 1), dtype=np.int64)
+    first = np.zeros((len(names), max(len(names) - 1, 1), ticks + 1), dtype=np.int64)
     listed: list[IntArray] = []
     total = late_ns = 0
-    for i, part in enumerate([] if virtual else [log[name] for name in names]):
+    for i, part in enumerate(map(log.__getitem__, names)):
         counts, rows = part.arrivals
         came = np.repeat(part.tick, counts)
         for p, peer in enumerate(part.peers):
@@ -575,17 +568,17 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
     return first, np.concatenate([*listed, np.zeros(0, np.int64)]), late_ns
 
 
-def _stack_hands(log: Log, ticks: int) -> tuple[Array, IntArray]:
+def _add_hands(feed: RecordedFeed, log: Log, ticks: int) -> RecordedFeed:
     setups = [log.scenario.setup(name)._replace(own=None) for name in log.scenario.names]
     rows = list(map(_find_live_row, setups))
-    size = max((setup.layout.hand - 3) // 2 for setup in setups)
     if max(rows) < 0:
-        return np.zeros((len(setups), 0, 1)), np.full(len(setups), -1)
+        return feed
+    size = max((setup.layout.hand - 3) // 2 for setup in setups)
     hands = np.zeros((len(setups), ticks, 1 + 2 * size))
     for i, name in enumerate(log.scenario.names):
         if rows[i] >= 0:
             _write_actions(hands[i], 0, log[name].hand)
-    return hands, np.array(rows)
+    return feed._replace(hands=hands, hand_rows=np.array(rows))
 
 
 def _write_actions(acts: Array, k: int, block: Array) -> None:
