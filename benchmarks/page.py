@@ -6,7 +6,6 @@ are compared with two socket clients that take every frame and draw nothing, and
 
 import json
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import trilat_net
+from tests.live.browsers import launch
 from trilat_net.net.arm_client import Hand
 
 from .stopwatch import cpu_s
@@ -148,7 +148,7 @@ def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
         live_session(Path(name) / "run") as (address, _),
         sync_playwright() as playwright,
     ):
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        browser = launch(playwright)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.goto(address)
         while not page.evaluate(_READY):

@@ -39,6 +39,11 @@ class Member:
         """Returns what it reads at an instant of the clock underneath."""
         return self.start_ns + self.offset_ns + round((true_ns - self.start_ns) * self.rate)
 
+    def offset_to_ns(self, other: "Member", since_epoch_ns: int) -> int:
+        """Returns how far another clock is ahead of this one at a reading of this one since the epoch."""
+        true_ns = self.true_ns(since_epoch_ns)
+        return other.reading_ns(true_ns) - self.reading_ns(true_ns)
+
 
 def members(log: Log) -> dict[str, Member]:
     """The clocks of a log's members."""
@@ -127,8 +132,7 @@ def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
     drift_ppm = float(other.rate / own.rate - 1) * 1e6
     rows = []
     for event in Bound(log, site, peer).events:
-        true_ns = own.true_ns(event.t_ns)
-        offset_ns = other.reading_ns(true_ns) - own.reading_ns(true_ns)
+        offset_ns = own.offset_to_ns(other, event.t_ns)
         rows.append(
             (event.t_ns / NS_PER_S, (event.offset_ns - offset_ns) / 1000, event.drift_ppb / 1000 - drift_ppm)
         )

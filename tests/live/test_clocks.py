@@ -4,12 +4,13 @@ All clocks are one underneath, so that the true delay of every sample is known t
 """
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from tests.cli.running import trilat
-from tests.truth import judged, offset_errors
+from tests.truth import judged, members, offset_errors
 
 from .processes import PAPER, Session, Stage, connections
 
@@ -41,14 +42,23 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
             if np.median(samples.bound_us) <= IDLE_US:
                 assert np.abs(errors[errors[:, 0] >= 10.0, 1]).max() <= 100.0
                 assert np.abs(errors[errors[:, 0] >= 10.0, 2]).max() <= 20.0
-    assert "clock of m2: another one, offset 3.00" in session.processes["m1"].text()
-    assert "clock of m1: another one, offset -86399.99" in session.processes["recorder"].text()
+    clocks = members(log)
+    for own, other, about_s in (("m1", "m2", 3.0), ("recorder", "m1", -86_400.0)):
+        found = re.search(
+            rf"clock of {other}: another one, offset (\S+) s \+- (\d+) us", session.processes[own].text()
+        )
+        assert found is not None, session.processes[own]
+        true_s = clocks[own].offset_to_ns(clocks[other], 0) / 1e9
+        assert true_s == pytest.approx(about_s, abs=0.1)
+        assert float(found[1]) == pytest.approx(
+            true_s, abs=1e-6 * (float(found[2]) + 1.0)
+        )  # it prints whole us
     told = json.loads(seen.succeeds())
-    clocks = {member["member"]: member for member in told["members"]}
-    assert set(clocks) == {*PAPER}
-    assert clocks["m1"]["same_clock"]
-    assert abs(clocks["m2"]["offset_ns"] - 3_000_000_000) <= 20_000_000
-    assert clocks["m2"]["rtt_us"]["min"] > 0
+    pinged = {member["member"]: member for member in told["members"]}
+    assert set(pinged) == {*PAPER}
+    assert pinged["m1"]["same_clock"]
+    assert abs(pinged["m2"]["offset_ns"] - 3_000_000_000) <= 20_000_000
+    assert pinged["m2"]["rtt_us"]["min"] > 0
     assert {(link["from"], link["to"]) for link in told["links"]} == {
         (peer, site) for site in PAPER for peer in log.scenario.peers(site)
     }

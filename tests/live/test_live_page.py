@@ -209,7 +209,8 @@ def test_a_gamepad_leads_the_chosen_arm(stage: Stage) -> None:
 MOTORS = """
 window.rumbles = [];
 pad.vibrationActuator = { playEffect: (kind, how) => {
-  rumbles.push({ kind, ...how, at: performance.now(), wall: Math.hypot(...trilat.frame.sites.s.wall) });
+  const at = trilat.parts.arms.cards[2].hold.rumbled; // when the page asked for it
+  rumbles.push({ kind, ...how, at, wall: Math.hypot(...trilat.frame.sites.s.wall) });
   return Promise.resolve("complete");
 } };
 """

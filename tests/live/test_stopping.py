@@ -118,7 +118,7 @@ def test_button_and_key_of_page_stop_every_arm(stage: Stage) -> None:
 @needs_browser
 @pytest.mark.long
 def test_whoever_holds_arm_is_asked_before_another_page_takes_part(stage: Stage) -> None:
-    running = live(stage, "play")
+    running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
     with browser_page(address) as first:
         shows(first, "trilat.frame && trilat.takesPart && trilat.parts.arms.cards[0].graspable")
