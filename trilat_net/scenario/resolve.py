@@ -45,22 +45,11 @@ from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .own_plant import resolve_plant
-from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, SiteSpec
+from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, Scenario, SiteSpec
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
-_TABLES = (
-    *SITE_GROUPS,
-    "control",
-    "link",
-    "sites",
-    "dominance",
-    "links",
-    "timeline",
-    "expect",
-    "drawn",
-    "urdf",
-)
+_TABLES = (*SITE_GROUPS, "control", "link", *(key for key in field_names(Scenario) if key not in _TOP))
 _SITE = field_names(SiteSpec)
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)

@@ -207,15 +207,9 @@ def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int
 
 
 _ABSENT: dict[str, tuple[Any, ...]] = {
-    "timeline": ((), []),
-    "expect": ({},),
-    "drawn": ({},),
-    "urdf": ({},),
-    "on_stale": ({},),
-    "task": ({},),
-    "environment": ((), []),
+    **dict.fromkeys(("timeline", "environment"), ((), [])),
+    **dict.fromkeys(("expect", "drawn", "urdf", "on_stale", "task", "sends"), ({},)),
     "plant": ("simulated",),
-    "sends": ({},),
     **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)),
 }
 """Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""

@@ -246,7 +246,7 @@ def _replace_estimate(
 
     converted = site_dynamics.SiteRates(*map(convert, rates))
     return SiteJacobian(
-        at._replace(parameters=len(T)),
+        site_dynamics.ArgumentLayout(at.joints, len(T), at.shared, at.peers),
         converted._replace(estimate=T @ converted.estimate),
         (*_name_motion(at.joints), *names),
     )

@@ -9,6 +9,7 @@ Squire and Trapp, "Using complex variables to estimate derivatives of real funct
 """
 
 from collections.abc import Iterator
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,83 +26,40 @@ SWITCHING_TOLERANCE = 1e-9
 """A wall this near, m, or an estimate this near to an end of its box, is at its switching point."""
 
 
-class ArgumentLayout(NamedTuple):
+class ArgumentLayout:
     """Where the parts of a site's argument stand, in their order: state, reference, torques.
 
-    Attributes:
+    Args:
         joints: length of each part but the estimate and what comes from peers.
         parameters: length of the estimate.
         shared: length of what comes from peers, of each of its three parts; 0: as many as there are joints.
         peers: of a law of one's own, which sees each peer by itself too, how many there are.
+
+    Attributes:
+        q, qd: joint positions, and velocities.
+        estimate: the estimate, theta_hat.
+        q_des, qd_des: the reference, q_id, in task space a pose, see `textbook_arm`; and its derivative.
+        peer_torque: the exogenous torque of the peers; in task space their force.
+        external_torque: torque that an operator adds ON the joints.
+        inputs: what comes from peers: the reference, its derivative, and their torque; then that of each.
+        coordinates: length of each part that comes from peers.
+        states: length of a site's state: q, qd and theta_hat.
+        arguments: length of the whole argument.
     """
 
-    joints: int
-    parameters: int
-    shared: int = 0
-    peers: int = 0
-
-    @property
-    def q(self) -> slice:
-        """Joint positions."""
-        return slice(0, self.joints)
-
-    @property
-    def qd(self) -> slice:
-        """Joint velocities."""
-        return slice(self.joints, 2 * self.joints)
-
-    @property
-    def estimate(self) -> slice:
-        """The estimate, theta_hat."""
-        return slice(2 * self.joints, self.states)
-
-    @property
-    def states(self) -> int:
-        """Length of a site's state: q, qd and theta_hat."""
-        return 2 * self.joints + self.parameters
-
-    @property
-    def coordinates(self) -> int:
-        """Length of each part that comes from peers."""
-        return self.shared or self.joints
-
-    @property
-    def inputs(self) -> slice:
-        """What comes from peers: the reference, its derivative, and their torque; then that of each."""
-        return slice(self.states, self.states + 3 * self.coordinates * (1 + self.peers))
-
-    def _input(self, place: int) -> slice:
-        first = self.states + place * self.coordinates
-        return slice(first, first + self.coordinates)
-
-    @property
-    def q_des(self) -> slice:
-        """The reference, q_id; in task space a pose, see `textbook_arm`."""
-        return self._input(0)
-
-    @property
-    def qd_des(self) -> slice:
-        """Its derivative."""
-        return self._input(1)
-
-    @property
-    def peer_torque(self) -> slice:
-        """The exogenous torque of the peers; in task space their force."""
-        return self._input(2)
-
-    @property
-    def external_torque(self) -> slice:
-        """Torque that an operator adds ON the joints."""
-        return slice(self.inputs.stop, self.arguments)
-
-    @property
-    def arguments(self) -> int:
-        """Length of the whole argument."""
-        return self.states + 3 * self.coordinates * (1 + self.peers) + self.joints
+    def __init__(self, joints: int, parameters: int, shared: int = 0, peers: int = 0) -> None:
+        self.joints, self.parameters, self.shared, self.peers = joints, parameters, shared, peers
+        self.coordinates = m = shared or joints
+        lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
+        parts = [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]
+        self.q, self.qd, self.estimate, self.q_des, self.qd_des, self.peer_torque, *_ = parts
+        self.external_torque = parts[-1]
+        self.states, self.arguments = self.estimate.stop, self.external_torque.stop
+        self.inputs = slice(self.states, self.external_torque.start)
 
     def of_peer(self, place: int) -> slice:
         """What came from one peer: its x, the velocity, and its exogenous torque."""
-        first = self.states + 3 * self.coordinates * (1 + place)
+        first = self.peer_torque.stop + 3 * self.coordinates * place
         return slice(first, first + 3 * self.coordinates)
 
 

@@ -70,14 +70,8 @@ ROBOT_CHANNELS = {
     FRAMES: Ros2Channel(cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
 }
 _LEVELS = {
-    "diverged": cdr.RosLogLevel.ERROR,
-    "failed": cdr.RosLogLevel.ERROR,
-    "lost": cdr.RosLogLevel.WARN,
-    "left": cdr.RosLogLevel.WARN,
-    "unheard": cdr.RosLogLevel.WARN,
-    "waiting": cdr.RosLogLevel.WARN,
-    "refused": cdr.RosLogLevel.WARN,
-    "clock fault": cdr.RosLogLevel.WARN,
+    **dict.fromkeys(("diverged", "failed"), cdr.RosLogLevel.ERROR),
+    **dict.fromkeys(("lost", "left", "unheard", "waiting", "refused", "clock fault"), cdr.RosLogLevel.WARN),
 }
 _MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mode, word)}
 
