@@ -21,13 +21,12 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
-from ..net.messages import RESTING_MODES
+from ..net.messages import RESTING_MODES, TASK_VECTORS
 from ..scenario import Scenario
 from ..scenario.scenario_types import Limits
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-_TASK_COLUMNS = ("x", "xd", "wrench")
 _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
@@ -163,8 +162,7 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 
 def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
     """Returns the rows in which no coordinate of a reference is as fast as it may be; of one row, if so."""
-    limit = np.inf if limits.qd_des_limit_rad_s is None else limits.qd_des_limit_rad_s
-    return np.asarray((np.abs(qd_des) < limit).all(axis=-1))
+    return np.asarray((np.abs(qd_des) < limits.motion.qd_des_limit).all(axis=-1))
 
 
 def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
@@ -178,7 +176,7 @@ def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
 
 def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
     """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
-    names = (*RECORD_COLUMNS, *(_TASK_COLUMNS if part.layout.task else ()))
+    names = (*RECORD_COLUMNS, *(TASK_VECTORS if part.layout.task else ()))
     names += ("hand",) if part.layout.hand else ()
     part.prepare(*names)
     tick = part.tick[rows]

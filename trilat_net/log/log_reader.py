@@ -74,7 +74,9 @@ class Log(Result, Mapping[str, SiteLog]):
         source: the file's name; of several files the first one's, and how many there are.
         sources: the names of its files, in order.
         session: metadata of the session: driver, seed, epoch, versions, commit, fingerprint.
+        driver: that of the session: "live" or "virtual".
         scenario: the scenario that ran.
+        sites: names of the sites, in scenario order.
         scenario_text, scenario_sha256: its text, as it is in the file, and the hash of that.
         events: the events, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
@@ -88,12 +90,14 @@ class Log(Result, Mapping[str, SiteLog]):
     def __init__(self, contents: LogContents) -> None:
         self.source, self.sources = contents.source, contents.sources
         self.session, self.damaged, self.chain = contents.session, contents.damaged, contents.chain
+        self.driver = self.session["driver"]
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
             self.scenario_text = contents.scenario.decode()
             self.scenario: Scenario = parse_embedded(self.scenario_text, f"{self.source}: scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
+        self.sites = self.scenario.names
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
         self.unreadable: list[str] = []
@@ -188,16 +192,6 @@ class Log(Result, Mapping[str, SiteLog]):
         events = self._decode(topic, Event)
         boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
         return sorted(events, key=lambda event: (boots[event.boot], event.n))
-
-    @property
-    def sites(self) -> tuple[str, ...]:
-        """Names of the sites, in scenario order."""
-        return self.scenario.names
-
-    @property
-    def driver(self) -> str:
-        """Driver of the session: "live" or "virtual"."""
-        return self.session["driver"]
 
     @cached_property
     def diverged_s(self) -> float | None:

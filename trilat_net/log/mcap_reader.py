@@ -10,6 +10,7 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -284,6 +285,7 @@ class McapReader:
 _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
 
 
+@dataclass(slots=True)
 class ChannelMessages:
     """The messages of one topic, in file order.
 
@@ -292,12 +294,9 @@ class ChannelMessages:
         log_ns, publish_ns: when each came, and was sent by its own stamp, Unix ns.
     """
 
-    __slots__ = ("log_ns", "payloads", "publish_ns")
-
-    def __init__(self) -> None:
-        self.payloads: list[bytes] = []
-        self.log_ns = array("Q")
-        self.publish_ns = array("Q")
+    payloads: list[bytes] = field(default_factory=list)
+    log_ns: "array[int]" = field(default_factory=partial(array, "Q"))
+    publish_ns: "array[int]" = field(default_factory=partial(array, "Q"))
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
         """Adds one message."""

@@ -14,6 +14,7 @@ import numpy as np
 from .. import process
 from ..core.law_channel import LawChannel
 from ..core.site_setup import Layout
+from ..core.task_space import PLACE
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import LogError, WireError
@@ -40,9 +41,6 @@ HEAVY_BLOCK, HEAVY_BLOCKS = 128, 8
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
 """Decodes some records, or raises an error for one that is none."""
 
-_PLACE = 3
-"""Numbers of an end effector's place; those of its orientation follow."""
-
 
 def freeze(value: T) -> T:
     """Makes arrays read-only, also those in a tuple or by name: nobody changes a log by accident."""
@@ -60,8 +58,8 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
     """
     e: Array = x - x_des
-    if e.shape[1] > _PLACE:
-        e[:, _PLACE:] = _find_turns(x[:, _PLACE:], x_des[:, _PLACE:])
+    if e.shape[1] > PLACE:
+        e[:, PLACE:] = _find_turns(x[:, PLACE:], x_des[:, PLACE:])
     e *= np.array(axes)
     return e
 

@@ -6,7 +6,6 @@ refused before anything runs, with the reason.
 
 import functools
 import operator
-import threading
 from collections.abc import Collection, Sequence
 from typing import Any, get_args
 
@@ -172,15 +171,10 @@ _CHOICES = {
 }
 
 
-_FIRST_USE = threading.Lock()
-"""Two threads that use a type of msgspec for the first time at once end the process: it is built then."""
-
-
 def build_scenario(resolved: TomlTable) -> Scenario:
     """Turns resolved tables into types; wrong types and ranges become errors with the key's path."""
     try:
-        with _FIRST_USE:
-            scenario = msgspec.convert(resolved, Scenario)
+        scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
         problem, path = split_refusal(error)
         dotted = _name_key(resolved, path.strip("."))

@@ -5,7 +5,7 @@ in one file of this folder, and in docs/metrics.md; whoever shows, compares or a
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +48,7 @@ def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> 
 def measure_shared(
     group: str,
     space: str,
-    keys: Sequence[str],
+    keys: Iterable[str],
     off: Array,
     at_end: NDArray[np.bool_],
     none: str = _NOT_FINITE,
@@ -108,6 +108,19 @@ class Quantity(NamedTuple):
     whole: str = "max"
     of: str = ""
     group: str = ""
+
+
+def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
+    """Returns what sites share by key and name: of their angles q, rad, and then of their places x, m.
+
+    A key lacks its unit; "{0}" in a name stands for q or x.
+    """
+    symbols = {"rad": "q", "m": "x"}
+    return [
+        Quantity(f"{key}_{unit}", name.format(symbol), unit)
+        for unit, symbol in symbols.items()
+        for key, name in names.items()
+    ]
 
 
 Measuring = Callable[[RunView, str], MetricValues]

@@ -37,6 +37,7 @@ from .measures import (
     Metric,
     MetricValues,
     Quantity,
+    list_shared_quantities,
     measure_shared,
     measures,
     metric,
@@ -47,19 +48,20 @@ from .measures import (
 
 LONG_END_S = 5.0
 """Length of the end of a run for slopes of estimates and for contact, s."""
+_ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
+_SPREADS = {
+    "spread_rms": "RMS spread, undelayed",
+    "spread_max": "largest spread",
+    "spread_end": "largest spread, last 1 s",
+}
+_LAGS = {
+    "following_rms": "RMS {0}_m(t-T) - {0}_s",
+    "following_max": "peak |{0}_m(t-T) - {0}_s|",
+    "following_end": "the same, last 1 s",
+}
 
 
-@measures(
-    "site",
-    TRACKING,
-    Quantity("settle_s", "settled", "s"),
-    Quantity("rms_error_rad", "RMS e", "rad"),
-    Quantity("max_error_rad", "peak |e|", "rad"),
-    Quantity("max_error_end_rad", "peak |e|, last 1 s", "rad"),
-    Quantity("rms_error_m", "RMS e", "m"),
-    Quantity("max_error_m", "peak |e|", "m"),
-    Quantity("max_error_end_m", "peak |e|, last 1 s", "m"),
-)
+@measures("site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS))
 def measure_tracking(view: RunView, site: str) -> MetricValues:
     """Returns settling, RMS and peak of a site's e."""
     log = view.log
@@ -69,24 +71,14 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     e, space = site_signals.joint_errors(part), log.scenario.sites[site].task.space
     unit = "rad" if space == "joints" else "m" if space == "position" else "m or rad"
     unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
-
-    keys, at_end = ("rms_error", "max_error", "max_error_end"), part.t_s > part.t_s[-1] - END_WINDOW_S
+    at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
     return {
-        **measure_shared(TRACKING, space, keys, e, at_end),
+        **measure_shared(TRACKING, space, _ERRORS, e, at_end),
         "settle_s": metric(site_signals.settling_time_s(part), unsettled),
     }
 
 
-@measures(
-    "run",
-    SPREAD,
-    Quantity("spread_rms_rad", "RMS spread, undelayed", "rad"),
-    Quantity("spread_max_rad", "largest spread", "rad"),
-    Quantity("spread_end_rad", "largest spread, last 1 s", "rad"),
-    Quantity("spread_rms_m", "RMS spread, undelayed", "m"),
-    Quantity("spread_max_m", "largest spread", "m"),
-    Quantity("spread_end_m", "largest spread, last 1 s", "m"),
-)
+@measures("run", SPREAD, *list_shared_quantities(_SPREADS))
 def measure_spread(view: RunView, _run: str) -> MetricValues:
     """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
 
@@ -108,20 +100,10 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     end_s = min(float(records.t_s[-1]) for records in sites)
     last = sites[0].t_s[known] > end_s - END_WINDOW_S
     none = "no instant of the last second of which every site has a record"
-    space, keys = log.scenario.sites[log.sites[0]].task.space, ("spread_rms", "spread_max", "spread_end")
-    return measure_shared(SPREAD, space, keys, apart, last, none)
+    return measure_shared(SPREAD, log.scenario.sites[log.sites[0]].task.space, _SPREADS, apart, last, none)
 
 
-@measures(
-    "link",
-    FOLLOWING,
-    Quantity("following_rms_rad", "RMS q_m(t-T) - q_s", "rad"),
-    Quantity("following_max_rad", "peak |q_m(t-T) - q_s|", "rad"),
-    Quantity("following_end_rad", "the same, last 1 s", "rad"),
-    Quantity("following_rms_m", "RMS x_m(t-T) - x_s", "m"),
-    Quantity("following_max_m", "peak |x_m(t-T) - x_s|", "m"),
-    Quantity("following_end_m", "the same, last 1 s", "m"),
-)
+@measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
 def measure_following(view: RunView, link: str) -> MetricValues:
     """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of the tick.
 
@@ -145,8 +127,8 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     there = master.shared[row]
     apart = find_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
     off, last = apart[known], slave.known_at_end(END_WINDOW_S)[known]
-    space, keys = log.scenario.sites[site].task.space, ("following_rms", "following_max", "following_end")
-    return measure_shared(FOLLOWING, space, keys, off, last, "no sample in the last second")
+    space, none = log.scenario.sites[site].task.space, "no sample in the last second"
+    return measure_shared(FOLLOWING, space, _LAGS, off, last, none)
 
 
 @measures(

@@ -153,6 +153,12 @@ class Ros2SiteChannels:
         if self.task:
             self.arrays["wrench"] = ArrayChannel("tau_x at the end effector", "N or N m", axes)
 
+    @property
+    def channels(self) -> dict[str, Ros2Channel]:
+        """Its channels by the last part of their topic: those of arrays, and of an arm for viewers."""
+        arrays = {name: array.channel for name, array in self.arrays.items()}
+        return arrays if self.robot is None else arrays | ROBOT_CHANNELS
+
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
         """Returns a channel of joint states with these names."""
         units = ", ".join(map(self._unit, ("rad", "rad/s", "N m")[: 2 + effort]))

@@ -80,21 +80,13 @@ class _SiteBuckets:
         self._put, self._epoch_unix_ns = put, epoch_ns
         self._shapes = shapes = ros2_messages.Ros2SiteChannels(scenario, site)
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
-        self._states_topic, self._states = f"{VIZ_ROOT}{site}/joint_states", JointStatePacker(names)
+        self._states = JointStatePacker(names)
         joints, sent = len(shapes.joints), scenario.channel(site).floats
         self.most_pending_bytes = MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
         self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
-        arrays = {name: array for name, array in shapes.arrays.items() if name not in shapes.task}
-        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in arrays}
-        self.channels: dict[str, ros2_messages.Ros2Channel] = {
-            self._states_topic: shapes.joint_states(names),
-            **{self._topics[name]: array.channel for name, array in arrays.items()},
-        }
-        if shapes.robot is not None:
-            self._topics |= {name: f"{VIZ_ROOT}{site}/{name}" for name in ros2_messages.ROBOT_CHANNELS}
-            self.channels |= {
-                self._topics[name]: channel for name, channel in ros2_messages.ROBOT_CHANNELS.items()
-            }
+        own = {"joint_states": shapes.joint_states(names), **shapes.channels}
+        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in own if name not in shapes.task}
+        self.channels = {topic: own[name] for name, topic in self._topics.items()}
         self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
         self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
@@ -109,7 +101,7 @@ class _SiteBuckets:
         none, n = self._none, len(self._none)
         velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : 4 * n], *none]
         data = self._states.pack(stamp_ns, row[: 2 * n], velocity, effort)
-        self._put(self._states_topic, data, stamp_ns, log_ns)
+        self._put(self._topics["joint_states"], data, stamp_ns, log_ns)
         error = self._shapes.arrays["error"].pack(*row[self._shapes.error_row])
         self._put(self._topics["error"], error, stamp_ns, log_ns)
         robot = self._shapes.robot

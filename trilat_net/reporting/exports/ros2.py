@@ -71,19 +71,15 @@ class _SiteMessages:
         self._shapes = shapes = ros2_messages.Ros2SiteChannels(log.scenario, name)
         self._states = cdr.JointStatePacker(shapes.joints)
         self._reference = cdr.JointStatePacker(shapes.joints, effort=False)
-        self.channels = {
-            f"/{name}/joint_states": shapes.joint_states(shapes.joints),
-            f"/{name}/reference": shapes.joint_states(shapes.joints, effort=False),
-            **{f"/{name}/{part}": array.channel for part, array in shapes.arrays.items()},
-        }
-        if shapes.robot is not None:
-            self.channels |= {
-                f"/{name}/{ros2_messages.ROBOT}": ros2_messages.ROBOT_CHANNELS[ros2_messages.ROBOT],
-                _TF: ros2_messages.ROBOT_CHANNELS[ros2_messages.FRAMES],
-            }
+        states = {"joint_states": shapes.joint_states(shapes.joints)}
+        states["reference"] = shapes.joint_states(shapes.joints, effort=False)
+        self.channels = {self._topic(part): channel for part, channel in (states | shapes.channels).items()}
+
+    def _topic(self, part: str) -> str:
+        return _TF if part == ros2_messages.FRAMES else f"/{self._name}/{part}"
 
     def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        return [(part if part == _TF else f"/{self._name}/{part}", data) for part, data in messages]
+        return [(self._topic(part), data) for part, data in messages]
 
     def records(self) -> Iterator[TimedMessages]:
         """Yields its records in the order of arrival."""
@@ -104,7 +100,7 @@ class _SiteMessages:
             if (robot := self._shapes.robot) is not None:
                 if count == 1:
                     messages.append((ros2_messages.ROBOT, pack_string(robot.description)))
-                messages.append((_TF, robot.pack(stamp_ns, state.q)))
+                messages.append((ros2_messages.FRAMES, robot.pack(stamp_ns, state.q)))
             yield log_ns[at], publish_ns[at], self._named(messages)
             if not count % _EVERY or count == len(part):
                 self._progress((count - 1) % _EVERY + 1)

@@ -7,7 +7,7 @@ this folder draws belongs to it.
 """
 
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -76,7 +76,7 @@ def write_figures(
     """
     form, wanted = make_print_size(width_in), list(dict.fromkeys(names)) or list_drawable_figures(log)
     chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
-    return _write(chosen, folder, form, _claim(folder, chosen, formats, force=force), progress)
+    return _write(chosen, folder, form, formats, progress, force=force)
 
 
 def write_overlay(
@@ -94,16 +94,7 @@ def write_overlay(
     """
     form = make_print_size(width_in)
     chosen = {"overlay": partial(draw_overlay, logs, form)}
-    return _write(chosen, folder, form, _claim(folder, chosen, formats, force=force))
-
-
-def _claim(folder: Path, names: Iterable[str], formats: Sequence[str], *, force: bool) -> list[str]:
-    kinds = list(dict.fromkeys(formats))
-    if strange := [kind for kind in kinds if kind not in FIGURE_FORMATS]:
-        raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}")
-    for path in (folder / f"{name}.{kind}" for name in names for kind in kinds):
-        refuse_existing(path, force=force)
-    return kinds
+    return _write(chosen, folder, form, formats, force=force)
 
 
 def write_report_figures(
@@ -136,9 +127,17 @@ def _write(
     chosen: Mapping[str, Callable[[], Figure]],
     folder: Path,
     form: FigureSize,
-    kinds: Sequence[str],
+    formats: Sequence[str],
     progress: Progress | None = None,
+    *,
+    force: bool = True,
 ) -> list[Path]:
+    """Writes figures by their names; refuses what can be refused before it draws the first."""
+    kinds = list(dict.fromkeys(formats))
+    if strange := [kind for kind in kinds if kind not in FIGURE_FORMATS]:
+        raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}")
+    for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
+        refuse_existing(path, force=force)
     paths = []
     for n, (name, draw) in enumerate(chosen.items()):
         if progress is not None:
