@@ -105,10 +105,7 @@ class PlacedArm:
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
         moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
-        torque: Numbers = (
-            multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
-        )
-        return torque
+        return multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta = e_p."""

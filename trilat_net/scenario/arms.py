@@ -246,8 +246,7 @@ class ArmModel(NamedTuple):
         rows = self._place(q)
         place_end_effector(rows, np.array(self.chain.tip_m))
         J = np.hstack([self.chain.task.scale * rows["J_lin"], rows["J_ang"]]).T
-        found: Array = J[: self.counts.shared]
-        return found
+        return J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
         """Returns what gravity turns a joint of the planar arm by at most, N m; () of a chain."""

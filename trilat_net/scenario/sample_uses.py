@@ -85,8 +85,7 @@ def draw_uses(link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: f
 def _find_newest(sample: IntArray, release: IntArray, ticks: int) -> IntArray:
     newest = np.full(ticks, -1, dtype=np.int64)
     np.maximum.at(newest, release[release < ticks], sample[release < ticks])
-    found: IntArray = np.maximum.accumulate(newest)
-    return found
+    return np.maximum.accumulate(newest)
 
 
 def count_silences(used: IntArray, own_hz: int, silence_ns: int) -> int:

@@ -145,10 +145,7 @@ class PlacedChain:
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns the torque of the joints' friction at speeds v, shape (n, ...), N m."""
         x = v / COULOMB_SPEED
-        torque: Numbers = self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(
-            1.0 + x * x
-        )
-        return torque
+        return self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(1.0 + x * x)
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns G(q), shape (n, ...), N m."""
