@@ -44,21 +44,20 @@ def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) ->
     return np.where(there, push, 0.0)
 
 
-def _target_progress(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
-    """Returns the progress of a target from 0 to 1, minimum jerk, and its rate, 1/s."""
+def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
+    """Returns the target of a spring, which moves from a to b with minimum jerk, and its velocity, (K, n)."""
     span_s = source.move_end_s - source.move_start_s
-    if span_s <= 0.0:
-        return (t_s > source.move_start_s).astype(np.float64), np.zeros(len(t_s))
-    x = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0)
-    return x**3 * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x**2 * (1.0 - x) ** 2 / span_s
+    x, per_s = (t_s > source.move_start_s).astype(np.float64), 0.0
+    if span_s > 0.0:
+        x, per_s = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0), 1.0 / span_s
+    a, way, x = np.array(source.a), np.array(source.b) - np.array(source.a), x[:, None]
+    return a + x**3 * (10.0 + x * (6.0 * x - 15.0)) * way, 30.0 * x**2 * (1.0 - x) ** 2 * per_s * way
 
 
 def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Array) -> Array:
     """Returns K (target - at) + B (its velocity - speed), per joint or axis, shape (K, n)."""
-    share, rate = _target_progress(source, t_s)
-    a, way = np.array(source.a), np.array(source.b) - np.array(source.a)
-    pull = np.array(source.K) * (a + share[:, None] * way - at)
-    found: Array = pull + np.array(source.B) * (rate[:, None] * way - speed)
+    target, velocity = follow_target(source, t_s)
+    found: Array = np.array(source.K) * (target - at) + np.array(source.B) * (velocity - speed)
     return found
 
 

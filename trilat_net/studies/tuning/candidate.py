@@ -28,6 +28,7 @@ from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import find_closed_groups, left_perron_vector
 from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.torque_sources import follow_target
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
@@ -120,12 +121,7 @@ def _springs(scenario: Scenario) -> list[tuple[str, JointSpring]]:
 def _target(hand: JointSpring, t_s: Array) -> tuple[Array, Array]:
     """Returns where a hand is at work, shape (K, 1), 0 or 1, and its target, shape (K, n), rad."""
     on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
-    span_s = hand.move_end_s - hand.move_start_s
-    x = np.clip((t_s - hand.move_start_s) / span_s, 0.0, 1.0) if span_s > 0.0 else t_s >= hand.move_end_s
-    way = (x**3 * (10.0 + x * (6.0 * x - 15.0)))[:, np.newaxis]  # minimum jerk, as core.exogenous
-    before, after = np.array(hand.from_rad), np.array(hand.to_rad)
-    target: Array = before + way * (after - before)
-    return on, target
+    return on, follow_target(hand.actor, t_s)[0]
 
 
 STRAYED_RAD = 0.2
