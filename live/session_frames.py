@@ -21,7 +21,6 @@ from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -49,7 +48,7 @@ class ArmFrames:
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario, self._site = scenario, site
         self._model, self._spec = scenario.arms[site], scenario.sites[site]
-        self._walls, self._hand = list_walls(self._spec), find_live_hand(self._spec.hands)
+        self._walls, self._hand = list_walls(self._spec), self._spec.find_live_hand()
         counts = self._model.counts.joints
         limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
         self._tau_limit = limits

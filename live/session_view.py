@@ -24,7 +24,6 @@ from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
 from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import initial_link_tables, scheduled_link_tables
 from trilat_net.scenario.sample_uses import PictureDelay
 
@@ -74,7 +73,7 @@ class SiteView:
         rule = scenario.sites[name].on_stale
         self.glides, self.peers = rule.action == "glide", scenario.peers(name)
         self.layout = scenario.layout(name) if rule.rule.degrades else None
-        self.hand = find_live_hand(scenario.sites[name].hands, is_open=True)
+        self.hand = scenario.sites[name].find_live_hand(is_open=True)
         self.reception, self.window = SiteReception(scenario, name, boot), window
         self.holder = ""
         self.bodies: dict[int, list[float]] = {}

@@ -28,7 +28,6 @@ from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPubl
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .ros2_topics import POSE, RELIABLE, WRENCH, Ends, RobotTable, SiteTopics, TopicTable
 from .running_session import RunningSession, open_hand
@@ -332,7 +331,7 @@ def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
     """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it, what it does."""
-    live = find_live_hand(scenario.sites[site].hands, is_open=True)
+    live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
     axes = len(scenario.arms[site].end_effector(scenario.sites[site].q0_rad))
     if live.mode == "joint":

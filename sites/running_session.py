@@ -29,7 +29,6 @@ from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
 from trilat_net.net.zenoh_config import OPERATOR
 from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.run_changes import parse_core_change
 from trilat_net.scenario.sample_uses import PictureDelay
 
@@ -138,7 +137,7 @@ class RunningSession:
         with self.reach_site(site, timeout_s) as (bus, scenario):
             who = type(device).__name__
             with open_hand(bus, self._clock, self.name, site, scenario, who, repeats=False) as held:
-                live = find_live_hand(scenario.sites[site].hands, is_open=True)
+                live = scenario.sites[site].find_live_hand(is_open=True)
                 if live is None or live.mode != "tip":
                     raise UsageError(
                         f"a device leads an end effector: the hand of {site} is not of mode 'tip'"
@@ -455,7 +454,7 @@ def open_hand(
         UsageError: nobody can hold that arm.
     """
     find_site(scenario, site)
-    live = find_live_hand(scenario.sites[site].hands, is_open=True)
+    live = scenario.sites[site].find_live_hand(is_open=True)
     if live is None:
         able = ", ".join(scenario.open_hands)
         others = f"; they can at {able}" if able else ""

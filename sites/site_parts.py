@@ -32,7 +32,6 @@ from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_code import ImportedLaw
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 from trilat_net.scenario.operators.program_hand import HandPlayer, make_program, place_own_hand
 from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
@@ -126,7 +125,7 @@ class SiteParts:
 
     def _meet_hand(self) -> None:
         name, bus, session = self.name, self.bus, self.options.session
-        live, at = find_live_hand(self.scenario.sites[name].hands), place_own_hand(self.scenario, name)
+        live, at = self.scenario.sites[name].find_live_hand(), place_own_hand(self.scenario, name)
         if live is None:
             return
         if at is not None and not at.runs_alone:

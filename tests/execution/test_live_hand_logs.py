@@ -16,7 +16,6 @@ from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 SECONDS = 1.2
 
@@ -26,7 +25,7 @@ class CirclingHand:
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._arm, spec = scenario.arms[site], scenario.sites[site]
-        live = find_live_hand(spec.hands)
+        live = spec.find_live_hand()
         assert live is not None
         self._mode, self._rules = live.mode, live.rules(spec.rate_hz, self._arm.counts)
         self._memory = HandMemory()

@@ -16,7 +16,6 @@ from tests.cli.running import COMMAND, PLAIN
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import list_shipped, load_scenario
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .browsers import browser_page, needs_browser, page_address, shows, take_hold
 from .page_client import PageClient, page_client
@@ -25,7 +24,7 @@ from .processes import Process, Stage, executed_again
 HELD = [
     name
     for name in list_shipped()
-    if any(find_live_hand(site.hands) is not None for site in load_scenario(name).sites.values())
+    if any(site.find_live_hand() is not None for site in load_scenario(name).sites.values())
 ]
 """Shipped scenarios whose arms people hold."""
 

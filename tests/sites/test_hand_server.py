@@ -24,7 +24,6 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.requests import HandMessage
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.operators.kernel_operators import find_live_hand
 
 from .relay import RelayClock
 from .sessions import SESSION, Session
@@ -119,7 +118,7 @@ class Served:
     def __init__(self) -> None:
         network = LocalNetwork()
         self.dropped: Counter[str] = Counter()
-        live, arm = find_live_hand(SCENARIO.sites["m1"].hands), SCENARIO.arms["m1"]
+        live, arm = SCENARIO.sites["m1"].find_live_hand(), SCENARIO.arms["m1"]
         assert live is not None
         key = topics.key("t", "m1", topics.HAND)
         inbox = network.join().inbox(key, MESSAGES_KEPT)

@@ -30,7 +30,6 @@ from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES, ArmModel
-from ..scenario.operators.kernel_operators import find_live_hand
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -268,7 +267,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     """Returns the records of a site, a row each, in order of their ticks."""
     docs, arm = read_field_docs(State), scenario.arms[site.name]
-    live = find_live_hand(scenario.sites[site.name].hands)
+    live = scenario.sites[site.name].find_live_hand()
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
     columns += _make_vector_columns(site, arm)

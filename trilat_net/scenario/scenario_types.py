@@ -34,7 +34,7 @@ from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw
 from .operators import Environment, Operator
-from .operators.kernel_operators import find_live_hand
+from .operators.kernel_operators import LiveHand
 from .own_plant import OwnPlant
 
 
@@ -146,6 +146,11 @@ class SiteSpec(Frozen, frozen=True):
     environment: tuple[Environment, ...] = ()
     plant: Literal["simulated", "external"] | OwnPlant = "simulated"
     view: Link | None = None
+
+    def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
+        """Returns the hand that is led while the session runs; `is_open`: one that anybody may hold."""
+        hands = (one for one in self.hands if isinstance(one, LiveHand))
+        return next((one for one in hands if one.is_open or not is_open), None)
 
 
 SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale, "task": Task}
@@ -388,7 +393,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     @property
     def open_hands(self) -> tuple[str, ...]:
         """The sites whose arms anybody may hold who comes."""
-        found = {name: find_live_hand(spec.hands, is_open=True) for name, spec in self.sites.items()}
+        found = {name: spec.find_live_hand(is_open=True) for name, spec in self.sites.items()}
         return tuple(name for name, hand in found.items() if hand is not None)
 
     @property
@@ -407,7 +412,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def layout(self, site: str) -> site_setup.Layout:
         """Returns how many numbers the vectors of a site have."""
-        live = find_live_hand(self.sites[site].hands)
+        live = self.sites[site].find_live_hand()
         actors = () if live is None else (live.actor,)
         found = site_setup.Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
         return found._replace(bodies=7 * len(self.bodies_m(site)))

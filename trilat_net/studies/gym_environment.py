@@ -22,7 +22,7 @@ from ..execution.fused import FusedRun
 from ..execution.virtual import record_virtual
 from ..files import import_extra
 from ..scenario import Scenario, find_site, load_scenario
-from ..scenario.operators.kernel_operators import LiveHand, find_live_hand
+from ..scenario.operators.kernel_operators import LiveHand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
 from ..scenario.own_plant import make_plant_players
 
@@ -192,7 +192,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         find_site(scenario, self._user)
         find_site(scenario, self._leads)
         spec = scenario.sites[self._user]
-        hand = find_live_hand(spec.hands, is_open=True) or LiveHand()
+        hand = spec.find_live_hand(is_open=True) or LiveHand()
         if self._mode:
             hand = replace(hand, mode=self._mode)
         sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
@@ -200,7 +200,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _place(self, scenario: Scenario) -> HandSite:
-        hand = find_live_hand(scenario.sites[self._user].hands)
+        hand = scenario.sites[self._user].find_live_hand()
         assert hand is not None
         return HandSite(scenario, self._user, hand, self._rate_hz, self._delay_s)
 

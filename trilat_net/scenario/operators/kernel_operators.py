@@ -5,7 +5,7 @@ without a start pose holds the arm at the arm's start pose.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -318,12 +318,6 @@ LIVE_KEYS = {
     "force": ("force_limit_n",),
 }
 """The keys of a live hand by its mode."""
-
-
-def find_live_hand(operators: Iterable[ActorBase], *, is_open: bool = False) -> LiveHand | None:
-    """Returns the live hand among a site's operators, or None; `is_open`: one that anybody may hold."""
-    hands = (one for one in operators if isinstance(one, LiveHand))
-    return next((one for one in hands if one.is_open or not is_open), None)
 
 
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):

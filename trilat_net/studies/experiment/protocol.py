@@ -23,7 +23,6 @@ from ...fields import Frozen, Positive
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
-from ...scenario.operators.kernel_operators import find_live_hand
 from .questionnaires import Name, Questionnaire, find_form
 from .staircase import COMPARISON, STANDARD, Staircase
 from .synthetic_participant import ParticipantModel, Share
@@ -417,7 +416,7 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     for user in protocol.users:
         if user not in scenario.names:
             raise ScenarioError(f"has no site {user}; there are {', '.join(scenario.names)}", path="users")
-        if find_live_hand(scenario.sites[user].hands, is_open=True) is None:
+        if scenario.sites[user].find_live_hand(is_open=True) is None:
             raise ScenarioError(
                 "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",
@@ -445,7 +444,7 @@ def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -
     found = {}
     for user, name in zip(protocol.users, group, strict=False):  # an odd one out is refused by itself
         spec, most = scenario.sites[user], protocol.force_limit_n.get(name)
-        hand = find_live_hand(spec.hands, is_open=True)
+        hand = spec.find_live_hand(is_open=True)
         if most is None or hand is None:
             continue
         if hand.mode == "joint" or hand.force_limit_n < most:

@@ -28,7 +28,6 @@ from ...log.log_reader import Log, open_log
 from ...log.record_columns import Ints
 from ...log.site_log import SiteLog
 from ...scenario import Scenario, parse_scenario
-from ...scenario.operators.kernel_operators import find_live_hand
 from ...scenario.operators.program_hand import HandPlayer, HandSite
 from ...scenario.scenario_types import Change
 from .movement_measures import (
@@ -260,7 +259,7 @@ class SyntheticTrial(ExperimentTrial):
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
         found = dict[str, HandPlayer]()
         for user, name in zip(self.protocol.users, self.planned.group, strict=True):
-            hand = find_live_hand(scenario.sites[user].hands, is_open=True)
+            hand = scenario.sites[user].find_live_hand(is_open=True)
             assert hand is not None  # see `plan_experiment`
             at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
