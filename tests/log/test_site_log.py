@@ -73,6 +73,17 @@ def test_few_records_are_a_list() -> None:
     assert isinstance(site_log.decode_records([b"1"] * 9, decoded), LazyRecords)
 
 
+@pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
+def test_records_with_a_long_list_are_held_few_at_a_time(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever list it is, and in either record: memory is bounded by all that a record may hold."""
+    monkeypatch.setattr(site_log, "HEAVY_BYTES", 9_000)
+    values = {f"m{n}": n for n in range(300)} if field == "used" else [0] * 300
+    heavy = msgspec.structs.replace(EMPTY, **{field: values})
+    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [EMPTY, EMPTY]), list)
+    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [heavy, EMPTY]), LazyRecords)
+    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [EMPTY, heavy]), LazyRecords)
+
+
 @given(st.lists(st.integers(0, 20), max_size=20).map(sorted))
 def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
     states = [msgspec.structs.replace(state(tick), late_us=n) for n, tick in enumerate(ticks)]
