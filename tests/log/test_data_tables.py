@@ -16,7 +16,7 @@ from tests.log_editing import edited, opened, recorded
 from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
-from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, read_field_docs
+from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, build_arrivals_table, read_field_docs
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
 
@@ -47,6 +47,17 @@ def test_column_names_are_unique_end_in_units_and_are_explained(which: str) -> N
                     column.name.split("_", 1)[-1].endswith(UNIT_SUFFIXES[column.unit])
                     or column.name in UNIT_SUFFIXES
                 )
+
+
+@pytest.mark.parametrize(
+    ("live", "said"),
+    [(False, "the age of its stamp; in virtual time"), (True, "its one-way delay, by the offset of")],
+)
+def test_delays_of_arrivals_say_what_they_are(*, live: bool, said: str) -> None:
+    """In virtual time nothing is under way: a sample's delay there is no network's."""
+    table = build_arrivals_table(paper()["m1"], "run.mcap", live=live)
+    (delay,) = (one for one in table.columns if one.name == "delay_us")
+    assert delay.meaning.startswith(said)
 
 
 @pytest.mark.parametrize("which", LOGS)
