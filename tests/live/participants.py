@@ -29,7 +29,7 @@ sites.m1.q0_rad = [-0.6, 1.2]
 sites.m1.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
 sites.m2.q0_rad = [-0.6, 1.2]
 sites.m2.hands = [{{ kind = "live", stiffness_n_m = 1000.0, damping_n_s_m = 100.0 }}]
-sites.s = {{ role = "slave", q0_rad = [-0.6, 1.2] }}
+sites.s = {{ role = "slave", q0_rad = [-0.6, 1.2]{walls} }}
 on_stale = {{ action = "glide", silence_ms = 100.0 }}
 dominance.m1 = {{ m2 = 0.2, s = 0.8 }}
 dominance.m2 = {{ m1 = 0.2, s = 0.8 }}
@@ -38,16 +38,20 @@ dominance.s = {{ m1 = 0.6, m2 = 0.4 }}
 "link.delay_ms" = 0
 {conditions}
 [task]
-kind = "reach"
+{task}
+"""
+REACH = """kind = "reach"
 targets = 4
 distance_m = 0.3
 width_m = 0.2
 dwell_s = 0.2
-timeout_s = {timeout}
+timeout_s = 20.0
 """
+WALL = """, environment = [
+{ kind = "wall", point_m = [1.69, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 1000.0 }]"""
 FAR = '[conditions.far]\n"link.delay_ms" = 100\n'
 
-LOOK = """(site) => {
+LOOK = """([site, beyond_m]) => {
   const shown = (trilat.frame?.stage && trilat.hello.running ? trilat.frame : trilat.hello)?.stage || {};
   const arms = trilat.parts?.arms, frame = trilat.frame;
   const found = { ...shown, running: shown.left_s !== undefined };
@@ -55,8 +59,8 @@ LOOK = """(site) => {
   const own = arms.byName[site], tip = frame.sites[site].points.at(-1);
   const box = own.canvas.getBoundingClientRect();
   if (!own.project) return found;
-  const slave = frame.sites[shown.target.site].points.at(-1), held = own.hold ? own.hold.to : tip;
-  const aim = held.map((x, n) => x + 0.35 * (shown.target.at[n] - slave[n]));
+  const slave = frame.sites[shown.target.site].points.at(-1);
+  const aim = shown.target.at.map((x, n) => tip[n] + x + (n ? 0 : beyond_m) - slave[n]);
   const ratio = own.canvas.width / box.width;
   const px = (at) => { const [x, y] = own.project(at); return [box.left + x / ratio, box.top + y / ratio]; };
   return { ...found, tip: px(tip), aim: px(aim), held: Boolean(own.hold), graspable: own.graspable };
@@ -64,10 +68,11 @@ LOOK = """(site) => {
 
 
 def write_protocol(
-    folder: Path, trials: int, more: str = "", conditions: str = "", timeout: float = 20.0
+    folder: Path, trials: int, more: str = "", conditions: str = "", task: str = REACH
 ) -> Path:
     file = folder / "short.toml"
-    text = PROTOCOL.format(trials=trials, more=more, conditions=conditions, timeout=timeout)
+    walls = WALL if "contact" in task else ""
+    text = PROTOCOL.format(trials=trials, more=more, conditions=conditions, task=task, walls=walls)
     file.write_text(text, encoding="utf-8")
     return file
 
@@ -77,7 +82,10 @@ class Participant:
 
     Attributes:
         told: what the page said of each trial that was done, in order: by measure, as text.
+        beyond_m: how far beyond the target along x it goes, as into a wall, m.
     """
+
+    beyond_m = 0.0
 
     def __init__(self, page: Page, site: str) -> None:
         self.page, self.site = page, site
@@ -86,7 +94,7 @@ class Participant:
         self._done: tuple[str, str] | None = None
 
     def look(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.page.evaluate(LOOK, self.site)
+        found: dict[str, Any] = self.page.evaluate(LOOK, [self.site, self.beyond_m])
         return found
 
     def act(self) -> dict[str, Any]:

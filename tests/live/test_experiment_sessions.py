@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import signal
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from trilat_net.studies.experiment.experiment_run import Experiment, open_experi
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .browsers import needs_browser, page_address, shows
-from .participants import FAR, Participant, begin, join, participants, take_part, write_protocol
+from .participants import FAR, REACH, Participant, begin, join, participants, take_part, write_protocol
 from .processes import Process, Stage
 
 pytestmark = needs_browser
@@ -89,6 +90,49 @@ def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) ->
     answers = rows_of(folder, "questionnaires.csv")
     assert {(row["participant"], row["item"]) for row in answers} >= {("P1", "mental"), ("P2", "effort")}
     assert {row["event"] for row in rows_of(folder, "events.csv")} == {"consent", "questionnaire"}
+
+
+TRACK = 'kind = "track"\nduration_s = 5.0\namplitude_m = 0.05\nwidth_m = 0.1\napart_m = 0.1'
+CONTACT = """kind = "contact"
+distance_m = 0.04
+force_n = 4.0
+tolerance_n = 3.0
+dwell_s = 0.5
+timeout_s = 20.0
+"""
+TASKS = {
+    "carry": (f"{REACH}corridor_m = 1.0", "internal_rms_n"),
+    "hand over": (f"{REACH}handover_s = 4.0", "error_handover_mm"),
+    "settle": (TRACK, "first_settled"),
+    "press": (CONTACT, "wall_force_n"),
+}
+"""What else two users are asked for, and what is measured of it."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("what", TASKS)
+def test_two_people_do_what_else_a_task_asks(what: str, stage: Stage) -> None:
+    """They are told, it is drawn, and the table has its measure; the log verifies."""
+    task, measure = TASKS[what]
+    folder, pictures = stage.folder / "out", os.environ.get("TRILAT_PICTURES")
+    running = begin(stage, write_protocol(stage.folder, 1, task=task), "--out", str(folder))
+    with participants(running) as people:
+        for one in people:
+            one.beyond_m = 0.006 if what == "press" else 0.0  # the target is a millimetre deep
+        take_part(people, lambda: people[0].look().get("appeared"))
+        for one in people if pictures else ():
+            one.page.screenshot(path=f"{pictures}/{what}_{one.site}.png")
+        shown = [one.look() for one in people]
+        take_part(people, running.ended)
+    assert running.code() == 0, running
+    done, (row,) = open_experiment(folder), rows_of(folder)
+    asked = done.plan.protocol.task.ask("s")
+    assert [one["task"] for one in shown] == [asked, asked]
+    assert ("way" in shown[0]) == (what == "carry")
+    assert (shown[0]["target"]["at"] != shown[1]["target"]["at"]) == (what == "settle")
+    assert row["succeeded"] == "1", row
+    assert float(row[measure]) >= 0.0
+    assert verify(open_log(folder / row["log"])).passed
 
 
 @pytest.mark.long
