@@ -84,6 +84,18 @@ def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     assert hands.text.startswith("the hands and walls gave up to")
 
 
+@pytest.mark.parametrize(
+    ("apart_rad", "says"), [(0.5, "the walls gave up to"), (1e-8, "the walls only took")]
+)
+def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
+    """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V that is hardly more."""
+    starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
+    damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
+    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **starts, **damper)["hands"]
+    assert found.text.startswith(says)
+    assert found.holds is (apart_rad < 1e-3)
+
+
 SITE = "sites.s.environment"
 SAMPLED = {f"{SITE}.0.sampled": True, "rate_hz": 200, "duration_s": 8.0}
 
