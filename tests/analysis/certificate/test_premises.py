@@ -88,10 +88,11 @@ def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     ("apart_rad", "says"), [(0.5, "the walls gave up to"), (1e-8, "the walls only took")]
 )
 def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
-    """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V that is hardly more."""
+    """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V of known arms that is hardly more."""
+    known = {"control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "control__Gamma": 0.0}
     starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
     damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
-    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **starts, **damper)["hands"]
+    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)["hands"]
     assert found.text.startswith(says)
     assert found.holds is (apart_rad < 1e-3)
 
