@@ -284,12 +284,13 @@ class OrderDesk:
     def order(self, order: Order, sites: Collection[str], links: Collection[str]) -> None:
         """Takes an order, if the session has the site or the link; it replaces one that waits for that."""
         if isinstance(order, SetLink):
-            site, known, request = order.link.partition("->")[2], order.link in links, _link_request(order)
+            what, site, known = "link", order.link.partition("->")[2], order.link in links
+            request = _link_request(order)
         else:
-            site, known = order.site, order.site in sites
+            what, site, known = "site", order.site, order.site in sites
             request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=LEAST_RAMP_S)
         if not known:
-            self.refused[f"no such {'link' if request.link else 'site'}"] += 1
+            self.refused[f"no such {what}"] += 1
         elif len(self._waiting) < MOST_WAITING:
             self._waiting[site, request.link] = request
 

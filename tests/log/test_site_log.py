@@ -74,7 +74,7 @@ def test_few_records_are_a_list() -> None:
 
 
 @pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
-def test_records_with_a_long_list_are_held_few_at_a_time(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_with_long_lists_are_held_few_at_a_time(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever list it is, and in either record: memory is bounded by all that a record may hold."""
     monkeypatch.setattr(site_log, "HEAVY_BYTES", 9_000)
     values = {f"m{n}": n for n in range(300)} if field == "used" else [0] * 300

@@ -10,7 +10,8 @@ Invariant: what it does is a function of what its site knows, of its numbers and
 """
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -20,10 +21,7 @@ from ...core.own_hand import HandContext, HandView
 from ...core.user_law import PeerView
 from ...core.vectors import Array
 from ...fields import Frozen
-from .tasks import place_slave
-
-if TYPE_CHECKING:
-    from .trial_run import ExperimentTrial
+from .tasks import TrialGoal, place_slave
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
@@ -66,16 +64,27 @@ class SyntheticParticipant:
     Args:
         facts: of its site.
         model: its numbers.
-        trial: what is asked of it, with which slave, and after how many others; its seed is of what it draws.
+        goal: the target that it sees.
+        slave: the site of the slave, its arm, and the force at its end effector by angles and torques, N.
+        before: how many trials it has made before.
+        seed: of the trial, for what it draws.
         user: which of the users it is, from 0.
     """
 
     def __init__(
-        self, facts: HandContext, model: ParticipantModel, trial: "ExperimentTrial", user: int
+        self,
+        facts: HandContext,
+        model: ParticipantModel,
+        goal: TrialGoal,
+        slave: tuple[str, Any, Callable[[Sequence[float], Sequence[float]], float]],
+        before: int,
+        seed: int,
+        user: int,
     ) -> None:
-        self._model, self._trial, self._goal, self._size = model, trial, trial.make_goal(), facts.size
-        self._user, self._peer = user, facts.peers.index(trial.slave)
-        self._random = np.random.default_rng([trial.planned.seed, facts.seed])
+        self._model, self._goal, self._before, self._size = model, goal, before, facts.size
+        name, self._arm, self._find_force_n = slave
+        self._user, self._peer = user, facts.peers.index(name)
+        self._random = np.random.default_rng([seed, facts.seed])
         self._from = self._to = np.zeros(facts.size)
         self._begins_s, self._takes_s, self._seen = -math.inf, 0.0, np.zeros(facts.size)
         self._begun, self._still_s = False, 0.0
@@ -83,7 +92,7 @@ class SyntheticParticipant:
     def act(self, now: HandView) -> Array:
         """Returns where the hand goes, m."""
         slave = now.peers[self._peer]
-        seen = place_slave(self._trial.arm, slave.q)[: self._size]
+        seen = place_slave(self._arm, slave.q)[: self._size]
         if not self._begun:
             self._begun, self._from, self._to, self._seen = True, now.pose, now.pose, seen
         moved, self._seen = float(np.linalg.norm(seen - self._seen)), seen
@@ -110,7 +119,7 @@ class SyntheticParticipant:
 
     def _press(self, slave: PeerView, t_s: float) -> Array:
         """Returns the way to the force that is asked, by the force seen over the network; 0 off a wall."""
-        felt_n = self._trial.find_force_n(slave.q, slave.tau_x)
+        felt_n = self._find_force_n(slave.q, slave.tau_x)
         towards = (self._goal.place(t_s) - self._goal.start_m)[: self._size]
         way: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
         return way * (1.0 - felt_n / self._goal.force_n) if felt_n else 0.0 * way
@@ -120,7 +129,7 @@ class SyntheticParticipant:
         length = float(np.linalg.norm(way))
         scatter = self._model.noise * length * self._random.standard_normal(self._size)
         difficulty = math.log2(length / self._goal.width_m + 1.0)
-        slower = 1.0 + self._model.learning * 0.5 ** (self._trial.planned.before / self._model.practised)
+        slower = 1.0 + self._model.learning * 0.5 ** (self._before / self._model.practised)
         self._from, self._to = self._reach(t_s), self._reach(t_s) + way + scatter
         self._begins_s = t_s
         self._takes_s = slower * (self._model.fitts_a_s + self._model.fitts_b_s * difficulty)

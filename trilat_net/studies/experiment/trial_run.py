@@ -263,7 +263,9 @@ class SyntheticTrial(ExperimentTrial):
             assert hand is not None  # see `plan_experiment`
             at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
-            act = SyntheticParticipant(at.describe(), self.protocol.model.draw(own), self, len(found))
+            model, slave = self.protocol.model.draw(own), (self.slave, self.arm, self.find_force_n)
+            mine = (self.make_goal(), slave, self.planned.before, self.planned.seed, len(found))
+            act = SyntheticParticipant(at.describe(), model, *mine)
             found[user] = HandPlayer(at, act)
         return found
 
