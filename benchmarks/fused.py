@@ -16,6 +16,7 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.process import count_cores, worker_pool
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
+from trilat_net.studies.gym_environment import make_env
 from trilat_net.studies.sweep.sweep_cell import classify_cell
 
 from .stopwatch import best_s
@@ -41,7 +42,27 @@ def run() -> list[str]:
         )
     for name in ("six_joints", "seven_joints"):
         lines += _both_drivers(load_scenario(name, {"duration_s": 2.0}), 5)[0]
-    return [*lines, *_with_plugged_laws(real_s, fused_s), *_on_all_cores(real_s)]
+    return [*lines, *_in_environment(), *_with_plugged_laws(real_s, fused_s), *_on_all_cores(real_s)]
+
+
+def _in_environment() -> list[str]:
+    """Times users of `paper`: in Python, as an environment trains them, and compiled, as its own are."""
+    env = make_env("paper", user="m2", duration_s=1e3)
+    env.reset(seed=1)
+    steps, action = 500, 0.2 * env.action_space.high
+
+    def act() -> None:
+        for _ in range(steps):
+            env.step(action)
+
+    act()
+    python = steps / 50 / best_s(act, 10)
+    scenario = load_scenario("paper", {"duration_s": 20.0})
+    compiled = 20.0 / best_s(lambda: FusedRun(scenario).advance(20.0), 10)
+    return [
+        f"an environment of paper, 50 steps/s, its user in Python: {python:.0f} x real time (bar: >= 25)",
+        f"  the same experiment, its users compiled: {compiled:.0f} x real time (bar: >= 150)",
+    ]
 
 
 def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:

@@ -128,30 +128,24 @@ class OwnHand:
 
     def view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Returns what it sees at tick k, which its site is about to make."""
-        site, links = arrays.site[0], arrays.links
+        own, links = np.asarray(arrays.site), np.asarray(arrays.links)  # records are slow to read
         n, m, rate_hz = layout.joints, layout.shared, self._rules.rate_hz
-        q, now_ns = site["q"][:n].copy(), tick_ns(k, rate_hz)
+        q, now_ns = own["q"][0, :n].copy(), tick_ns(k, rate_hz)
         size, memory = self._rules.size, self._memory
+        numbers = [links[name].tolist() for name in ("alpha", "used", "rate_hz", "new")]
+        shared = [links[name][:, :m].copy() for name in ("q", "qd", "tau_x")]
         peers = tuple(
-            PeerView(
-                float(link["alpha"]),
-                used := int(link["used"]),
-                (now_ns - tick_ns(max(used, 0), int(link["rate_hz"]))) * 1e-9,
-                int(link["new"]),
-                link["q"][:m].copy(),
-                link["qd"][:m].copy(),
-                link["tau_x"][:m].copy(),
-            )
-            for link in links
+            PeerView(alpha, used, (now_ns - tick_ns(max(used, 0), its_rate_hz)) * 1e-9, new, *states)
+            for alpha, used, its_rate_hz, new, *states in zip(*numbers, *shared, strict=True)
         )
         return HandView(
             k,
             k / rate_hz,
             q,
-            site["qd"][:n].copy(),
-            np.asarray(self._place(q), dtype=np.float64),
-            site["q_des"][:m].copy(),
-            0.0 - site["on_arm"][:n],
+            own["qd"][0, :n].copy(),
+            np.asarray(self._place(q.tolist()), dtype=np.float64),
+            own["q_des"][0, :m].copy(),
+            0.0 - own["on_arm"][0, :n],
             np.array(memory.target or (0.0,) * size),
             memory.grip,
             peers,

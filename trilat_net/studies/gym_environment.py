@@ -222,11 +222,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._ticks, self._tick_rate_hz = scenario.ticks(self._user), scenario.sites[self._user].rate_hz
 
     def _look(self) -> Scene:
-        names, run = self.scenario.names, self._run
-        arms = self.scenario.arms
-        own = [run.arrays(n).site[0]["q"][: arms[one].counts.joints] for n, one in enumerate(names)]
-        q = {name: angles.copy() for name, angles in zip(names, own, strict=True)}
-        places = {name: np.array(arms[name].end_effector(q[name])) for name in names}
+        names, arms, run = self.scenario.names, self.scenario.arms, self._run
+        q = {name: row[: arms[name].counts.joints] for name, row in zip(names, run.q, strict=True)}
+        places = {name: np.array(arms[name].end_effector(row.tolist())) for name, row in q.items()}
         view = self._player.view(self._k, run.arrays(names.index(self._user)))
         poses = {site: np.reshape(plant.state.bodies, (-1, 7)) for site, plant in self._plants.items()}
         bodies = {
@@ -244,9 +242,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def _inform(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
         """Returns facts of a step; the first two by the names of gym-hil."""
-        row = self._run.arrays(self.scenario.names.index(self._leads)).links
-        peers = self.scenario.peers(self._leads)
-        shares = dict(zip(peers, row["alpha"].tolist(), strict=True))
+        links = np.asarray(self._run.arrays(self.scenario.names.index(self._leads)).links)
+        shares = dict(zip(self.scenario.peers(self._leads), links["alpha"].tolist(), strict=True))
         others = {name: share for name, share in shares.items() if name != self._user}
         first = max(others, key=lambda name: others[name], default=self._user)
         return {

@@ -6,6 +6,7 @@ and into its log, which then lasts just that long.
 """
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from ...analysis.aligned import AlignedRecords, align_records
 from ...analysis.arm_rows import EndEffectorRows, build_arm_rows
 from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
-from ...core.ticks import NS_PER_S, tick_ns
+from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import LogError
 from ...execution.fused import FusedRun
@@ -272,18 +273,21 @@ class SyntheticTrial(ExperimentTrial):
     def find_end_s(self) -> float:
         """Runs the trial, compiled, until it ends; returns when that is, s."""
         scenario, judge, site = self.scenario, self.begin(), self.slave
-        run = FusedRun(scenario, keep=1, hands=self._make_players(scenario))
+        kept = scenario.sites[site].rate_hz // HAND_HZ + 1
+        run = FusedRun(scenario, keep=kept, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
         place, columns = scenario.names.index(site), scenario.layout(site).columns()
-        rate_hz, t_s = scenario.sites[site].rate_hz, 0.0
-        for tick in range(1, scenario.ticks(site)):
-            t_s = tick_ns(tick, rate_hz) / NS_PER_S
-            run.step_to(tick_ns(tick, rate_hz))
-            row = run.records[place]
-            q, tau_x = (row[columns[name]].tolist() for name in ("q", "tau_x"))
-            if run.diverged_s is not None or judge.take(t_s, q, tau_x) is not None:
-                break
-        return t_s
+        for piece in range(math.ceil(self.longest_s * HAND_HZ)):
+            run.step_to((piece + 1) * NS_PER_S // HAND_HZ)
+            t_ns, rows = run.take_records()[place]
+            moments = (rows[:, columns[name]].tolist() for name in ("q", "tau_x"))
+            for moment in zip((t_ns / NS_PER_S).tolist(), *moments, strict=True):
+                judge.take(*moment)
+            if judge.outcome is not None:
+                return judge.outcome.ended_s
+            if run.diverged_s is not None:
+                return run.diverged_s
+        return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
         """Runs the trial into its log, and returns what that says."""
