@@ -3,8 +3,9 @@
     python -m tests.mutants --seed 1 --count 40
 
 Changes are drawn by the seed, the same number from each room. Each is made in a copy of the tree, and the
-tests of a push run there, those nearest to the changed file first, until one fails. What survives them all is
-a law that no test states, or a change that means nothing.
+tests of a push run there, those nearest to the changed file first, until one fails; a changed core takes
+minutes to compile, so its own tests are tried without first. What survives them all is a law that no test
+states, or a change that means nothing.
 
 By rule these are not drawn, as no run can tell them: annotations and decorators, text for people (strings,
 and whatever a `raise` says), names that a module exports, and the bases of a class.
@@ -26,6 +27,7 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import NamedTuple
 
 from . import house
@@ -75,6 +77,9 @@ OTHERS = {
 """What a token of these becomes; a number becomes one more or, with a point, twice what it is."""
 SLOWEST_S = 600
 """A test that takes longer hangs: it has found the change."""
+INTERPRETED = {"NUMBA_DISABLE_JIT": "1"}
+QUICK_S = 5
+"""A test of the core that takes longer without compiling waits until the changed core is compiled."""
 
 
 class Mutant(NamedTuple):
@@ -226,19 +231,45 @@ def order_tests(path: Path) -> Iterator[list[str]]:
             yield [str(one.relative_to(house.ROOT)) for one in some]
 
 
+def ask_pytest(tree: Path, options: list[str], workers: int, **environment: str) -> CompletedProcess[str]:
+    """Runs tests of a push in a tree; what runs in another folder is of this tree too."""
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider"]
+    command += ["-m", "not live and not long"]
+    command += ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
+    env = {**os.environ, "PYTHONPATH": str(tree), "CI": "1", **environment}
+    return subprocess.run(
+        [*command, *options], cwd=tree, env=env, capture_output=True, text=True, check=False
+    )
+
+
+@cache
+def find_quick_tests(workers: int) -> list[str]:
+    """Returns the tests of the core that pass, and soon, where nothing is compiled."""
+    with tempfile.TemporaryDirectory() as made:
+        copy_tree(Path(made))
+        options = [f"--timeout={QUICK_S}", "--timeout-method=signal", "-rp", "tests/core"]
+        told = ask_pytest(Path(made), options, workers, **INTERPRETED).stdout
+    return re.findall(r"^PASSED (.+)$", told, re.MULTILINE)
+
+
+def run_interpreted(tree: Path, workers: int) -> str:
+    """Runs the quick tests of the core, of which nothing is compiled, as `run_tests` does."""
+    listed = tree.parent / "quick.txt"
+    listed.write_text("\n".join(find_quick_tests(workers)), encoding="utf-8")
+    ended = ask_pytest(tree, ["-x", "-rfE", "--timeout=60", f"@{listed}"], workers, **INTERPRETED)
+    return name_failure(ended)
+
+
 def run_tests(tree: Path, files: list[str], workers: int) -> str:
     """Runs tests of a push in a tree until one fails; returns its name, or "" if none does."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "--tb=no", "-rfE", "-p", "no:cacheprovider"]
-    command += ["-m", "not live and not long", f"--timeout={SLOWEST_S}", "--timeout-method=thread"]
-    command += ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
-    env = {
-        **os.environ,
-        "PYTHONPATH": str(tree),
-        "CI": "1",
-    }  # what runs in another folder is of this tree too
-    if any((tree / path.relative_to(house.ROOT)).read_bytes() != path.read_bytes() for path in CORE):
-        env["XDG_CACHE_HOME"] = str(tree.parent / "cache")  # of a changed core nothing compiled is kept
-    ended = subprocess.run([*command, *files], cwd=tree, env=env, capture_output=True, text=True, check=False)
+    options = ["-x", "-rfE", f"--timeout={SLOWEST_S}", "--timeout-method=thread", *files]
+    changed = any((tree / path.relative_to(house.ROOT)).read_bytes() != path.read_bytes() for path in CORE)
+    cache = {"XDG_CACHE_HOME": str(tree.parent / "cache")} if changed else {}  # nothing compiled is kept
+    return name_failure(ask_pytest(tree, options, workers, **cache))
+
+
+def name_failure(ended: CompletedProcess[str]) -> str:
+    """Returns the name of a test that failed, or "" if none did."""
     if ended.returncode in (0, 5):  # 5: all of them are long tests
         return ""
     named = re.search(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
@@ -262,6 +293,8 @@ def judge_mutant(mutant: Mutant, workers: int) -> str:
         tree = Path(made) / "tree"
         copy_tree(tree)
         (tree / mutant.path.relative_to(house.ROOT)).write_text(mutant.apply(), encoding="utf-8")
+        if mutant.path in CORE and (found := run_interpreted(tree, workers)):
+            return found
         return next(filter(None, (run_tests(tree, some, workers) for some in order_tests(mutant.path))), "")
 
 
