@@ -220,13 +220,14 @@ def draw_mutants(seed: int, count: int) -> list[Mutant]:
 
 
 def order_tests(path: Path) -> Iterator[list[str]]:
-    """Yields files of tests: those that import a file of the program, those of its room, all others."""
+    """Yields files of tests: those that import a file of the program, golden runs, its room, all others."""
     module = path.relative_to(house.ROOT).with_suffix("").parts
     tests = sorted((house.ROOT / "tests").rglob("test_*.py"))
     near = [one for one in tests if any(name[: len(module)] == module for name in house.imported_names(one))]
     near.sort(key=lambda one: one.stem != f"test_{path.stem}")
     room = [one for one in tests if house.room(path) in one.parts and one not in near]
-    for some in (near, room, [one for one in tests if one not in (*near, *room)]):
+    golden = [one for one in tests if "golden" in one.parts and one not in near]
+    for some in (near, golden, room, [one for one in tests if one not in (*near, *golden, *room)]):
         if some:
             yield [str(one.relative_to(house.ROOT)) for one in some]
 
