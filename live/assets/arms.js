@@ -216,14 +216,19 @@ class ArmCard {
     push(site.pull, css("--warn"), "law");
     push(site.wall, css("--bad"), "wall");
     push(site.hand, css("--good"), "hand");
+    const around = Math.max(13 * ratio, Math.min(30 * ratio, (0.0325 * this.about.reach * this.canvas.height) / this.view.half)); // its end, as it is drawn
     if (this.scene) { // of arms over each other each says which it is
+      const above = around + (5 + 15 * this.n) * ratio;
       g.font = `700 ${12.5 * ratio}px system-ui, sans-serif`;
       g.textAlign = "center";
-      g.fillStyle = css("--ink");
-      g.fillText(this.name, at[0], at[1] - (18 + 15 * this.n) * ratio);
       g.strokeStyle = siteColour(this.about);
       g.lineWidth = 1.5 * ratio;
-      g.beginPath(); g.moveTo(at[0], at[1] - 8 * ratio); g.lineTo(at[0], at[1] - (14 + 15 * this.n) * ratio); g.stroke();
+      g.beginPath(); g.moveTo(at[0], at[1] - 8 * ratio); g.lineTo(at[0], at[1] - above); g.stroke();
+      g.strokeStyle = css("--card");
+      g.lineWidth = 3.5 * ratio;
+      g.strokeText(this.name, at[0], at[1] - above);
+      g.fillStyle = css("--ink");
+      g.fillText(this.name, at[0], at[1] - above);
     }
     const target = this.hold?.to || site.target;
     if (target) {
@@ -235,11 +240,13 @@ class ArmCard {
       g.setLineDash([]);
       g.beginPath(); g.arc(...to, 8 * ratio, 0, 2 * Math.PI); g.stroke();
     } else if (this.graspable) {
+      g.beginPath(); g.arc(...at, around, 0, 2 * Math.PI);
+      g.lineWidth = (this.near ? 6 : 4) * ratio; // a rim, so that it is seen on the arm too
+      g.strokeStyle = css("--card");
+      g.stroke();
+      g.lineWidth = (this.near ? 3 : 1.5) * ratio;
       g.strokeStyle = css("--ink");
-      g.globalAlpha = this.near ? 0.9 : 0.3;
-      g.lineWidth = 1.5 * ratio;
-      g.beginPath(); g.arc(...at, 13 * ratio, 0, 2 * Math.PI); g.stroke();
-      g.globalAlpha = 1;
+      g.stroke();
     }
   }
 }

@@ -91,7 +91,7 @@ setInterval(() => { // what is shown is as old as the newest message; nobody is 
   const now = silent_ms > LATE_MS && Boolean(page.hello);
   if (now) {
     const seconds = Math.floor(silent_ms / 1000);
-    state(`this page is ${seconds} s behind`, "bad");
+    state(`${seconds} s behind`, "bad");
     const cut = page.frame?.ended ? "The session has ended, and its server with it." : `This page is ${seconds} s behind: what it shows is old, and its buttons are off but for STOP, which may be late.`;
     tell(page.frame?.ended || socket?.readyState === WebSocket.OPEN ? cut : `This page is ${seconds} s behind and cut off: what it shows is old, and its buttons are off. To stop every arm: trilat stop --session ${page.hello.session}`, page.frame?.ended ? "" : "late");
     if (page.frame?.ended) state("ended");
@@ -163,7 +163,7 @@ function take(frame) {
   const silent = parts.names.filter((name) => frame.sites[name].silent);
   const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
   const stopped = alarms(frame);
-  if (stopped.length) state(stopped.join(", "), "bad");
+  if (stopped.length) state(stopped.length > 1 ? `${stopped.length} alarms` : stopped[0], "bad");
   else if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
   else if (frame.ended) { state("ended"); $("end").hidden = true; }
   else if (silent.length) state(`${silent.join(", ")} silent`, "bad");
@@ -187,23 +187,31 @@ function take(frame) {
 }
 
 let raised = "";
-// What nobody may overlook: of each arm that holds, is stopped or in fault the mode, why, and what to do.
+// What nobody may overlook: of arms that hold, are stopped or in fault the mode, why, and what to do; of those
+// with one reason together, as what to do ends with their names or has none.
 function alarms(frame) {
-  const list = (parts?.names || []).map((name) => [name, frame.sites[name]?.alarm]).filter(([, alarm]) => alarm);
+  const alike = new Map();
+  for (const name of parts?.names || []) {
+    const { word, reason, advice = "" } = frame.sites[name]?.alarm || {};
+    const order = advice.endsWith(` ${name}`) ? advice.slice(0, -name.length) : "";
+    const key = JSON.stringify([word, reason, order || advice]);
+    if (word) alike.set(key, { word, reason, advice, order, names: [...(alike.get(key)?.names || []), name] });
+  }
+  const list = [...alike.values()];
   const text = JSON.stringify(list);
   if (text !== raised) {
     raised = text;
-    $("alarms").replaceChildren(...list.map(([name, { word, reason, advice }]) => {
+    $("alarms").replaceChildren(...list.map(({ word, reason, advice, order, names }) => {
       const block = document.createElement("div");
       const [what, why, act] = ["strong", "span", "code"].map((tag) => block.appendChild(document.createElement(tag)));
       block.className = ["FAULT", "STOPPED"].includes(word) ? "raised" : "raised mild";
-      what.textContent = `${name} ${word}`;
+      what.textContent = `${names.join(", ")} ${word}`;
       why.textContent = reason;
-      act.textContent = advice;
+      act.textContent = order ? order + names.join(" ") : advice;
       return block;
     }));
   }
-  return list.map(([name, { word }]) => `${name} ${word}`);
+  return list.map(({ names, word }) => `${names.join(", ")} ${word}`);
 }
 
 const LOUD = ["lost", "left", "unheard", "diverged", "failed", "refused", "clock fault"];

@@ -28,7 +28,7 @@ export class ArmScene {
     this.links = Array.from({ length: count - 1 }, (_, n) => this.tube(this.bodyColour, this.thick * thin * (n ? 0.86 : 1)));
     this.joints = Array.from({ length: count }, (_, n) => this.ball(n === count - 1 ? this.bodyColour : this.jointColour, this.thick * thin * (n === count - 1 ? 1.05 : 1.22)));
     this.ghosts = about.task ? [] : this.links.map(() => this.tube(this.ghostColour, 0.62 * this.thick * thin, false));
-    this.goal = this.ball(this.ghostColour, (about.task ? 1.6 : 0.9) * this.thick, false);
+    this.goal = this.ball(this.ghostColour, (about.task ? 1.6 : 0.9 * thin) * this.thick, false);
     this.bodyBoxColour = new THREE.MeshStandardMaterial({ roughness: 0.8 });
     this.bodies = about.bodies.map((size_m) => this.mesh(new THREE.BoxGeometry(...size_m), this.bodyBoxColour, true));
     for (const { at, normal } of about.walls) this.wall(vector(at), vector(normal), size);

@@ -43,7 +43,7 @@ class Plot {
     this.plot = new uPlot({
       width: Math.max(sizeOf(this.box).width, 120), height: 132, padding: [6, this.room(), 0, 0], legend: { show: false }, cursor: { show: false },
       scales: { x: { time: false, range: () => [this.now - SPAN_S, this.now] }, y: { range } },
-      axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => (v < 0 ? "" : `${v} s`)) }, axis(46)],
+      axes: [{ ...axis(22), values: (u, splits) => splits.map((v) => (v < 0 ? "" : `${v} s`)) }, { ...axis(46), space: 20 }],
       series: [{}, ...this.series.map(({ colour, dash, width = 1.6 }) => ({
         stroke: css(colour), width, dash: dash ? [5, 3] : undefined, points: { show: false }, pxAlign: 0, spanGaps: false,
       }))],

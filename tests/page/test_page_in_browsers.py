@@ -62,7 +62,10 @@ def test_axe_finds_nothing_serious(
             assert grave_findings(page) == []
 
 
-ALARM = {"word": "STOPPED", "reason": "ordered to stop", "advice": "trilat enable --session t m1"}
+def raise_alarm(site: str, **changed: str) -> dict[str, str]:
+    """What a page is told of an arm that was stopped."""
+    advice = f"trilat enable --session t {site}"
+    return {"word": "STOPPED", "reason": "ordered to stop", "advice": advice, **changed}
 
 
 @pytest.mark.parametrize("screen", SCREENS)
@@ -71,14 +74,37 @@ def test_axe_finds_nothing_serious_in_what_is_raised(
 ) -> None:
     """Alarms, what a page is asked, and the report at the end."""
     newest = session.frames["experimenter"][-1]
-    sites = {name: {**site, "alarm": ALARM, "mode": "stopped"} for name, site in newest["sites"].items()}
+    sites = {
+        name: {**site, "alarm": raise_alarm(name), "mode": "stopped"} for name, site in newest["sites"].items()
+    }
     ended = {"ended": True, "results": ["/x/report.html", "/x/run.mcap"], "asked": [2]}
     for scheme in SCHEMES:
         shown = session.shown(browser, address, "experimenter", screen, scheme, sites=sites, **ended)
         with shown as page:
             assert page.locator("#todo a").count() == 2
-            assert page.locator("#alarms .raised").count() == 3
+            assert "m1, m2, s STOPPED" in page.inner_text("#alarms .raised")
+            assert "trilat enable --session t m1 m2 s" in page.inner_text("#alarms .raised")
+            assert page.inner_text("#state") == "m1, m2, s STOPPED"
             assert grave_findings(page) == []
+
+
+def test_alarms_of_one_reason_are_raised_together(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
+    alarms = {
+        "m1": raise_alarm("m1"),
+        "m2": raise_alarm("m2", word="HOLD", reason="s is silent", advice="it goes on once it is heard"),
+        "s": raise_alarm("s"),
+    }
+    newest = session.frames["experimenter"][-1]["sites"]
+    sites = {name: {**newest[name], "alarm": alarm} for name, alarm in alarms.items()}
+    with session.shown(browser, address, "experimenter", "desktop", "light", sites=sites) as page:
+        raised = [one.inner_text().split("\n") for one in page.locator("#alarms .raised").all()]
+        assert raised == [
+            ["m1, s STOPPED", "ordered to stop", "trilat enable --session t m1 s"],
+            ["m2 HOLD", "s is silent", "it goes on once it is heard"],
+        ]
+        assert page.inner_text("#state") == "2 alarms"
 
 
 def test_arms_have_half_of_the_window(session: RecordedSession, address: str, browser: Browser) -> None:
