@@ -75,7 +75,8 @@ def test_axe_finds_nothing_serious_in_what_is_raised(
     """Alarms, what a page is asked, and the report at the end."""
     newest = session.frames["experimenter"][-1]
     sites = {
-        name: {**site, "alarm": raise_alarm(name), "mode": "stopped"} for name, site in newest["sites"].items()
+        name: {**site, "alarm": raise_alarm(name), "mode": "stopped"}
+        for name, site in newest["sites"].items()
     }
     ended = {"ended": True, "results": ["/x/report.html", "/x/run.mcap"], "asked": [2]}
     for scheme in SCHEMES:
