@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -54,7 +54,8 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
     assert np.abs(np.array(turn_between(rows, rotation_matrix((0.0, 0.0, 0.0))))).max() <= np.pi
 
 
-@given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 1e-6]))
+@given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 3e-3, 1e-3, 1e-6]))
+@example(vector=(0.6, -0.5, 0.4), rate=(0.3, 0.9, -0.7), shorter=1e-2)
 def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
     vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
 ) -> None:

@@ -1,0 +1,83 @@
+"""The torque of a tick of a chain, joint by joint, by the dynamics that Pinocchio computed for it."""
+
+import numpy as np
+import pytest
+
+from tests.core.chain_references import Arm, ChainState, chain_references, moving, torque_for
+from trilat_net.core.chain import ChainJoint
+from trilat_net.core.chain_stages import place_chain, update_errors, update_torque
+from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup
+from trilat_net.core.vectors import Array
+
+REFERENCES = chain_references()
+each = pytest.mark.parametrize("name", ["arm6", "arm7", "random3"])
+LAMBDA = 2.0
+
+
+def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
+    """A site with the chain, in a state; its reference is such that v and a are those of the state."""
+    chain = REFERENCES[name].chain
+    joints = tuple(
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m) for one in chain.joints
+    )
+    n = len(joints)
+    theta = np.concatenate([one.inertia for one in chain.joints])
+    law = Gains(Lambda=(LAMBDA,), theta_hat0=theta, known=theta, **gains)  # type: ignore[arg-type]
+    arrays = build_site_arrays(
+        SiteSetup(
+            name="a",
+            rate_hz=1000,
+            scheme=Scheme.SECOND_ORDER,
+            theta=theta,
+            g_m_s2=0.0,
+            lengths_m=(0.0, 0.0),
+            tau_limit_nm=1e9,
+            gains=law,
+            qd_limit_rad_s=1e9,
+            q0=tuple(state.q),
+            qd0=tuple(state.qd),
+            actors=(),
+            links=(LinkSetup("b", 1.0, 1000, (0.0,) * n),),
+            chain=ChainSetup(joints, tuple(state.gravity)),
+        ),
+        pages=8,
+    )
+    site = arrays.site[0]
+    site["q_des"][:n], site["qd_des"][:n] = state.q + state.v / LAMBDA, state.qd + state.a / LAMBDA
+    return arrays
+
+
+def find_torque(arrays: SiteArrays) -> Array:
+    """What the site's law asks in its tick, N m."""
+    site, chain = arrays.site[0], arrays.chain
+    place_chain(site, chain)
+    update_errors(site, chain)
+    update_torque(site, chain)
+    return np.array(site["tau"][: len(chain)])
+
+
+@each
+def test_adaptive_torque_is_that_of_pinocchio_less_its_feedback(name: str) -> None:
+    """Eq. (13): Y theta - Kp r - Kd ed, and Y' r of Eq. (15)."""
+    for state in REFERENCES[name].states:
+        arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
+        wanted = state.inverse_dynamics - 3.0 * (state.qd - state.v) + 5.0 * state.a / LAMBDA
+        np.testing.assert_allclose(find_torque(arrays), wanted, rtol=1e-9, atol=1e-9)
+        found = arrays.site[0]["Yr"][: len(state.regressor_transpose_r)]
+        np.testing.assert_allclose(found, state.regressor_transpose_r, rtol=1e-9, atol=1e-9)
+
+
+@each
+def test_a_law_that_knows_gravity_adds_to_it_springs_and_dampers(name: str) -> None:
+    """G - K e - d qd - Kd ed, where G is what the inverse dynamics ask of the arm at rest."""
+    for state in REFERENCES[name].states:
+        arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
+        found = find_torque(arrays)
+        still = 0.0 * state.q
+        arm = Arm(arrays.chain, np.concatenate([one.inertia for one in REFERENCES[name].chain.joints]))
+        moving(arm, state._replace(qd=still, a=still), still)
+        wanted = torque_for(arm, still, still)
+        assert np.abs(wanted).max() > 1e-3
+        wanted += 7.0 * state.v / LAMBDA - 2.0 * state.qd + 5.0 * state.a / LAMBDA
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
