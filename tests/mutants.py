@@ -276,12 +276,14 @@ def digest_paper(tree: Path) -> dict[str, str]:
     return channel_digests(path) if ended.returncode == 0 else {}
 
 
-def run_interpreted(tree: Path, workers: int) -> str:
+def run_interpreted(tree: Path, path: Path, workers: int) -> str:
     """Runs the quick tests of the core, of which nothing is compiled, as `run_tests` does."""
     if digest_paper(tree) != find_paper():
         return "tests/golden/test_payloads.py[paper]"
     listed = tree.parent / "quick.txt"
-    listed.write_text("\n".join(find_quick_tests(workers)), encoding="utf-8")
+    near = next(order_tests(path))
+    names = sorted(find_quick_tests(workers), key=lambda name: name.partition("::")[0] not in near)
+    listed.write_text("\n".join(names), encoding="utf-8")
     ended = ask_pytest(tree, ["-x", "-rfE", "--timeout=60", f"@{listed}"], workers, **INTERPRETED)
     return name_failure(ended)
 
@@ -319,7 +321,7 @@ def judge_mutant(mutant: Mutant, workers: int) -> str:
         tree = Path(made) / "tree"
         copy_tree(tree)
         (tree / mutant.path.relative_to(house.ROOT)).write_text(mutant.apply(), encoding="utf-8")
-        if mutant.path in CORE and (found := run_interpreted(tree, workers)):
+        if mutant.path in CORE and (found := run_interpreted(tree, mutant.path, workers)):
             return found
         return next(filter(None, (run_tests(tree, some, workers) for some in order_tests(mutant.path))), "")
 
