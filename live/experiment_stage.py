@@ -16,7 +16,7 @@ from trilat_net.errors import UsageError
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import HALTED_MODES
 from trilat_net.studies.experiment.protocol import ExperimentPlan, Step
-from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry
+from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry, TrialJudge
 
 from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
@@ -40,7 +40,7 @@ class TrialWatch:
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
-        self.trial, self.judge, self.aborted = trial, trial.begin(), ""
+        self.trial, self.judge, self.aborted = trial, TrialJudge(trial), ""
         self._clock, self._next, self._ended_ns = clock, 0, 0
         self._appeared = self.diverged = False
 

@@ -69,7 +69,7 @@ def test_adaptive_torque_is_that_of_pinocchio_less_its_feedback(name: str) -> No
 
 
 @each
-def test_a_law_that_knows_gravity_adds_to_it_springs_and_dampers(name: str) -> None:
+def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
     """G - K e - d qd - Kd ed, where G is what the inverse dynamics ask of the arm at rest."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))

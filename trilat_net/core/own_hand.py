@@ -131,7 +131,6 @@ class OwnHand:
         own, links = np.asarray(arrays.site), np.asarray(arrays.links)  # records are slow to read
         n, m, rate_hz = layout.joints, layout.shared, self._rules.rate_hz
         q, now_ns = own["q"][0, :n].copy(), tick_ns(k, rate_hz)
-        size, memory = self._rules.size, self._memory
         numbers = [links[name].tolist() for name in ("alpha", "used", "rate_hz", "new")]
         shared = [links[name][:, :m].copy() for name in ("q", "qd", "tau_x")]
         peers = tuple(
@@ -146,8 +145,8 @@ class OwnHand:
             np.asarray(self._place(q.tolist()), dtype=np.float64),
             own["q_des"][0, :m].copy(),
             0.0 - own["on_arm"][0, :n],
-            np.array(memory.target or (0.0,) * size),
-            memory.grip,
+            np.array(self._memory.target or (0.0,) * self._rules.size),
+            self._memory.grip,
             peers,
         )
 

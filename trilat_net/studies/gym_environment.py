@@ -118,13 +118,13 @@ class ReachTask:
 class ActedHand(HandPlayer):
     """The user's hand: at each step it does what it was told."""
 
-    def __init__(self, at: HandSite, actions: list[Array], every: int) -> None:
+    def __init__(self, at: HandSite, actions: list[Array]) -> None:
         super().__init__(at, None)
-        self._actions, self._every = actions, every
+        self._actions = actions
 
     def ask(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
         """Decides by the action of the step."""
-        self.hand.decide(k, self._actions[k // self._every].tolist())
+        self.hand.decide(k, self._actions[k // self.hand.every].tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
@@ -215,7 +215,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def _begin(self, scenario: Scenario) -> None:
         self.scenario, self._k, self._actions = scenario, 0, list[Array]()
-        self._player = ActedHand(self._place(scenario), self._actions, self._every)
+        self._player = ActedHand(self._place(scenario), self._actions)
         self._plants = make_plant_players(scenario)
         self._run = FusedRun(scenario, keep=1, hands={self._user: self._player}, plants=self._plants)
         self._run.plan([scenario.ticks(name) for name in scenario.names])
@@ -293,7 +293,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
-        player = ActedHand(self._place(self.scenario), self._actions, self._every)
+        player = ActedHand(self._place(self.scenario), self._actions)
         lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
         record_virtual(lasted, Path(path), force=force, hands={self._user: player.track})
         return Path(path)

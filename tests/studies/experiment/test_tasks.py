@@ -14,7 +14,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment
 from trilat_net.studies.experiment.protocol import PlannedTrial
 from trilat_net.studies.experiment.tasks import ContactTrial, ReachTrial, TrackTrial
-from trilat_net.studies.experiment.trial_run import ExperimentTrial
+from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialJudge
 
 from .experiments import APART, CONTACT, HANDOVER, REACH, TRACK, write_protocol
 
@@ -168,7 +168,7 @@ def test_force_at_the_slave_is_that_of_the_wall(tmp_path: Path) -> None:
     scenario = plan.scenarios["near"]
     q, force = np.array([[0.3, 0.9]]), np.array([3.0, -4.0])
     tau_x = -build_arm_rows(scenario, "s").place_end_effector(q, 0.0 * q).J[0].T @ force
-    judge = ExperimentTrial(plan.protocol, scenario, plan.trials[0], plan.digest).begin()
+    judge = TrialJudge(ExperimentTrial(plan.protocol, scenario, plan.trials[0], plan.digest))
     judge.goal.appears_s, judge.goal.force_n = 0.0, 5.0
     assert all(judge.take(t_s, q[0].tolist(), tau_x.tolist()) is None for t_s in np.linspace(0.0, 0.9, 10))
     outcome = judge.take(1.0, q[0].tolist(), tau_x.tolist())

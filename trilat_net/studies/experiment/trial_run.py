@@ -139,14 +139,9 @@ class ExperimentTrial:
             timeline = (*timeline, Change(at_s, dominance=self.slave, to=after, ramp_s=ramp_s))
         return replace(scenario, dominance=dominance, timeline=timeline)
 
-    def begin(self) -> TrialJudge:
-        """Returns what judges it, from its first record on."""
-        return TrialJudge(self)
-
     def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
         """Returns the magnitude of what presses on the slave's end effector, N."""
-        (force_n,) = self._find_forces_n(np.array([q]), np.array([tau_x]))
-        return float(force_n)
+        return float(self._find_forces_n(np.array([q]), np.array([tau_x]))[0])
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
         """Returns the same of K records, shape (K,)."""
@@ -175,12 +170,11 @@ class ExperimentTrial:
             raise LogError(f"{path}: its records are not those of the run")
         if (outcome := self._judge(log)) is None:
             raise LogError(f"{path}: ends before its trial does")
-        planned, measures = self.planned, self._measure(log, outcome)
-        how = planned.seed, digest_file(path), outcome.succeeded, measures, self.people
-        return TrialEntry(planned.number, *how)
+        of_log = digest_file(path), outcome.succeeded, self._measure(log, outcome)
+        return TrialEntry(self.planned.number, self.planned.seed, *of_log, self.people)
 
     def _judge(self, log: Log) -> Outcome | None:
-        judge, part = self.begin(), log[self.slave]
+        judge, part = TrialJudge(self), log[self.slave]
         for moment in zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True):
             if (outcome := judge.take(*moment)) is not None:
                 return outcome
@@ -272,7 +266,7 @@ class SyntheticTrial(ExperimentTrial):
 
     def find_end_s(self) -> float:
         """Runs the trial, compiled, until it ends; returns when that is, s."""
-        scenario, judge, site = self.scenario, self.begin(), self.slave
+        scenario, judge, site = self.scenario, TrialJudge(self), self.slave
         kept = scenario.sites[site].rate_hz // HAND_HZ + 1
         run = FusedRun(scenario, keep=kept, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
