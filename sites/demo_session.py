@@ -1,20 +1,27 @@
 """A whole session on one machine: starts every site and the recorder as processes, monitors and ends them.
 
-Invariant: in every case the recorder ends last and no child is left on return. The children have process
-sessions of their own, so that Ctrl-C reaches them through this process, in that order.
+They are copies of one process, the starter, which has loaded everything: a copy begins in a tenth of the time
+that an interpreter takes. What is copied has no connection, no thread of its own and no code of the user's.
+
+Invariant: in every case the recorder ends last and no child is left on return, nor if this process is killed.
+The children have process sessions of their own, so that Ctrl-C reaches them through this process, in that
+order.
 """
 
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import chain
+from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from setproctitle import setproctitle
 
 from trilat_net.core.jit import compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
@@ -25,8 +32,9 @@ from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import reserve_session_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.process import Interrupt
+from trilat_net.process import Interrupt, freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.operators.program_hand import place_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 
@@ -34,6 +42,8 @@ from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
 
 POLL_NS = 100_000_000
+START_PROCESSES = "start-processes"
+"""The command of a starter; its words are the number of a connection and the file of a scenario."""
 START_S = 10
 """Time for a site to start, s, where many share a few processors."""
 JOIN_S, WAIT_S = 60, 600
@@ -55,38 +65,86 @@ class SessionResult:
     exit_code: int = RunFailed.exit_code
 
 
-class _Child:
-    def __init__(self, name: str, arguments: Sequence[str], folder: Path) -> None:
-        self.name = name
-        self._signalled = False
-        self._output = folder / f"{name}.txt"
-        with self._output.open("wb") as sink:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "trilat_net", *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=sink,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+class SessionProcess:
+    """A process of a session: its number once it has begun, its exit code once it has ended."""
 
-    def code(self) -> int | None:
-        return self._process.poll()
+    def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
+        self.name, self.output = name, output
+        self.pid: int | None = None
+        self.code: int | None = None
+        self._starter, self._signalled = starter, False
 
     def end(self, number: int) -> None:
-        if self.code() is None:
+        """Sends it a signal, unless it has ended."""
+        if self.code is None:
             self._signalled = True
-            self._process.send_signal(number)
+            self._starter.signal(self, number)
 
     def problem(self) -> str | None:
         """Describes how the process failed; None if it did not."""
-        code = self.code()
+        code = self.code
         if code in (0, None) or (self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)):
             return None  # a process that ends anyway has no handler any more
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
-        lines = self._output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
         return f"{self.name} ended with code {code}: {last}"
+
+
+class ProcessStarter:
+    """Starts the processes of a scenario's session on this machine; what each prints is kept in a folder."""
+
+    def __init__(self, scenario_file: Path, folder: Path) -> None:
+        self._folder, self._output = folder, folder / "starter.txt"
+        self._processes: dict[str, SessionProcess] = {}
+        self._orders, theirs = Pipe()
+        with theirs, self._output.open("wb") as sink:
+            words = ["-m", "trilat_net", START_PROCESSES, str(theirs.fileno()), str(scenario_file)]
+            self._starter = subprocess.Popen(
+                [sys.executable, *words],
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                pass_fds=[theirs.fileno()],
+            )
+
+    def start(self, name: str, words: Sequence[str]) -> SessionProcess:
+        """Starts a command, given by its words, as a process of a name that no other has."""
+        started = SessionProcess(self, name, self._folder / f"{name}.txt")
+        self._processes[name] = started
+        self._order(name, [*words], 0, started.output)
+        return started
+
+    def signal(self, process: SessionProcess, number: int) -> None:
+        """Sends a process a signal; one that has not begun never will."""
+        self._order(process.name, [], number, process.output)
+        self._starter.send_signal(signal.SIGINT)  # which it ignores from its first order on
+
+    def _order(self, *order: Any) -> None:
+        with suppress(OSError):  # the starter has failed, which `poll` finds
+            self._orders.send(order)
+
+    def poll(self) -> None:
+        """Takes note of what has begun and ended."""
+        try:
+            while self._orders.poll():
+                name, pid, code = self._orders.recv()
+                self._processes[name].pid, self._processes[name].code = pid, code
+        except (EOFError, OSError):
+            code = self._starter.wait()
+            for left in self._processes.values():
+                if left.code is None:
+                    left.code, left.output = code, self._output
+                    if left.pid is not None:
+                        with suppress(ProcessLookupError):
+                            os.kill(left.pid, signal.SIGINT)
+
+    def close(self) -> None:
+        """Ends the starter, after all that it has started."""
+        self._orders.close()
+        self._starter.wait()
 
 
 SessionAttendant = Callable[
@@ -117,10 +175,9 @@ def run_demo(
     with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
         compile_core(scenario, display.say, interrupt)
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
-        sites, start_recorder = _start(
-            scenario, folder, session, endpoints, JOIN_S if begins is None else WAIT_S
-        )
-        recorder: list[_Child] = []
+        patience_s = JOIN_S if begins is None else WAIT_S
+        starter, sites, start_recorder = _start(scenario, folder, session, endpoints, patience_s)
+        recorder: list[SessionProcess] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
@@ -130,16 +187,17 @@ def run_demo(
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, *recorder], result)):
+                    starter.poll()
                     if not recorder and (begins is None or begins()):
                         recorder.append(start_recorder())
                     monitor.poll()
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         finally:
-            _end_all(sites, recorder, clock)
+            _end_all(starter, (sites, recorder), clock)
         result.interrupted = interrupt.number
     for child in [*sites, *recorder]:
         problem = child.problem()
-        if child.code() == LogRefused.exit_code:
+        if child.code == LogRefused.exit_code:
             result.exit_code = LogRefused.exit_code
         if problem and not result.interrupted and problem not in result.problems:
             result.problems.append(problem)
@@ -159,22 +217,22 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 
 def _start(
     scenario: Scenario, folder: Path, session: str, endpoints: list[str], wait_s: int
-) -> tuple[list[_Child], Callable[[], _Child]]:
+) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
     file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
+    starter = ProcessStarter(file, output)
     connect = [["--connect", endpoint] for endpoint in endpoints]
     patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
     sites = [
-        _Child(
+        starter.start(
             name,
             [
                 *("site", name, "--scenario", str(file), "--session", session, "--listen", endpoints[n]),
                 *chain(*connect[:n]),
                 *("--needs-recorder", *patience),
             ],
-            output,
         )
         for n, name in enumerate(scenario.names)
     ]
@@ -182,27 +240,108 @@ def _start(
         at = place_own_hand(scenario, name)
         if at is not None and at.runs_alone:
             words = ["hand", name, "--scenario", str(file), "--session", session]
-            sites.append(_Child(f"hand-{name}", [*words, *connect[n], *patience], output))
+            sites.append(starter.start(f"hand-{name}", [*words, *connect[n], *patience]))
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    return sites, lambda: _Child(topics.RECORDER, [*arguments, *patience, "--force"], output)
+    return starter, sites, lambda: starter.start(topics.RECORDER, [*arguments, *patience, "--force"])
 
 
-def _is_over(children: list[_Child], result: SessionResult) -> bool:
+def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     result.problems += [problem for child in children if (problem := child.problem())]
-    return bool(result.problems) or all(child.code() == 0 for child in children)
+    return bool(result.problems) or all(child.code == 0 for child in children)
 
 
-def _end_all(sites: list[_Child], recorder: list[_Child], clock: Clock) -> None:
+def _end_all(starter: ProcessStarter, groups: Sequence[list[SessionProcess]], clock: Clock) -> None:
     """Ends the sites, then the recorder, which by then has all their messages."""
-    for group in (sites, recorder):
+    for group in groups:
         for child in group:
             child.end(signal.SIGINT)
         give_up_ns = clock.monotonic_ns() + END_TIMEOUT_NS
-        while any(child.code() is None for child in group):
+        while any(child.code is None for child in group):
             if clock.monotonic_ns() > give_up_ns:
                 for child in group:
                     child.end(signal.SIGKILL)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
+            starter.poll()
+    starter.close()
+
+
+def run_starter(number: int, scenario_file: str) -> list[str] | None:
+    """Starts and signals processes as ordered until nobody is there; in each process it returns its words."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    scenario = load_scenario(scenario_file)
+    if not list_imported_code([scenario]):  # code of the user's is loaded where it runs, and nowhere else
+        for name in {arm.counts: name for name, arm in scenario.arms.items()}.values():
+            warm_up(scenario, name)
+    freeze_gc()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return _Starter(Connection(number)).serve()
+
+
+class _Starter:
+    def __init__(self, orders: Connection) -> None:
+        self._orders = orders
+        self._running: dict[int, tuple[str, int]] = {}
+        """By the end of a pipe whose other end a process alone has: its name and number."""
+
+    def serve(self) -> list[str] | None:
+        words: list[str]
+        while True:
+            for ready in wait([self._orders, *self._running]):
+                if isinstance(ready, int):
+                    self._report_end(ready)
+                    continue
+                try:
+                    name, words, number, output = self._orders.recv()
+                except (EOFError, OSError):
+                    self._end_all()
+                    return None
+                if number:
+                    self._signal([pid for one, pid in self._running.values() if one == name], number)
+                elif self._fork(name):
+                    _become(words, output)
+                    return words
+
+    def _fork(self, name: str) -> bool:
+        """Copies this process; true in the copy."""
+        ours, theirs = os.pipe()
+        if pid := os.fork():
+            os.close(theirs)
+            self._running[ours] = name, pid
+            self._orders.send((name, pid, None))
+            return False
+        for other in (ours, *self._running):
+            os.close(other)
+        self._orders.close()
+        return True
+
+    def _report_end(self, closed: int) -> None:
+        name, pid = self._running.pop(closed)
+        os.close(closed)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        with suppress(OSError):  # whoever asked is gone
+            self._orders.send((name, pid, code))
+
+    def _signal(self, pids: list[int], number: int) -> None:
+        for pid in pids:
+            os.kill(pid, number)
+
+    def _end_all(self) -> None:
+        for is_last in (False, True):
+            pids = [pid for name, pid in self._running.values() if (name == topics.RECORDER) == is_last]
+            self._signal(pids, signal.SIGINT)
+            for pid in pids:
+                os.waitpid(pid, 0)
+
+
+def _become(words: list[str], output: Path) -> None:
+    """Makes a copy what a shell would have started: its name, session, output and signals."""
+    os.setsid()
+    sink = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(sink, stream.fileno())
+    os.close(sink)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    setproctitle(" ".join(["trilat", *words]))
 
 
 def run(

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -97,13 +97,8 @@ class Process:
         return int(self._process.returncode)
 
     def children(self) -> dict[int, str]:
-        children = {}
-        for pid in Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split():
-            with contextlib.suppress(OSError):
-                line = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-                if "trilat_net" in line:
-                    children[int(pid)] = line
-        return children
+        """What it has started, and what those have: the starter of a session and its members."""
+        return dict(_descendants(self.pid))
 
     def end(self) -> None:
         for number in (signal.SIGCONT, signal.SIGINT, signal.SIGKILL):
@@ -114,6 +109,15 @@ class Process:
 
     def __repr__(self) -> str:
         return f"{self.name}: exit code {self._process.poll()}, printed\n{self.text()}"
+
+
+def _descendants(pid: int) -> Iterator[tuple[int, str]]:
+    with contextlib.suppress(OSError):
+        for child in map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()):
+            line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+            if "trilat" in line:
+                yield child, line
+            yield from _descendants(child)
 
 
 def gone(pid: int) -> bool:

@@ -38,7 +38,7 @@ def test_a_killed_site_is_named_with_its_signal(stage: Stage) -> None:
     running = demo(stage)
     log_file = recording(stage)
     children = running.children()
-    assert len(children) == 3
+    assert len(children) == 4  # two sites, a recorder, and what starts them
     os.kill(child(running, "site s "), signal.SIGKILL)
     assert running.code() == 1
     errors = [line for line in running.text().splitlines() if line.startswith("error: ")]

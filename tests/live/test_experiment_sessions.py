@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.net.waiting import until
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.experiment.experiment_run import Experiment, open_experiment
@@ -17,7 +18,7 @@ from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .browsers import needs_browser, page_address, shows
 from .participants import FAR, REACH, Participant, begin, join, participants, take_part, write_protocol
-from .processes import Process, Stage
+from .processes import Process, Stage, gone
 
 pytestmark = needs_browser
 CONSENT = 'consent = "We record how the arms move."\nquestionnaires = [{ name = "tlx" }]\n'
@@ -142,8 +143,10 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
     first = begin(stage, write_protocol(stage.folder, 2, CONSENT), "--out", str(folder))
     with participants(first) as people:
         take_part(people, lambda: all(one.look().get("running") for one in people))
+        left = first.children()
         first.signal(signal.SIGKILL)
         first.code()
+        until(lambda: all(gone(pid) for pid in left))
     second = begin(stage, folder, name="second")
     with participants(second) as people:
         take_part(people, lambda: people[0].look().get("appeared"))
@@ -151,8 +154,11 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
         people[0].page.reload()
         shows(people[0].page, "trilat.frame?.stage.left_s > 0")  # it is in the trial again
         take_part(people, lambda: settled(second, 1))
+        left = second.children()
         second.signal(signal.SIGKILL)
         second.code()
+        until(lambda: all(gone(pid) for pid in left))
+    assert left
     third = begin(stage, folder, name="third")
     with participants(third) as people:
         take_part(people, third.ended)

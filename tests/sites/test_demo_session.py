@@ -1,0 +1,113 @@
+"""Processes of a session: each is what a shell would have started, and none is left, whoever dies first."""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from sites.demo_session import ProcessStarter, SessionProcess
+from tests.cli.running import trilat
+from tests.net.waiting import until
+from trilat_net.scenario.scenario_reader import read_shipped
+from trilat_net.scenario.skeletons import name_skeleton_class
+
+WAITS = ("record", "--session", "nobody", "--connect", "tcp/127.0.0.1:9", "-o", "run.mcap")
+
+
+def started(folder: Path) -> ProcessStarter:
+    (folder / "paper.toml").write_text(read_shipped("paper"))
+    return ProcessStarter(folder / "paper.toml", folder)
+
+
+@pytest.fixture
+def starter(tmp_path: Path) -> Iterator[ProcessStarter]:
+    with closing(started(tmp_path)) as starter:
+        yield starter
+
+
+def ended(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
+    until(lambda: starter.poll() or process.code is not None)
+    return process
+
+
+def waiting(starter: ProcessStarter, name: str) -> SessionProcess:
+    process = starter.start(name, WAITS)
+    until(lambda: starter.poll() or (process.output.exists() and "waiting for" in process.output.read_text()))
+    return process
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists() or "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
+
+
+def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Path) -> None:
+    shown = ended(starter, starter.start("show", ["scenario", "show", "paper"]))
+    refused = ended(starter, starter.start("site", ["site", "m9", "--scenario", "paper"]))
+    assert (shown.code, shown.problem()) == (0, None)
+    assert shown.output.read_text() == trilat("scenario", "show", "paper", cwd=tmp_path).out
+    assert refused.code == 2
+    assert "site ended with code 2: " in str(refused.problem())
+    assert "m9" in str(refused.problem())
+
+
+def test_each_has_its_name_session_and_signals(starter: ProcessStarter) -> None:
+    process = waiting(starter, "recorder")
+    assert process.pid is not None
+    assert Path(f"/proc/{process.pid}/cmdline").read_text().startswith("trilat record --session nobody ")
+    assert os.getsid(process.pid) == process.pid
+    process.end(signal.SIGINT)
+    assert (ended(starter, process).code, process.problem()) == (130, None)
+    process.end(signal.SIGKILL)  # it has ended: nobody gets that
+
+
+def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> None:
+    process = waiting(starter, "m1")
+    os.kill(int(process.pid or 0), signal.SIGKILL)
+    assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+
+
+def test_what_has_not_begun_is_ended_with_its_starter(starter: ProcessStarter) -> None:
+    process = starter.start("m1", WAITS)
+    process.end(signal.SIGINT)
+    assert ended(starter, process).problem() is None
+
+
+def test_processes_of_a_killed_starter_end(starter: ProcessStarter) -> None:
+    process = waiting(starter, "m1")
+    os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
+    assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+    until(lambda: gone(int(process.pid or 0)))
+
+
+def test_processes_end_with_whoever_asked_for_them(tmp_path: Path) -> None:
+    starter = started(tmp_path)
+    processes = [waiting(starter, name) for name in ("m1", "recorder")]
+    starter.close()
+    assert all(gone(int(one.pid or 0)) for one in processes)
+
+
+def test_a_starter_that_fails_says_why(tmp_path: Path) -> None:
+    with closing(ProcessStarter(tmp_path / "absent.toml", tmp_path)) as starter:
+        process = ended(starter, starter.start("m1", WAITS))
+    assert "absent.toml" in str(process.problem())
+
+
+def test_no_code_of_the_users_runs_in_the_starter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whose threads or devices no copy would have."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    trilat("new", "law", "mylaw.py", cwd=tmp_path)
+    file = tmp_path / "mylaw.py"
+    file.write_text(file.read_text() + "\nopen('imported', 'a').close()\n")
+    law = f'law = "mylaw:{name_skeleton_class("mylaw", "law")}"'
+    (tmp_path / "own.toml").write_text(read_shipped("paper").replace('law = "adaptive"', law))
+    with closing(ProcessStarter(tmp_path / "own.toml", tmp_path)) as starter:
+        assert ended(starter, starter.start("show", ["scenario", "show", "paper"])).code == 0
+    assert not (tmp_path / "imported").exists()
