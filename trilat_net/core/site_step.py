@@ -43,7 +43,7 @@ from .ticks import (
     TickInput,
     TickRecord,
 )
-from .vectors import Row
+from .vectors import Array, Row
 
 _MODES = {int(mode): mode for mode in Mode}
 _RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
@@ -89,7 +89,7 @@ class Site:
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
-        self._hand = self._arrays.actors[live[0]] if live else None
+        self._hand = self._find_hand(live[0]) if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
@@ -101,6 +101,11 @@ class Site:
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
         self._keeps_forces = self._reflects or self._hand is not None  # a hand of one's own sees them
+
+    def _find_hand(self, place: int) -> tuple[Array, Array, Array]:
+        """Returns grip, target, and target a second later of the live hand at a place among the actors."""
+        actors, size = self._arrays.actors, (self.layout.hand - 3) // 2
+        return actors["grip"][place : place + 1], actors["a"][place, :size], actors["b"][place, :size]
 
     def _plug_law(self, setup: SiteSetup) -> None:
         """Makes the law of a setup that has its own."""
@@ -235,14 +240,13 @@ class Site:
 
     def _take_hand(self, vector: Sequence[float]) -> Sequence[float]:
         """Puts what a live hand does into its row; returns it as a record has it, () if there is none."""
-        row = self._hand
-        if row is None:
+        if self._hand is None:
             return ()
-        size = (self.layout.hand - 3) // 2
-        taken = list(vector) or free_hand(size)
+        grip, target, ahead = self._hand
+        taken = list(vector) or free_hand(len(target))
         hand = HandInForce.read(taken)
-        row["grip"], row["a"][:size] = hand.grip, hand.target
-        row["b"][:size] = [x + v for x, v in zip(hand.target, hand.rate, strict=True)]
+        grip[0], target[:] = hand.grip, hand.target
+        ahead[:] = [x + v for x, v in zip(hand.target, hand.rate, strict=True)]
         return taken
 
     def _crc(self, packed: int, arrivals: int) -> int:
