@@ -311,7 +311,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     def publish(clock: RelayClock) -> None:
         send = network.join().publisher(topics.key(SESSION, "m", topics.STATE))
         for k, payload in enumerate(states("m")):
-            clock.sleep_until(MONO_NS + k * 1_000_000)
+            clock.sleep_until(MONO_NS + k * 5_000_000)
             send(payload)
 
     relay.add("recorder", run)
@@ -320,7 +320,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
 
 
 def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> None:
-    recorder_alone(tmp_path, Relay(), MONO_NS + 30_500_000)
+    recorder_alone(tmp_path, Relay(), MONO_NS + 150_500_000)
     log = open_log(tmp_path / "run.mcap")
     assert log.complete
     assert 30 <= len(log["m"]) < TICKS
