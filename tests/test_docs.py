@@ -177,7 +177,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("own-controller.md", "at half a second of overtime", 0.5, code_watchdog.MOST_NS / 1e9),
     ("own-controller.md", "for 50 ms at most", 50, code_watchdog.HICCUP_NS / 1e6),
     ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
-    ("recording.md", "it flushes every 80 ms", 80, record_process.FLUSH_NS / 1e6),
+    ("recording.md", "it flushes every 65 ms", 65, record_process.FLUSH_NS / 1e6),
     ("recording.md", "the last 4096 events", 4096, retransmit_buffer.EVENTS_KEPT),
     ("sweep.md", "more than a million runs", 1e6, sweep_run.MAX_RUNS),
     ("sweep.md", "or more than a day", 1, sweep_run.MAX_SWEEP_S / 86_400),
