@@ -3,9 +3,9 @@
 They are copies of one process, the starter, which has loaded everything: a copy begins in a tenth of the time
 that an interpreter takes. What is copied has no connection, no thread of its own and no code of the user's.
 
-Invariant: in every case the recorder ends last and no child is left on return, nor if this process is killed.
-The children have process sessions of their own, so that Ctrl-C reaches them through this process, in that
-order.
+Invariant: in every case the recorder ends last and no child is left on return, nor if this process is killed;
+if the starter is, all are asked to end. The children have process sessions of their own, so that Ctrl-C
+reaches them through this process, in that order.
 """
 
 import os
@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import chain
-from multiprocessing.connection import Connection, Pipe, wait
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
 
@@ -280,55 +280,50 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
 class _Starter:
     def __init__(self, orders: Connection) -> None:
         self._orders = orders
-        self._running: dict[int, tuple[str, int]] = {}
-        """By the end of a pipe whose other end a process alone has: its name and number."""
+        self._running: dict[str, int] = {}
 
     def serve(self) -> list[str] | None:
         words: list[str]
         while True:
-            for ready in wait([self._orders, *self._running]):
-                if isinstance(ready, int):
-                    self._report_end(ready)
+            self._report_ends()
+            try:
+                if not self._orders.poll(POLL_NS / NS_PER_S):
                     continue
-                try:
-                    name, words, number, output = self._orders.recv()
-                except (EOFError, OSError):
-                    self._end_all()
-                    return None
-                if number:
-                    self._signal([pid for one, pid in self._running.values() if one == name], number)
-                elif self._fork(name):
-                    _become(words, output)
-                    return words
+                name, words, number, output = self._orders.recv()
+            except (EOFError, OSError):
+                self._end_all()
+                return None
+            if not number and self._fork(name):
+                _become(words, output)
+                return words
+            if number and name in self._running:
+                os.kill(self._running[name], number)
 
     def _fork(self, name: str) -> bool:
         """Copies this process; true in the copy."""
-        ours, theirs = os.pipe()
         if pid := os.fork():
-            os.close(theirs)
-            self._running[ours] = name, pid
-            self._orders.send((name, pid, None))
+            self._running[name] = pid
+            self._report(name, pid, None)
             return False
-        for other in (ours, *self._running):
-            os.close(other)
         self._orders.close()
         return True
 
-    def _report_end(self, closed: int) -> None:
-        name, pid = self._running.pop(closed)
-        os.close(closed)
-        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        with suppress(OSError):  # whoever asked is gone
-            self._orders.send((name, pid, code))
+    def _report_ends(self) -> None:
+        for name, pid in list(self._running.items()):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                del self._running[name]
+                self._report(name, pid, os.waitstatus_to_exitcode(status))
 
-    def _signal(self, pids: list[int], number: int) -> None:
-        for pid in pids:
-            os.kill(pid, number)
+    def _report(self, *news: Any) -> None:
+        with suppress(OSError):  # whoever asked is gone, as the next look at its orders finds
+            self._orders.send(news)
 
     def _end_all(self) -> None:
-        for is_last in (False, True):
-            pids = [pid for name, pid in self._running.values() if (name == topics.RECORDER) == is_last]
-            self._signal(pids, signal.SIGINT)
+        recorder = [self._running.pop(topics.RECORDER)] if topics.RECORDER in self._running else []
+        for pids in (list(self._running.values()), recorder):
+            for pid in pids:
+                os.kill(pid, signal.SIGINT)
             for pid in pids:
                 os.waitpid(pid, 0)
 
