@@ -42,15 +42,15 @@ def _run() -> None:
         sys.argv[2:] = left
     from .cli import main as run
 
-    if sys.argv[1:2] == ["start-processes"]:
-        from recorder import record_process  # noqa: F401 - loaded once, not in every process that is started
-        from sites import site_process  # noqa: F401
-        from sites.demo_session import run_starter
+    match sys.argv[1:]:
+        case ["start-processes", number, scenario_file] if number.isdecimal():
+            from recorder import record_process  # noqa: F401 - loaded once, not in each process that is started
+            from sites import site_process  # noqa: F401
+            from sites.demo_session import run_starter
 
-        words = run_starter(int(sys.argv[2]), sys.argv[3])
-        if words is None:
-            return
-        sys.argv[1:] = words
+            if (words := run_starter(int(number), scenario_file)) is None:
+                return
+            sys.argv[1:] = words
     run()
 
 
