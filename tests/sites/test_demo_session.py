@@ -22,9 +22,9 @@ def started(folder: Path) -> ProcessStarter:
     return ProcessStarter(folder / "paper.toml", folder)
 
 
-@pytest.fixture
-def starter(tmp_path: Path) -> Iterator[ProcessStarter]:
-    with closing(started(tmp_path)) as starter:
+@pytest.fixture(scope="module")
+def starter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessStarter]:
+    with closing(started(tmp_path_factory.mktemp("processes"))) as starter:
         yield starter
 
 
@@ -73,16 +73,18 @@ def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> N
     assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
 
 
-def test_what_has_not_begun_is_ended_with_its_starter(starter: ProcessStarter) -> None:
-    process = starter.start("m1", WAITS)
-    process.end(signal.SIGINT)
-    assert ended(starter, process).problem() is None
+def test_what_has_not_begun_is_ended_with_its_starter(tmp_path: Path) -> None:
+    with closing(started(tmp_path)) as starter:
+        process = starter.start("m1", WAITS)
+        process.end(signal.SIGINT)
+        assert ended(starter, process).problem() is None
 
 
-def test_processes_of_a_killed_starter_end(starter: ProcessStarter) -> None:
-    process = waiting(starter, "m1")
-    os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
-    assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
+def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
+    with closing(started(tmp_path)) as starter:
+        process = waiting(starter, "m1")
+        os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
+        assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
     until(lambda: gone(int(process.pid or 0)))
 
 
