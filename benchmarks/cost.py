@@ -8,6 +8,7 @@ turns between the two: processor time of sites and recorder, and how late the lo
 import os
 import re
 import shutil
+import signal
 import tempfile
 import time
 from collections import Counter
@@ -19,20 +20,22 @@ from unittest import mock
 import numpy as np
 
 from sites.realtime import FIFO_PRIORITY
-from tests.live.processes import PLAIN, Stage
+from tests.live.processes import PLAIN, Process, Stage
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
 
 from .live import cyclictest_us, thread_us
 from .page import SocketClient, live_session
-from .sessions import SITES, paper
+from .sessions import SITES
 from .stopwatch import cpu_s
 
 DURATION_S, WINDOW_S, PAIRS, STARTS = 20, 14, 7, 5
 AHEAD_S = 0.5
 """Between the announcement of a session and its first tick."""
 COST_RATIO, LATENESS_RATIO, START_S = 0.6, 3.0, 3.0
+PROCESSES = "run/processes"
+"""Where a session's processes print, from the folder in which it runs."""
 MS_PER_TICK = 1000.0 / os.sysconf("SC_CLK_TCK")
 
 Usage = Counter[str]
@@ -65,39 +68,51 @@ def run() -> list[str]:
 
 def _measure_start() -> tuple[float, float]:
     """Returns the time until the first tick of `trilat demo paper`, s: of processors, and of the clock."""
-    with tempfile.TemporaryDirectory() as folder:
-        since, stage = time.perf_counter(), Stage(Path(folder))
-        demo = stage.start("demo", "demo", "paper", "--duration", "2", "--out", "run")
-        printed = [stage.folder / "run" / "processes" / f"{name}.txt" for name in SITES]
-        until(lambda: all(file.exists() and "the session begins" in file.read_text() for file in printed))
+    since = time.perf_counter()
+    with _demo() as demo:
         time.sleep(AHEAD_S)
         wall_s = time.perf_counter() - since
         spent_s = sum(map(cpu_s, (demo.pid, *_list_descendants(demo.pid))))
-        assert demo.code() == 0
     return spent_s, wall_s
 
 
 def _measure_paper(root: str) -> tuple[float, float]:
-    """Runs `paper` with the program in a folder.
+    """Runs `trilat demo paper` with the program in a folder.
 
     Returns the processor time of a site and its share of the recorder, ms a second, and the worst site's p99
     of lateness over that of what woke beside it at the same priority.
     """
-    with mock.patch.dict(PLAIN, PYTHONPATH=root), paper(DURATION_S) as session:
-        session.all()
-        session.begun()
-        pids = {name: process.pid for name, process in session.processes.items()}
-        priority = FIFO_PRIORITY * all("SCHED_FIFO" in session.processes[name].text() for name in SITES)
+    with mock.patch.dict(PLAIN, PYTHONPATH=root), _demo() as demo:
+        time.sleep(AHEAD_S)
+        printed = "".join((demo.folder / PROCESSES / f"{name}.txt").read_text() for name in SITES)
+        priority = FIFO_PRIORITY * (printed.count("SCHED_FIFO") == len(SITES))
         measure = cyclictest_us if shutil.which("cyclictest") else thread_us
         beside_us: list[float] = []
-        usage = _watch(pids, lambda: beside_us.append(measure(priority, WINDOW_S)))
-        session.ends_well()
-        log = open_log(session.log)
+        usage = _watch(_find_members(demo.pid), lambda: beside_us.append(measure(priority, WINDOW_S)))
+        demo.signal(signal.SIGINT)
+        assert demo.code() == 128 + signal.SIGINT
+        log = open_log(demo.folder / "run" / "run.mcap")
+        assert log.complete
+        assert all(len(log[name]) == log[name].last_tick + 1 for name in SITES)
         late_us = max(float(np.percentile(log[name].late_us, 99)) for name in SITES)
-        assert sum(len(log[name]) for name in SITES) == DURATION_S * 1000 * len(SITES)
     cost_ms = sum(map(_total, usage.values())) / len(SITES)
     print(f"  {root}: {cost_ms:.0f} ms; late p99 {late_us:.0f} us, beside {beside_us[0]:.0f} us", flush=True)
     return cost_ms, late_us / beside_us[0]
+
+
+@contextmanager
+def _demo() -> Iterator[Process]:
+    """A session of `paper` on this machine, which has just been announced; it is ended."""
+    with tempfile.TemporaryDirectory() as folder:
+        demo = Stage(Path(folder)).start(
+            "demo", "demo", "paper", "--duration", str(DURATION_S), "--out", "run"
+        )
+        printed = [demo.folder / PROCESSES / f"{name}.txt" for name in SITES]
+        try:
+            until(lambda: all(file.exists() and "the session begins" in file.read_text() for file in printed))
+            yield demo
+        finally:
+            demo.end()
 
 
 @contextmanager
@@ -110,14 +125,19 @@ def _with_bridge(folder: Path) -> Iterator[dict[str, int]]:
             stage.start("router", "router", "--listen", router)
             bridge = stage.start("bridge", "ros2", "--ros", router, "--session", "play")
             bridge.prints("is in the graph of ROS 2")
-            members = {}
-            for pid in _list_descendants(page):
-                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split()
-                if named := {"site", "record"} & set(words):
-                    members[words[words.index("site") + 1] if "site" in named else "recorder"] = pid
-            yield {**members, "page": page, "bridge": bridge.pid}
+            yield {**_find_members(page), "page": page, "bridge": bridge.pid}
         finally:
             stage.clear()
+
+
+def _find_members(pid: int) -> dict[str, int]:
+    """Returns the sites and the recorder among the descendants of a process, by name."""
+    members = {}
+    for child in _list_descendants(pid):
+        words = Path(f"/proc/{child}/cmdline").read_text("utf-8").replace("\0", " ").split()
+        if named := {"site", "record"} & set(words):
+            members[words[words.index("site") + 1] if "site" in named else "recorder"] = child
+    return members
 
 
 def _list_descendants(pid: int) -> list[int]:

@@ -63,7 +63,7 @@ class Process:
     """One process, with what it prints in a file; `before` are words before its command."""
 
     def __init__(self, name: str, arguments: Sequence[str], folder: Path, before: Sequence[str] = ()) -> None:
-        self.name = name
+        self.name, self.folder = name, folder
         self._printed = folder / f"{name}.printed"
         with self._printed.open("wb") as sink:
             self._process = subprocess.Popen(
