@@ -1,8 +1,9 @@
 """Processor time of a live session: to its first tick; then by process and thread, with a page and a bridge.
 
 It is user and system time, which other programs on the machine change less than any latency. With the
-environment variable `TRILAT_BEFORE`, the folder of another version of the program, sessions of `paper` take
-turns between the two: processor time of sites and recorder, and how late the loops woke up over cyclictest.
+environment variable `TRILAT_BEFORE`, the folder of another version of the program, sessions of `trilat demo`
+take turns between the two: processor time of sites and recorder, and how late the loops woke up over
+cyclictest.
 """
 
 import os
@@ -20,7 +21,7 @@ from unittest import mock
 import numpy as np
 
 from sites.realtime import FIFO_PRIORITY
-from tests.live.processes import PLAIN, Process, Stage
+from tests.live.processes import PLAIN, Process, Stage, list_descendants
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import find_free_endpoints
@@ -72,7 +73,7 @@ def _measure_start() -> tuple[float, float]:
     with _demo() as demo:
         time.sleep(AHEAD_S)
         wall_s = time.perf_counter() - since
-        spent_s = sum(map(cpu_s, (demo.pid, *_list_descendants(demo.pid))))
+        spent_s = sum(map(cpu_s, (demo.pid, *demo.children())))
     return spent_s, wall_s
 
 
@@ -133,16 +134,11 @@ def _with_bridge(folder: Path) -> Iterator[dict[str, int]]:
 def _find_members(pid: int) -> dict[str, int]:
     """Returns the sites and the recorder among the descendants of a process, by name."""
     members = {}
-    for child in _list_descendants(pid):
-        words = Path(f"/proc/{child}/cmdline").read_text("utf-8").replace("\0", " ").split()
+    for child, line in list_descendants(pid):
+        words = line.split()
         if named := {"site", "record"} & set(words):
             members[words[words.index("site") + 1] if "site" in named else "recorder"] = child
     return members
-
-
-def _list_descendants(pid: int) -> list[int]:
-    children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split())
-    return [one for child in children for one in (child, *_list_descendants(child))]
 
 
 def _total(usage: Usage) -> float:

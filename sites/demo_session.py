@@ -42,8 +42,6 @@ from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
 
 POLL_NS = 100_000_000
-START_PROCESSES = "start-processes"
-"""The command of a starter; its words are the number of a connection and the file of a scenario."""
 START_S = 10
 """Time for a site to start, s, where many share a few processors."""
 JOIN_S, WAIT_S = 60, 600
@@ -100,9 +98,9 @@ class ProcessStarter:
         self._processes: dict[str, SessionProcess] = {}
         self._orders, theirs = Pipe()
         with theirs, self._output.open("wb") as sink:
-            words = ["-m", "trilat_net", START_PROCESSES, str(theirs.fileno()), str(scenario_file)]
+            words = ["start-processes", str(theirs.fileno()), str(scenario_file)]  # see `run_starter`
             self._starter = subprocess.Popen(
-                [sys.executable, *words],
+                [sys.executable, "-m", "trilat_net", *words],
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
@@ -113,6 +111,7 @@ class ProcessStarter:
     def start(self, name: str, words: Sequence[str]) -> SessionProcess:
         """Starts a command, given by its words, as a process of a name that no other has."""
         started = SessionProcess(self, name, self._folder / f"{name}.txt")
+        started.output.write_bytes(b"")  # here, where a disk that refuses it is told of
         self._processes[name] = started
         self._order(name, [*words], 0, started.output)
         return started
@@ -331,7 +330,7 @@ class _Starter:
 def _become(words: list[str], output: Path) -> None:
     """Makes a copy what a shell would have started: its name, session, output and signals."""
     os.setsid()
-    sink = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    sink = os.open(output, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         os.dup2(sink, stream.fileno())
     os.close(sink)

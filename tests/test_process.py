@@ -9,11 +9,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from tests.live.processes import is_running
 from tests.net.waiting import until
 from tests.other_systems import replace_os
 from trilat_net import process
@@ -89,13 +89,6 @@ def sigint() -> Iterator[None]:
 
 def wait_for_ever() -> None:
     threading.Event().wait()
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
 
 
 def test_work_is_done_in_other_processes_that_ignore_ctrl_c() -> None:

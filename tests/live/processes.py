@@ -98,7 +98,7 @@ class Process:
 
     def children(self) -> dict[int, str]:
         """What it has started, and what those have: the starter of a session and its members."""
-        return dict(_descendants(self.pid))
+        return dict(list_descendants(self.pid))
 
     def end(self) -> None:
         for number in (signal.SIGCONT, signal.SIGINT, signal.SIGKILL):
@@ -111,13 +111,22 @@ class Process:
         return f"{self.name}: exit code {self._process.poll()}, printed\n{self.text()}"
 
 
-def _descendants(pid: int) -> Iterator[tuple[int, str]]:
+def list_descendants(pid: int) -> Iterator[tuple[int, str]]:
+    """Processes of this program below one, however far, each with its command."""
     with contextlib.suppress(OSError):
         for child in map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()):
             line = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ").decode()
             if "trilat" in line:
                 yield child, line
-            yield from _descendants(child)
+            yield from list_descendants(child)
+
+
+def is_running(pid: int) -> bool:
+    """Unlike `gone`, of one that has ended and that nobody has waited for: it runs no more."""
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
 
 
 def gone(pid: int) -> bool:

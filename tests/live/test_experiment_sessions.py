@@ -18,7 +18,7 @@ from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .browsers import needs_browser, page_address, shows
 from .participants import FAR, REACH, Participant, begin, join, participants, take_part, write_protocol
-from .processes import Process, Stage, gone
+from .processes import Process, Stage, is_running
 
 pytestmark = needs_browser
 CONSENT = 'consent = "We record how the arms move."\nquestionnaires = [{ name = "tlx" }]\n'
@@ -146,7 +146,7 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
         left = first.children()
         first.signal(signal.SIGKILL)
         first.code()
-        until(lambda: all(gone(pid) for pid in left))
+        until(lambda: not any(map(is_running, left)))
     second = begin(stage, folder, name="second")
     with participants(second) as people:
         take_part(people, lambda: people[0].look().get("appeared"))
@@ -157,7 +157,7 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
         left = second.children()
         second.signal(signal.SIGKILL)
         second.code()
-        until(lambda: all(gone(pid) for pid in left))
+        until(lambda: not any(map(is_running, left)))
     assert left
     third = begin(stage, folder, name="third")
     with participants(third) as people:

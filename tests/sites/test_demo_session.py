@@ -10,6 +10,7 @@ import pytest
 
 from sites.demo_session import ProcessStarter, SessionProcess
 from tests.cli.running import trilat
+from tests.live.processes import is_running
 from tests.net.waiting import until
 from trilat_net.scenario.scenario_reader import read_shipped
 from trilat_net.scenario.skeletons import name_skeleton_class
@@ -41,10 +42,6 @@ def waiting(starter: ProcessStarter, name: str) -> SessionProcess:
 
 def parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def gone(pid: int) -> bool:
-    return not Path(f"/proc/{pid}").exists() or "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
 
 
 def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Path) -> None:
@@ -85,14 +82,14 @@ def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
         process = waiting(starter, "m1")
         os.kill(parent(int(process.pid or 0)), signal.SIGKILL)
         assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
-    until(lambda: gone(int(process.pid or 0)))
+    until(lambda: not is_running(int(process.pid or 0)))
 
 
 def test_processes_end_with_whoever_asked_for_them(tmp_path: Path) -> None:
     starter = started(tmp_path)
     processes = [waiting(starter, name) for name in ("m1", "recorder")]
     starter.close()
-    assert all(gone(int(one.pid or 0)) for one in processes)
+    assert not any(is_running(int(one.pid or 0)) for one in processes)
 
 
 def test_a_starter_that_fails_says_why(tmp_path: Path) -> None:
