@@ -143,6 +143,7 @@ class ProcessStarter:
     def close(self) -> None:
         """Ends the starter, after all that it has started."""
         self._orders.close()
+        self._starter.send_signal(signal.SIGINT)
         self._starter.wait()
 
 
@@ -175,7 +176,7 @@ def run_demo(
         compile_core(scenario, display.say, interrupt)
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         patience_s = JOIN_S if begins is None else WAIT_S
-        starter, sites, start_recorder = _start(scenario, folder, session, endpoints, patience_s)
+        starter, sites, start_recorder = _start(scenario, folder, reserved, endpoints, patience_s)
         recorder: list[SessionProcess] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
@@ -186,11 +187,11 @@ def run_demo(
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not (interrupt.requested() or is_enough() or _is_over([*sites, *recorder], result)):
-                    starter.poll()
                     if not recorder and (begins is None or begins()):
                         recorder.append(start_recorder())
                     monitor.poll()
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+                    starter.poll()
         finally:
             _end_all(starter, (sites, recorder), clock)
         result.interrupted = interrupt.number
@@ -215,13 +216,13 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 
 
 def _start(
-    scenario: Scenario, folder: Path, session: str, endpoints: list[str], wait_s: int
+    scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
     file.write_bytes(scenario.text.encode())
     output.mkdir(exist_ok=True)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
-    starter = ProcessStarter(file, output)
+    starter, session = reserved.enter_context(closing(ProcessStarter(file, output))), scenario.name
     connect = [["--connect", endpoint] for endpoint in endpoints]
     patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
     sites = [
@@ -261,7 +262,6 @@ def _end_all(starter: ProcessStarter, groups: Sequence[list[SessionProcess]], cl
                     child.end(signal.SIGKILL)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
             starter.poll()
-    starter.close()
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
@@ -286,7 +286,7 @@ class _Starter:
         while True:
             self._report_ends()
             try:
-                if not self._orders.poll(POLL_NS / NS_PER_S):
+                if not self._orders.poll(POLL_NS / 10 / NS_PER_S):
                     continue
                 name, words, number, output = self._orders.recv()
             except (EOFError, OSError):
