@@ -1,10 +1,11 @@
 """The real-time loop of a site on an absolute tick grid, and the inbox of its peers' samples.
 
-Invariant (L1): tick k lies at epoch + k periods of the leader's grid. Lateness is telemetry and enters no
-formula; a late loop runs its missed ticks back to back and counts them, or at an arm outside makes none of
-them, since no plant can be caught up with: the numbers of its ticks jump. No arriving payload can raise out
-of the loop: it is a peer's sample, or it is counted by reason and dropped. Samples are decoded as they
-arrive, before their tick, and carry the instants of their arrival, not of their draining.
+Invariant (L1): tick k lies at epoch + k periods of the leader's grid; the site wakes up for it in its turn.
+Lateness is telemetry and enters no formula; a late loop runs its missed ticks back to back and counts them,
+or at an arm outside makes none of them, since no plant can be caught up with: the numbers of its ticks jump.
+No arriving payload can raise out of the loop: it is a peer's sample, or it is counted by reason and dropped.
+Samples are decoded as they arrive, before their tick, and carry the instants of their arrival, not of their
+draining.
 """
 
 from bisect import bisect_right
@@ -226,7 +227,7 @@ def run_loop(
 ) -> TickRecord | None:
     """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
     send = partial(_send_sample, site.name, boot, clock, timing, io)
-    quarter_ns, deadline_ns = NS_PER_S // (4 * site.rate_hz), timing.schedule.deadline(first)
+    quarter_ns, deadline_ns = NS_PER_S // (4 * site.rate_hz), timing.deadline(first)
     busy_us, mode, last, asked, k = 0, Mode.RUN, None, False, first
     while k < ticks:
         clock.sleep_until(deadline_ns)
@@ -234,10 +235,10 @@ def run_loop(
             break
         woke_ns = clock.monotonic_ns()
         skipped = 0
-        if not catches_up and k > first and woke_ns >= timing.schedule.deadline(k + 1):
-            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.schedule.deadline) - 1
+        if not catches_up and k > first and woke_ns >= timing.deadline(k + 1):
+            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.deadline) - 1
             k += skipped
-            deadline_ns = timing.schedule.deadline(k)
+            deadline_ns = timing.deadline(k)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
         arrivals = inbox.drain(k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns)
         output = io.step(k, arrivals)
@@ -259,7 +260,7 @@ def run_loop(
             mode = output.mode
             io.report(output)
         k += 1
-        deadline_ns = timing.schedule.deadline(k)
+        deadline_ns = timing.deadline(k)
         if (block_due or asked) and deadline_ns - clock.monotonic_ns() > quarter_ns:
             asked = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000

@@ -35,7 +35,7 @@ from trilat_net.net.messages import MODE_WORDS, Event
 from trilat_net.net.pinging import Pinger, describe_clocks
 from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.session import SessionJoin
-from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming
+from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming, find_turn_ns
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt, LinePrinter
@@ -180,7 +180,11 @@ class RunningSite:
         ]
         site.begin_at(epoch.first)
         parts.buffer.begin_at(epoch.first)
-        self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0])
+        own = {peer.name for peer in peers if peer.is_own and peer.name in epoch.boots}
+        self._here = [name for name in scenario.names if name == parts.name or name in own]
+        rate_hz = max(scenario.sites[name].rate_hz for name in self._here)
+        turn_ns = find_turn_ns(self._here.index(parts.name), len(self._here), rate_hz)
+        self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0], turn_ns)
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
         heard = (parts.rings, boots, self._timing.meters, parts.stats.dropped)
         self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
@@ -208,9 +212,8 @@ class RunningSite:
 
     def _publish_setup(self) -> None:
         parts, texts = self._parts, self._clock_texts
-        there = [one.peer for one in self._timing.meters if one.peer.name in self._epoch.boots]
-        here = 1 + sum(peer.is_own for peer in there)
-        obtained = realtime.prepare(parts.options.cpu, here)
+        obtained = realtime.prepare(parts.options.cpu, len(self._here))
+        obtained["turn"] = f"{self._timing.turn_ns // 1000} us after the grid"
         self._publisher.publish(
             "setup",
             ", ".join([*(f"{key}: {value}" for key, value in obtained.items()), *texts]),

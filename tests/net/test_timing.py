@@ -3,6 +3,7 @@
 import heapq
 import random
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -24,6 +25,7 @@ from trilat_net.net.timing import (
     SentStamps,
     SiteTiming,
     TickSchedule,
+    find_turn_ns,
 )
 
 from .crossing import Delay, Other, S, queueing
@@ -258,6 +260,15 @@ def test_who_shares_the_leaders_clock_is_not_steered() -> None:
         assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []
     assert timing.schedule.deadline(10_000) == 5 + 10 * S
     assert timing.schedule.slew == 0.0
+
+
+@given(st.integers(1, 30), st.integers(1, 4000))
+def test_turns_of_a_machine_lie_within_half_a_period(sites: int, rate_hz: int) -> None:
+    turns = [find_turn_ns(place, sites, rate_hz) for place in range(sites)]
+    assert turns[0] == 0
+    assert 2 * turns[-1] * rate_hz < S
+    apart = [later - turn for turn, later in pairwise(turns)]
+    assert max(apart, default=0) - min(apart, default=0) <= 1
 
 
 EPOCH_NS = 5_000_000_123

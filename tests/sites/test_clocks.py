@@ -85,6 +85,7 @@ def test_people_are_told_whose_clock_is_another_one(skewed: tuple[Session, Log])
     assert "clock of m2: another one" in setups["s"].text
     assert setups["m2"].epoch_mono_ns == members(log)["m2"].epoch_ns
     assert "skewed by 3000000000 ns" in setups["m2"].clock
+    assert all("turn: 0 us after the grid" in event.text for event in setups.values())
 
 
 def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) -> None:
@@ -95,6 +96,15 @@ def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) ->
             assert set(stats.offset_us.values()) == set(stats.bound_us.values()) == {0}
             assert (stats.grid_error_us, stats.slew_ppb) == (0, 0)
     assert not any("another one" in text for text in session.said if not text.startswith("recorder"))
+
+
+def test_sites_on_one_clock_wake_up_in_turn(tmp_path: Path) -> None:
+    _, log = run(tmp_path, {}, 0.2)
+    setups = {event.member: event.text for event in log.events if event.kind == "setup"}
+    for site, turn_us in (("m1", 0), ("m2", 166), ("s", 333)):
+        assert f"turn: {turn_us} us after the grid" in setups[site]
+        at_once_ns = min(state.sent_ns - state.t_ns for state in log[site].states)
+        assert turn_us <= at_once_ns // 1000 < turn_us + 20
 
 
 class Stepping(Relay):

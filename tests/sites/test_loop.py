@@ -55,9 +55,9 @@ class Alone:
         self.stopped: Callable[[], bool] = lambda: False
         self._clock, self._ticks = clock, scenario.ticks("m")
 
-    def run(self, *, catches_up: bool = True) -> object:
+    def run(self, turn_ns: int = 0, *, catches_up: bool = True) -> object:
         inbox = PeerInbox((), (), (), (), self.stats.dropped)
-        timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s")
+        timing = SiteTiming(EPOCH_NS, self.site.rate_hz, (), "s", turn_ns)
         states = StateBlock(self.site, 1, self.publish_states, 0, single=True)
         timed = (self._clock, inbox, timing, self.stats, states, self)
         return run_loop(self.site, 1, self._ticks, *timed, catches_up=catches_up)
@@ -110,6 +110,15 @@ def test_lateness_enters_no_formula() -> None:
     on_time = [msgspec.structs.replace(state, late_us=0, sent_ns=state.t_ns) for state in late.states]
     assert on_time == prompt.states
     assert max(state.late_us for state in late.states) == 400_000
+
+
+def test_a_turn_shifts_wake_ups_and_nothing_else() -> None:
+    clock, prompt = LateClock(), Alone(LateClock())
+    in_turn = Alone(clock)
+    prompt.run()
+    in_turn.run(turn_ns=333_000)
+    assert clock.deadlines == [EPOCH_NS + k * 1_000_000 + 333_000 for k in range(2000)]
+    assert [msgspec.structs.replace(state, sent_ns=state.t_ns) for state in in_turn.states] == prompt.states
 
 
 def test_statistics_and_slack_come_ten_times_second_after_tick() -> None:

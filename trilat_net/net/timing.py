@@ -2,8 +2,8 @@
 
 Invariant (L1): tick k is due at `k * 10^9 // rate_hz` ns after the epoch, to the nanosecond, on the leader's
 clock. A site on another clock follows by slewing, at most SLEW_LIMIT, never by a step; while the leader is
-away, along its clock as last estimated. Measuring changes no number of a run: an impossible stamp is
-counted, and its sample is used.
+away, along its clock as last estimated. Sites of one machine wake up in turn after that, see `find_turn_ns`.
+Measuring changes no number of a run: an impossible stamp is counted, and its sample is used.
 
 Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of the record that the peer
 echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the echo.
@@ -239,11 +239,32 @@ ClockNotice = dict[str, Any]
 """The fields of an event about a clock, or about a peer that does not hear this site."""
 
 
-class SiteTiming:
-    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's."""
+def find_turn_ns(place: int, sites: int, rate_hz: int) -> int:
+    """Returns how long after a tick of the grid a site wakes up that is one of several on its machine.
 
-    def __init__(self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str) -> None:
+    Woken up at one instant, they would wait for one another's processors. The turns take half of a period, so
+    that a sample of the last one is still there well before the next tick of the first.
+
+    Args:
+        place: of the site among them, from 0.
+        sites: how many they are.
+        rate_hz: the highest of their tick rates.
+    """
+    return place * NS_PER_S // (2 * sites * rate_hz)
+
+
+class SiteTiming:
+    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's.
+
+    Attributes:
+        turn_ns: how long after a tick of the grid the site wakes up, see `find_turn_ns`.
+    """
+
+    def __init__(
+        self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str, turn_ns: int = 0
+    ) -> None:
         self.schedule = TickSchedule(epoch_ns, rate_hz)
+        self.turn_ns = turn_ns
         self._epoch_ns, self._rate_hz = epoch_ns, rate_hz
         self._sent = SentStamps()
         self.meters = [LinkTimingMonitor(peer, self._sent) for peer in peers]
@@ -252,6 +273,10 @@ class SiteTiming:
         self._leader_name = leader
         self._turn = 0
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
+
+    def deadline(self, k: int) -> int:
+        """Returns when the site is to wake up for tick k, on its clock, ns: in its turn."""
+        return self.schedule.deadline(k) + self.turn_ns
 
     def opening(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
