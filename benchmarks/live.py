@@ -4,7 +4,7 @@ cyclictest (Debian: rt-tests) wakes once a millisecond at the sites' priority wh
 installed, a thread of this process does, which takes what Python takes to wake up.
 
 A tick is busy from its waking until the loop sleeps again, all of it. That the sites keep one grid is read
-from their stamps: how long after the nominal time of its tick each sample was sent.
+from their stamps: how long after its tick, and the site's turn in it, each sample was sent.
 """
 
 import os
@@ -18,6 +18,7 @@ import numpy as np
 
 from sites.realtime import FIFO_PRIORITY
 from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.timing import find_turn_ns
 
 from .sessions import SITES, paper
 
@@ -41,7 +42,7 @@ def run() -> list[str]:
         by_site = ", ".join(f"{name} {at_us:.0f}" for name, at_us in zip(SITES, sent_us, strict=True))
         print(
             f"  busy p50 {p50:.0f} us; late p50 {late_p50:.0f}, p99 {late:.0f}, beside {beside_us:.0f} us: "
-            f"ratio {late / beside_us:.1f}; sent after the grid's tick, p50: {by_site} us",
+            f"ratio {late / beside_us:.1f}; sent after their turns, p50: {by_site} us",
             flush=True,
         )
     busy, late_p50, late, beside_us, ratio, apart = np.median(rows, axis=0)
@@ -67,8 +68,9 @@ def _run(waker: str) -> tuple[Log, float]:
 
 
 def _sent_after_us(log: Log, site: str) -> np.ndarray:
-    """Returns how long after the nominal times of its ticks a site sent its samples, by its clock, us."""
-    return np.array([(state.sent_ns - state.t_ns) / 1000 for state in log[site].states])
+    """Returns how long after its turns in its ticks a site sent its samples, by its clock, us."""
+    turn_ns = find_turn_ns(SITES.index(site), len(SITES), log[site].rate_hz)
+    return np.array([(state.sent_ns - state.t_ns - turn_ns) / 1000 for state in log[site].states])
 
 
 def cyclictest_us(priority: int, duration_s: int) -> float:
