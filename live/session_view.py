@@ -7,7 +7,7 @@ for no records from before it, and for all events, which say what was changed.
 
 from collections import Counter, deque
 from collections.abc import Mapping
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -24,7 +24,7 @@ from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
 from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
-from trilat_net.scenario.run_changes import initial_link_tables, scheduled_link_tables
+from trilat_net.scenario.run_changes import LinkTables
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
@@ -115,13 +115,12 @@ class SessionView:
         self.scenario: Scenario | None = None
         self.sites: dict[str, SiteView] = {}
         self.met: dict[str, Info] = {}
-        self.links: dict[str, dict[str, Any]] = {}
+        self.links = LinkTables({}, ())
         self.dominance: dict[str, dict[str, float]] = {}
         self.energy: RunningEnergy | None = None
         self.events: Tail[Event] = Tail(EVENTS_KEPT)
         self.dropped: Counter[str] = Counter()
         self._pictures: dict[str, PictureDelay] = {}
-        self._planned: list[tuple[int, str, dict[str, Any]]] = []
         self._changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
         self._queue = InboundQueue(clock)
@@ -160,9 +159,7 @@ class SessionView:
             for channel, message, _ in site.repair.poll(now_ns, alive=not self.silent(site)):
                 self._keep(name, site, channel, message.content)
         newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
-        for planned in [one for one in self._planned if one[0] <= newest_ns]:
-            self._planned.remove(planned)
-            self.links[planned[1]] = planned[2]
+        self.links.advance(newest_ns)
 
     def advance_energy(self) -> EnergyCourse | None:
         """Returns V at the ticks of which all records have come since the last call; None without any."""
@@ -193,7 +190,7 @@ class SessionView:
 
     def _begin(self, scenario: Scenario, boots: dict[str, int]) -> None:
         windows = {name: RecordWindow(scenario, name) for name in scenario.names}
-        self.links, self._planned = initial_link_tables(scenario), scheduled_link_tables(scenario)
+        self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)
         self.sites = {

@@ -19,13 +19,7 @@ from trilat_net.net.messages import MODE_WORDS
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario, find_owner
-from trilat_net.scenario.run_changes import (
-    initial_link_tables,
-    make_site_order,
-    resolve_change,
-    scheduled_link_tables,
-    to_core_change,
-)
+from trilat_net.scenario.run_changes import LinkTables, make_site_order, resolve_change, to_core_change
 from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100
@@ -63,8 +57,7 @@ class ChangeServer:
         self._mode, self._held = mode, held
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
-        self._links = initial_link_tables(scenario)
-        self._planned = scheduled_link_tables(scenario)
+        self._links = LinkTables(scenario.links, scenario.timeline)
         self._held_up: Query | None = None
         self._accepted: Counter[str] = Counter()
         self._waiting: deque[int] = deque()
@@ -141,10 +134,7 @@ class ChangeServer:
 
     def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)
-        for planned_ns, name, table in list(self._planned):
-            if planned_ns <= from_ns:  # the scenario has changed this link by then
-                self._links[name] = table
-                self._planned.remove((planned_ns, name, table))
+        self._links.advance(from_ns)  # the scenario has changed them by then
         if first >= self._ticks:
             raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
         if self._accepted[request.link] >= MAX_CHANGES:

@@ -24,7 +24,7 @@ from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import CoreChange, TickInput
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_embedded, parse_scenario
-from trilat_net.scenario.run_changes import initial_link_tables, resolve_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
 MIB = 2**20
 
@@ -168,7 +168,7 @@ def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
 
 def test_change_that_would_need_more_than_limit_is_refused() -> None:
     scenario = parse_scenario(many(12, 20_000, 1.0))
-    present = initial_link_tables(scenario)
+    present = LinkTables(scenario.links, ())
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
     assert resolve_change(scenario, present, change, 10**9).link == "a1->a0"
     with pytest.raises(ScenarioError, match="its links would take"):

@@ -16,7 +16,7 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.code_consent import find_user_laws
-from trilat_net.scenario.run_changes import initial_link_tables, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 
 LAW = "tests.laws:Adaptive"
 SHORT: dict[str, Any] = {"duration_s": 0.12, "link.delay_ms": 20.0}
@@ -72,7 +72,7 @@ def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
         {"dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 0.1},
     ]
     changes = [
-        to_core_change(scenario, resolve_change(scenario, initial_link_tables(scenario), order, 10**8))
+        to_core_change(scenario, resolve_change(scenario, LinkTables(scenario.links, ()), order, 10**8))
         for order in orders
     ]
     stream = io.BytesIO()

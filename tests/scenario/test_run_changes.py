@@ -19,7 +19,7 @@ from trilat_net.scenario import (
     load_scenario,
     parse_core_change,
 )
-from trilat_net.scenario.run_changes import initial_link_tables, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 from trilat_net.scenario.scenario_reader import parse_scenario, read_shipped
 
 S = 10**9
@@ -139,7 +139,7 @@ def test_changes_stand_in_the_order_of_their_times() -> None:
 
 
 def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> Any:
-    return resolve_change(scenario, initial_link_tables(scenario), written, from_ns)
+    return resolve_change(scenario, LinkTables(scenario.links, ()), written, from_ns)
 
 
 def test_command_holds_from_its_tick_and_belongs_to_receiver() -> None:

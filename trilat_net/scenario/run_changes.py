@@ -4,7 +4,8 @@ Invariant: a change is completed upon the state before it, and its text in a rec
 every reader derives the same `CoreChange` from it.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -12,16 +13,24 @@ import msgspec
 
 from ..core.ticks import NS_PER_S, CoreChange, LifeOrder
 from ..errors import ScenarioError
+from .delay_models import LinkBase
 from .resolve import resolve_dominance_row, resolve_target
 from .scenario_types import Change, Scenario, SiteOrder
 from .validate import check_change, check_links_memory
 
-LinkTables = dict[str, dict[str, Any]]
 
+class LinkTables(dict[str, dict[str, Any]]):
+    """Every link as a table: first as at the start, then as the timeline and whoever changes one has it."""
 
-def initial_link_tables(scenario: Scenario) -> LinkTables:
-    """Returns every link at the start, as tables."""
-    return {name: msgspec.to_builtins(link) for name, link in scenario.links.items()}
+    def __init__(self, links: Mapping[str, LinkBase], timeline: Sequence[Change]) -> None:
+        super().__init__({name: msgspec.to_builtins(link) for name, link in links.items()})
+        self._planned = deque(change for change in timeline if change.link)
+
+    def advance(self, to_ns: int) -> None:
+        """Makes the changes that the timeline has up to a time, ns since the epoch."""
+        while self._planned and self._planned[0].start_ns <= to_ns:
+            change = self._planned.popleft()
+            self[change.link] = change.to
 
 
 def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int) -> Change:
@@ -115,8 +124,3 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     if change.dominance:
         resolve_dominance_row(change.to, list(scenario.names), change.dominance, "cmd.to")
     return to_core_change(scenario, change)
-
-
-def scheduled_link_tables(scenario: Scenario) -> list[tuple[int, str, dict[str, Any]]]:
-    """Returns the links of the scenario's own timeline: (first stamp, ns, the link, its table)."""
-    return [(change.start_ns, change.link, change.to) for change in scenario.timeline if change.link]
