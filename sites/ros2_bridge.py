@@ -166,7 +166,7 @@ class RobotArm:
         if not whole or len(self._safe) != len(joints) or not all(map(math.isfinite, self._safe)):
             named = ", ".join(called[0] for called in joints)
             raise UsageError(f"--names: `controller` and `safe` have one of each joint: {named}")
-        self._pack = cdr.make_float_array_packer(cdr.ArrayDimension(" ".join(order), len(order)))
+        self._pack = cdr.make_float_array_packer((" ".join(order), len(order)))
         self._commands, self._clock = commands, clock
         self._sender, self._lock = OneSender(clock), threading.Lock()
         self._sent: tuple[int, int] | None = None  # boot and tick of the record whose torque went out last

@@ -141,7 +141,7 @@ class SiteTopics:
         self._pack_states = cdr.JointStatePacker(names).pack
         self._pack_reference = cdr.JointStatePacker(names, effort=False).pack
         peers = scenario.peers(site)
-        self._pack_shares = cdr.make_float_array_packer(cdr.ArrayDimension(" ".join(peers), len(peers)))
+        self._pack_shares = cdr.make_float_array_packer((" ".join(peers), len(peers)))
         self.shares = ShareHistory(scenario, site)
         self._shown: tuple[float, ...] = ()
 

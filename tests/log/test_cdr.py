@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.cdr import (
-    ArrayDimension,
     JointStatePacker,
     RosLogLevel,
     make_float_array_packer,
@@ -106,23 +105,23 @@ def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> No
 
 
 @st.composite
-def arrays(draw: st.DrawFn) -> tuple[list[ArrayDimension], list[float]]:
-    dimensions = draw(st.lists(st.builds(ArrayDimension, words, st.integers(0, 3)), max_size=3))
-    count = math.prod(dimension.size for dimension in dimensions)
+def arrays(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
+    dimensions = draw(st.lists(st.tuples(words, st.integers(0, 3)), max_size=3))
+    count = math.prod(size for _, size in dimensions)
     return dimensions, draw(st.lists(floats, min_size=count, max_size=count))
 
 
 @given(arrays())
-def test_arrays_are_read_as_they_were_written(case: tuple[list[ArrayDimension], list[float]]) -> None:
+def test_arrays_are_read_as_they_were_written(case: tuple[list[tuple[str, int]], list[float]]) -> None:
     dimensions, numbers = case
     data = make_float_array_packer(*dimensions)(*numbers)
-    strides = [math.prod(d.size for d in dimensions[n:]) for n in range(len(dimensions))]
+    strides = [math.prod(size for _, size in dimensions[n:]) for n in range(len(dimensions))]
     for message in (decoded(cdr.FLOAT64_ARRAY, data), by_rosbags(cdr.FLOAT64_ARRAY, data)):
         assert bits(message.data) == bits(numbers)
         shape = [(d.label, d.size, d.stride) for d in message.layout.dim]
         assert shape == [(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
     one = type_of("std_msgs/msg/MultiArrayDimension")
-    dims = [one(d.label, d.size, stride) for d, stride in zip(dimensions, strides, strict=True)]
+    dims = [one(*d, stride) for d, stride in zip(dimensions, strides, strict=True)]
     layout = type_of("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
     own = type_of(cdr.FLOAT64_ARRAY)(layout=layout, data=np.array(numbers))
     assert data == serialized(cdr.FLOAT64_ARRAY, own)

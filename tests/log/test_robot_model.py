@@ -14,11 +14,10 @@ from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.robot_model import (
     SPACING_M,
     RobotModel,
-    build_robot_model,
     multiply_quaternions,
     rotate_vector,
 )
-from trilat_net.log.ros2.ros2_messages import ROBOT_CHANNELS
+from trilat_net.log.ros2.ros2_messages import ROBOT_CHANNELS, Ros2SiteChannels
 from trilat_net.scenario import Scenario, parse_scenario
 
 POSES = {"arm6": [0.3, -1.0, 1.2, -0.6, 0.5, 0.2], "arm7": [0.1, 0.2, 0.0, -1.5, 0.1, 1.6, 0.2]}
@@ -40,7 +39,7 @@ def end_of(model: RobotModel, q) -> tuple:
 
 @pytest.mark.parametrize("arm", POSES)
 def test_last_frame_is_where_pinocchio_has_end_of_arm(arm):
-    model = build_robot_model(scenario(arm), "m")
+    model = RobotModel(scenario(arm), "m")
     reference = chain_references()[arm]
     assert model.frames[-1][1] == f"m/{reference_tip(arm)}"
     for state in reference.states:
@@ -59,14 +58,14 @@ def reference_tip(arm: str) -> str:
 
 @pytest.mark.parametrize("down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
 def test_bases_stand_apart_and_gravity_points_down(down):
-    models = [build_robot_model(scenario(down=str([*down])), site) for site in ("m", "s")]
+    models = [RobotModel(scenario(down=str([*down])), site) for site in ("m", "s")]
     (m, turned), (s, _) = (model.transforms(POSES["arm6"])[0] for model in models)
     assert math.dist(m, s) == SPACING_M
     assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx((0, 0, -1))
 
 
 def test_a_message_is_read_by_the_decoder_of_ros():
-    model = build_robot_model(scenario(), "m")
+    model = RobotModel(scenario(), "m")
     schema = Schema(id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS])
     q = POSES["arm6"]
     message = DecoderFactory().decoder_for("cdr", schema)(model.pack(5_000_000_007, q))
@@ -79,7 +78,7 @@ def test_a_message_is_read_by_the_decoder_of_ros():
 
 
 def test_the_robot_description_has_the_links_and_shapes():
-    root = ElementTree.fromstring(build_robot_model(scenario(), "s").description)
+    root = ElementTree.fromstring(RobotModel(scenario(), "s").description)
     given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
     names = [link.get("name") for link in root.findall("link")]
     assert names == [f"s/{link.get('name')}" for link in given.findall("link")]
@@ -94,7 +93,7 @@ def test_end_of_every_unlike_arm_is_where_its_site_says():
 
     unlike = load_scenario("unlike_arms")
     for n, (site, spec) in enumerate(unlike.sites.items()):
-        model = build_robot_model(unlike, site)
+        model = RobotModel(unlike, site)
         at, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
         for origin, own in model.transforms(spec.q0_rad):
             at = np.add(at, rotate_vector(turned, origin))
@@ -107,4 +106,4 @@ def test_end_of_every_unlike_arm_is_where_its_site_says():
 def test_planar_arms_alone_have_no_model():
     from trilat_net.scenario import load_scenario
 
-    assert build_robot_model(load_scenario("two_sites"), "m") is None
+    assert Ros2SiteChannels(load_scenario("two_sites"), "m").robot is None

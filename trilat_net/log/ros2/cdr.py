@@ -101,16 +101,12 @@ class TransformPacker:
         return self._pack(_HEAD, len(self._names), *fields)
 
 
-class ArrayDimension(NamedTuple):
-    """One dimension of an array: its label and its size."""
+def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
+    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers row by row.
 
-    label: str
-    size: int
-
-
-def make_float_array_packer(*dimensions: ArrayDimension) -> Callable[..., bytes]:
-    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers row by row."""
-    sizes = [dimension.size for dimension in dimensions]
+    Each dimension is a label and a size.
+    """
+    sizes = [size for _, size in dimensions]
     layout: list[int | str] = []
     for n, (label, size) in enumerate(dimensions):
         layout += label, size, math.prod(sizes[n:])

@@ -139,11 +139,6 @@ class RobotModel:
         return self._packer.pack(stamp_ns, numbers)
 
 
-def build_robot_model(scenario: Scenario, site: str) -> RobotModel | None:
-    """Returns the model of a site's arm, or None where arms are planar ones alone."""
-    return RobotModel(scenario, site) if scenario.arms[site].chain is not None else None
-
-
 def _turned(rpy: Sequence[float]) -> Quaternion:
     roll, pitch, yaw = rpy
     turned = multiply_quaternions(_about((0.0, 0.0, 1.0), yaw), _about((0.0, 1.0, 0.0), pitch))

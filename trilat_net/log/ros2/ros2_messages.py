@@ -24,7 +24,7 @@ from ...scenario.arms import TASK_AXES
 from ..mcap_writer import McapWriter
 from ..site_log import find_task_errors
 from . import cdr
-from .robot_model import build_robot_model
+from .robot_model import RobotModel
 
 EVENTS, LINES = "events", "log"
 """Channels of a whole session: events as plain text, and as lines with a time and a level."""
@@ -96,9 +96,7 @@ class ArrayChannel:
         labels = [f"{content}: {' '.join(axis)}" if not n else " ".join(axis) for n, axis in enumerate(axes)]
         labels[-1] += f" ({unit})"
         self.size = math.prod(map(len, axes))
-        self.pack = cdr.make_float_array_packer(
-            *(cdr.ArrayDimension(*one) for one in zip(labels, map(len, axes), strict=True))
-        )
+        self.pack = cdr.make_float_array_packer(*zip(labels, map(len, axes), strict=True))
 
 
 class Ros2SiteChannels:
@@ -120,7 +118,7 @@ class Ros2SiteChannels:
         shared, axes = arm.counts.shared, TASK_AXES[: arm.counts.shared]
         self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 4 * n + shared)
         self.slow_row = slice(4 * n + shared, None)
-        self.robot = build_robot_model(scenario, site)
+        self.robot = RobotModel(scenario, site) if arm.chain is not None else None
         self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
         labels = ["_".join(name.split()) for name in self.joints]
         parameters = ["_".join(name.split()) for name, _ in arm.parameters]
