@@ -64,7 +64,7 @@ def chain_references() -> dict[str, ChainReference]:
     """Chains by name: random1, random2, random3, arm6, arm7, random12."""
     return {
         name: ChainReference(
-            to_chain(name, entry),
+            to_chain(entry),
             [
                 ChainState(**{key: np.array(value) for key, value in state.items()})
                 for state in entry["states"]
@@ -74,7 +74,7 @@ def chain_references() -> dict[str, ChainReference]:
     }
 
 
-def to_chain(name: str, entry: dict) -> UrdfChain:
+def to_chain(entry: dict) -> UrdfChain:
     """A chain from plain numbers, without limits and friction."""
     joints = [
         UrdfJoint(
@@ -90,7 +90,7 @@ def to_chain(name: str, entry: dict) -> UrdfChain:
         for joint in entry["joints"]
     ]
     tip_rotation, tip_origin_m = _rows(entry["tip_rotation"]), tuple(entry["tip_origin_m"])
-    return UrdfChain(name, "base", "tip", tuple(joints), tip_rotation, tip_origin_m, ())
+    return UrdfChain("base", "tip", tuple(joints), tip_rotation, tip_origin_m, ())
 
 
 def _rows(matrix: list) -> tuple:

@@ -136,8 +136,8 @@ def main() -> None:
         "arm7": shipped_chain("arm7"),
         "random12": random_chain(random, 12, sliders=(6,)),
     }
-    for name, entry in chains.items():
-        chain = to_chain(name, entry)
+    for entry in chains.values():
+        chain = to_chain(entry)
         model = build_model(chain)
         entry["states"] = []
         for i in range(STATES):

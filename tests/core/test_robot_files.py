@@ -266,7 +266,7 @@ def test_the_core_agrees_on_random_chains(seed: int, sliders: list[bool]) -> Non
     random = np.random.default_rng(seed)
     n = len(sliders)
     entry = random_chain(random, n, tuple(i for i in range(n) if sliders[i]))
-    chain = to_chain("random", entry)
+    chain = to_chain(entry)
     state = random_state(random, n, weight=False)
     check_core(chain, ChainState(**state | answer(build_model(chain), chain, state)))
 

@@ -100,7 +100,6 @@ class UrdfChain(NamedTuple):
     """An arm: the joints that move between a base and an end link, and where that one is.
 
     Attributes:
-        name: the robot.
         base: the link that does not move.
         tip: the end link.
         joints: 1 to `MAX_JOINTS` of them, from the base on.
@@ -109,7 +108,6 @@ class UrdfChain(NamedTuple):
         notes: what was taken otherwise than the file may have meant, a sentence each.
     """
 
-    name: str
     base: str
     tip: str
     joints: tuple[UrdfJoint, ...]
@@ -167,8 +165,7 @@ def read_urdf(text: str, base: str = "", tip: str = "", payload: UrdfPayload | N
     Raises:
         ScenarioError: the problem, with the line, link or joint.
     """
-    root = _parse_xml(text)
-    robot = _read_tree(root)
+    robot = _read_tree(_parse_xml(text))
     base = _check_end(robot, "base", base) or _find_base(robot)
     tip = _check_end(robot, "tip", tip) or _find_tip(robot, base)
     path = _find_path(robot, base, tip)
@@ -184,7 +181,7 @@ def read_urdf(text: str, base: str = "", tip: str = "", payload: UrdfPayload | N
                 bodies.append(_read_payload(payload, path[n + 1 :]))
             joints.append(_read_joint(edge, pose, _lump_bodies(edge, bodies), notes))
             pose = _Pose()
-    return UrdfChain(root.get("name", ""), base, tip, tuple(joints), *pose, tuple(notes))
+    return UrdfChain(base, tip, tuple(joints), *pose, tuple(notes))
 
 
 def _refuse(place: str, problem: str) -> NoReturn:
