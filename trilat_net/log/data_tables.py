@@ -174,12 +174,6 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
     return docs
 
 
-def add_unit_suffix(stem: str, unit: str) -> str:
-    """Returns a column's name: the stem, and its unit unless that is named already."""
-    suffix = UNIT_SUFFIXES.get(unit, "")
-    return stem if not suffix or stem == suffix or stem.endswith(f"_{suffix}") else f"{stem}_{suffix}"
-
-
 def to_int_array(values: Iterable[int], source: str, field: str, kind: Any = np.int64) -> NDArray[Any]:
     """Returns whole numbers as an array of type `kind`."""
     try:
@@ -225,8 +219,11 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 def _make_number_column(
     site: SiteLog, field: str, n: int, stem: str, unit: str, text: str, known: NDArray[np.bool_] | None = None
 ) -> Column:
+    suffix = UNIT_SUFFIXES.get(unit, "")
+    if suffix and stem != suffix and not stem.endswith(f"_{suffix}"):  # else it is named already
+        stem = f"{stem}_{suffix}"
     values = np.ascontiguousarray(getattr(site, field)[:, n])
-    return Column(add_unit_suffix(stem, unit), values, unit, text, f"{field}[{n}]", known)
+    return Column(stem, values, unit, text, f"{field}[{n}]", known)
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:

@@ -116,11 +116,6 @@ class LogWriter:
         return channels
 
     @property
-    def keys(self) -> tuple[str, ...]:
-        """Keys of the messages that have a channel in the file."""
-        return tuple(key for key, channel in self._channels.items() if channel is not None)
-
-    @property
     def ended(self) -> bool:
         """True once nothing more can be added: it is finished, or the disk refused."""
         return bool(self._ended)

@@ -106,8 +106,7 @@ class Ros2SiteChannels:
         joints: names of its joints: those of its file, or numbered ones of a planar arm.
         arrays: the channels that are arrays, by the last part of their topic.
         task: the names of those that stand for the end effector, in task space; else ().
-        joint_row: of a row of `stack_signals` the joints: q, q_des, qd, tau.
-        error_row: the error e = q - q_des, Eq. (9).
+        error_row: of a row of `stack_signals`, behind the joints, the error e = q - q_des, Eq. (9).
         slow_row: the rest: tau_x, theta_hat, what the law sends, mode.
         robot: the arm for viewers, or None where arms are planar ones alone.
     """
@@ -116,8 +115,7 @@ class Ros2SiteChannels:
         arm, self._peers = scenario.arms[site], scenario.peers(site)
         self._arm, n, peers = arm, arm.counts.joints, self._peers
         shared, axes = arm.counts.shared, TASK_AXES[: arm.counts.shared]
-        self.joint_row, self.error_row = slice(0, 4 * n), slice(4 * n, 4 * n + shared)
-        self.slow_row = slice(4 * n + shared, None)
+        self.error_row, self.slow_row = slice(4 * n, 4 * n + shared), slice(4 * n + shared, None)
         self.robot = RobotModel(scenario, site) if arm.chain is not None else None
         self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
         labels = ["_".join(name.split()) for name in self.joints]
