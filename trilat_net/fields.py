@@ -23,21 +23,17 @@ from .errors import ScenarioError
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Immutable; unknown keys are refused."""
 
-    @classmethod
-    def is_kind(cls) -> bool:
-        """True if a scenario can name it by its tag, and it is no base of others."""
-        return cls.__struct_config__.tag not in (None, cls.__name__)
-
 
 K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the kinds of a base that the files of its package define, by file and place there."""
+    """Yields the kinds of a base, named by a tag, that the files of its package define, by file and place."""
     for found in pkgutil.iter_modules(import_module(package).__path__):
         module = f"{package}.{found.name}"
         for one in vars(import_module(module)).values():
-            if isinstance(one, type) and issubclass(one, base) and one.__module__ == module and one.is_kind():
+            own = isinstance(one, type) and issubclass(one, base) and one.__module__ == module
+            if own and one.__struct_config__.tag not in (None, one.__name__):  # else it is a base of others
                 yield one
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 
-from ..errors import UsageError
+from ..errors import TrilatError, UsageError
 from ..reporting import terminal_output as terminal
 
 if TYPE_CHECKING:
@@ -87,7 +87,6 @@ def complete_figures(incomplete: str) -> list[str]:
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
     """Returns what a shell completes to a site: those of the scenario or the log that was named before."""
-    from ..errors import TrilatError
     from ..log.log_reader import open_log
     from ..scenario import load_scenario
 
