@@ -2,8 +2,7 @@
 
 Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append or a short
 reply; what reads it raises nothing. Messages wait in bounded rings until the loop polls them; on overflow the
-oldest is dropped. Stamped rings count the loss; elsewhere the receiver sees it in the tick numbers. Only the
-recorder takes callbacks.
+oldest is dropped, which the receiver sees in the numbers of the messages. Only the recorder takes callbacks.
 
 `zenoh_bus` implements it.
 """
@@ -11,7 +10,6 @@ recorder takes callbacks.
 import re
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
@@ -33,14 +31,8 @@ Inbox = PolledRing[tuple[str, bytes]]
 """Messages: (key, payload)."""
 PresenceInbox = PolledRing[tuple[str, bool]]
 """Liveliness changes: (key, whether it is alive now)."""
-
-
-class StampedInbox(PolledRing[tuple[Polled, int]], Protocol[Polled]):
-    """Messages with the instants of their arrival: (what was read, ns)."""
-
-    @property
-    def overflowed(self) -> int:
-        """Number of messages that the full ring has dropped, oldest first."""
+StampedInbox = PolledRing[tuple[Polled, int]]
+"""Messages with the instants of their arrival: (what was read, ns)."""
 
 
 class Query(Protocol):
@@ -131,30 +123,14 @@ class BoundedRing(Generic[T]):
         return self._entries.popleft() if self._entries else None
 
 
-class StampingRing(Generic[T]):
-    """The `StampedInbox` of every bus; `take` may run in another thread than `poll`.
-
-    Every message taken is polled, waits, or is counted in `overflowed`.
-    """
+class StampingRing(BoundedRing[tuple[T, int]]):
+    """The `StampedInbox` of every bus; `take` may run in another thread than `poll`."""
 
     def __init__(self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int) -> None:
-        self.overflowed = 0
-        self._now_ns, self._read, self._capacity = now_ns, read, capacity
-        self._entries: deque[tuple[T, int]] = deque()
+        super().__init__(capacity)
+        self._now_ns, self._read = now_ns, read
 
     def take(self, payload: bytes) -> None:
         """Stamps a message, reads it and appends it."""
         now_ns = self._now_ns()
         self._entries.append((self._read(payload), now_ns))
-        # not `maxlen`: a full deque cannot distinguish what it drops from what `poll` has just taken
-        if len(self._entries) > self._capacity:
-            with suppress(IndexError):  # `poll` has emptied it since the line before
-                self._entries.popleft()
-                self.overflowed += 1
-
-    def poll(self) -> tuple[T, int] | None:
-        """See `StampedInbox`."""
-        try:  # an exception costs ten times a look
-            return self._entries.popleft() if self._entries else None
-        except IndexError:  # `take` has dropped it since the look
-            return None
