@@ -75,27 +75,26 @@ def joint_states(draw: st.DrawFn) -> SimpleNamespace:
     row = st.lists(floats, min_size=len(names), max_size=len(names))
     return SimpleNamespace(
         stamp_ns=draw(stamps_ns),
-        frame_id=draw(words),
         names=names,
         position=draw(row),
         velocity=draw(row) if velocity else [],
         effort=draw(row) if effort else [],
-        packer=lambda frame_id: JointStatePacker(names, frame_id, velocity=velocity, effort=effort),
+        packer=JointStatePacker(names, velocity=velocity, effort=effort),
     )
 
 
 @given(joint_states())
 def test_joint_states_are_read_as_they_were_written(case: SimpleNamespace) -> None:
-    data = case.packer(case.frame_id).pack(case.stamp_ns, case.position, case.velocity, case.effort)
+    data = case.packer.pack(case.stamp_ns, case.position, case.velocity, case.effort)
     for message in (decoded(cdr.JOINT_STATE, data), by_rosbags(cdr.JOINT_STATE, data)):
         stamp = message.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == case.stamp_ns
-        assert (message.header.frame_id, list(message.name)) == (case.frame_id, case.names)
+        assert (message.header.frame_id, list(message.name)) == ("", case.names)
         assert bits(message.position) == bits(case.position)
         assert bits(message.velocity) == bits(case.velocity)
         assert bits(message.effort) == bits(case.effort)
     own = type_of(cdr.JOINT_STATE)(
-        header=header(case.stamp_ns, case.frame_id),
+        header=header(case.stamp_ns, ""),
         name=case.names,
         position=np.array(case.position),
         velocity=np.array(case.velocity),

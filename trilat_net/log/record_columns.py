@@ -21,7 +21,6 @@ from ..net.messages import MODES, READABLE, Stamp, State, TickNumber
 from ..net.wire import MAX_BYTES, decode
 
 Ints = NDArray[np.int64]
-Strings = NDArray[np.object_]
 
 _MODE: Any = Literal.__getitem__(tuple(MODES))
 _TYPES: dict[str, Any] = {
@@ -75,7 +74,7 @@ def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> d
     return {field: part.copy() for field, part in zip(fields, parts, strict=True)}
 
 
-def decode_strings(payloads: Sequence[bytes], field: str) -> Strings:
+def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]:
     """Returns a word, or another object, of every record, shape (K,)."""
     return _to_array(payloads, _decode_fields(payloads, field), np.object_, len(payloads))
 

@@ -19,7 +19,6 @@ from ..fields import Joints, KeyProblem, NotNegative, Positive, Real, check_keys
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 LeastMost = Annotated[tuple[Real, ...], Meta(min_length=2, max_length=2)]
 
-_WHERE = ("from_s", "to_s", "site")
 ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 """Quantities of all sites together."""
 
@@ -78,7 +77,7 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
 
 _WINDOW_KEYS = field_names(ExpectWindow)
-_QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in _WHERE)
+_QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in ("from_s", "to_s", "site"))
 _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 

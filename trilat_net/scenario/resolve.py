@@ -50,7 +50,6 @@ from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
 _TABLES = (*SITE_GROUPS, "control", "link", *(key for key in field_names(Scenario) if key not in _TOP))
-_SITE = field_names(SiteSpec)
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
 _DEFAULT_SEED = 1
@@ -209,7 +208,7 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
                 f"and not {_RESERVED[0]!r}",
                 path=path,
             )
-        written[name] = check_keys(table, _SITE, path)
+        written[name] = check_keys(table, field_names(SiteSpec), path)
         groups[name] = {}
         for group, kind in SITE_GROUPS.items():
             own = check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}")

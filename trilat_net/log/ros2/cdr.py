@@ -57,10 +57,8 @@ def _format_floats(offset: int, count: int) -> tuple[str, int]:
 class JointStatePacker:
     """Packer of `sensor_msgs/msg/JointState` with these joints, with or without velocities and efforts."""
 
-    def __init__(
-        self, names: Sequence[str], frame_id: str = "", *, velocity: bool = True, effort: bool = True
-    ) -> None:
-        self._names = _pack_fields(8, frame_id, len(names), *names)  # after the stamp
+    def __init__(self, names: Sequence[str], *, velocity: bool = True, effort: bool = True) -> None:
+        self._names = _pack_fields(8, "", len(names), *names)  # after the stamp; of no frame
         self._counts = [len(names) * present for present in (True, velocity, effort)]
         form, offset = f"<4siI{len(self._names)}s", 8 + len(self._names)
         for count in self._counts:

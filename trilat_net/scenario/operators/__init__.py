@@ -107,15 +107,12 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
 
 
-_TIME = "a time of at least 0 s"
-_ANGLES = "one angle for {joints}, rad"
-_POINT = "{axes}, m"
 _GAIN = "one number for {joints}, at least 0"
 ROW_WORDS = "[time in s, torque on {each} in N m]"
 WORDS = {
-    **dict.fromkeys(("start_s", "end_s", "move_start_s", "move_end_s"), _TIME),
-    **dict.fromkeys(("from_rad", "to_rad"), _ANGLES),
-    **dict.fromkeys(("from_m", "to_m", "point_m"), _POINT),
+    **dict.fromkeys(("start_s", "end_s", "move_start_s", "move_end_s"), "a time of at least 0 s"),
+    **dict.fromkeys(("from_rad", "to_rad"), "one angle for {joints}, rad"),
+    **dict.fromkeys(("from_m", "to_m", "point_m"), "{axes}, m"),
     **dict.fromkeys(("peak_nm", "amplitude_nm"), "one torque for {joints}, ON the arm, N m"),
     "stiffness_nm_rad": f"{_GAIN}, N m/rad",
     "damping_nm_s_rad": f"{_GAIN}, N m s/rad",
