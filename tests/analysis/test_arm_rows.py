@@ -95,15 +95,14 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
     written = Arm(l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25)
     model = build_arm(written, Task(), {}, chains=True)
     assert model.chain is not None
-    plane = PlanarArmRows(written.theta, 9.81, (0.8, 0.6))
+    theta = build_arm(written, Task(), {}, chains=False).theta
+    plane = PlanarArmRows(theta, 9.81, (0.8, 0.6))
     chain = ChainArmRows(model.theta, model.chain)
     q, qd, v, a = drawn(2)
     np.testing.assert_allclose(plane.gravity_torque(q), chain.gravity_torque(q), atol=1e-12)
     np.testing.assert_allclose(plane.multiply_inertia(q, a), chain.multiply_inertia(q, a), atol=1e-12)
     theirs = chain.law_torque(model.theta[np.newaxis], q, qd, v, a)
-    np.testing.assert_allclose(
-        plane.law_torque(np.tile(written.theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12
-    )
+    np.testing.assert_allclose(plane.law_torque(np.tile(theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12)
     ours, theirs = plane.place_end_effector(q, qd), chain.place_end_effector(q, qd)
     np.testing.assert_allclose(ours.at, theirs.at[:, :2], atol=1e-12)
     np.testing.assert_allclose(ours.J, theirs.J[:, :2], atol=1e-12)

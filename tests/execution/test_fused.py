@@ -139,8 +139,8 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     for key in TOTALS:
         assert found[key] == (whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)), key
     squares = []
-    for site, spec in scenario.sites.items():
-        q, tau, theta = log[site].q, log[site].tau, spec.arm.theta
+    for site in scenario.names:
+        q, tau, theta = log[site].q, log[site].tau, scenario.arms[site].theta
         outer = 9.81 * theta[4] * np.cos(q[:, 0] + q[:, 1])
         gravity = np.stack((9.81 * theta[3] * np.cos(q[:, 0]) + outer, outer), axis=1)
         squares.append(np.mean((tau - gravity) ** 2))

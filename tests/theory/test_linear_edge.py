@@ -32,7 +32,7 @@ def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float
     The equations of a mode v of M and of an eigenvalue -share of alpha on the imaginary axis.
     """
     rest = predict_equilibrium(scenario)
-    theta = scenario.sites["s"].arm.theta
+    theta = scenario.arms["s"].theta
     found = []
     for mass in eigvalsh(np.array(inertia(theta, rest.q[0]))):
 

@@ -421,7 +421,7 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Returns the groups of sites that shares connect, at any time and in either direction."""
     joined = scenario.alpha.copy()
     for change in scenario.timeline:
-        for peer, share in (change.shares if change.dominance else {}).items():
+        for peer, share in (change.to if change.dominance else {}).items():
             joined[scenario.names.index(change.dominance), scenario.names.index(peer)] += share
     reach = find_reach(joined + joined.T)
     return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}]

@@ -45,7 +45,7 @@ class AppliedChange(NamedTuple):
             )
         if self.change.link:
             return self.change.after.describe()
-        shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.shares.items() if share)
+        shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.to.items() if share)
         return f"{shares} within {self.change.ramp_s:g} s" if self.change.ramp_s else shares
 
 

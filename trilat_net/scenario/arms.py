@@ -99,16 +99,6 @@ class Arm(fields.Frozen, frozen=True):
     armature_kg_m2: fields.NotNegativeJoints = (0.0,)
     stops: bool = True
 
-    @property
-    def links(self) -> ArmLinks:
-        """The two links of the planar arm."""
-        return ArmLinks(**{name: getattr(self, name) for name in ArmLinks._fields})
-
-    @property
-    def theta(self) -> Array:
-        """True parameters of the planar arm, Eq. (24), shape (5,)."""
-        return theta_from_links(self.links)
-
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
 """The keys of an arm that place it in space."""
@@ -272,7 +262,7 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
     """
     if arm.urdf:
         return _chain_model(arm, task, read_arm(arm, urdf))
-    theta = arm.theta
+    theta = theta_from_links(ArmLinks(*(getattr(arm, name) for name in ArmLinks._fields)))
     if not is_positive_definite(theta):
         raise ScenarioError(
             "its inertia matrix is singular in some pose: give the links mass away from their joints"

@@ -95,7 +95,7 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
     if change.order:
         return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
     if change.dominance:
-        return CoreChange(text, ramp=scenario.ramp(site, change.shares, change.start_ns, change.ramp_s))
+        return CoreChange(text, ramp=scenario.ramp(site, change.to, change.start_ns, change.ramp_s))
     peer = scenario.peers(site).index(change.link.partition("->")[0])
     return CoreChange(text, peer=peer, model=change.after.core(change.start_ns))
 

@@ -198,11 +198,6 @@ class Change(Frozen, frozen=True, omit_defaults=True):
         """The link from then on."""
         return msgspec.convert(self.to, Link)
 
-    @property
-    def shares(self) -> dict[str, float]:
-        """The dominance factors at the end of the change."""
-        return self.to
-
 
 def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
     """Yields the later states of a link, each with its first stamp, ns, in order."""
@@ -504,7 +499,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
         """Returns the changes of a site's dominance factors on the timeline, as the core has them."""
         changes = [change for change in self.timeline if change.dominance == site]
-        return [self.ramp(site, one.shares, one.start_ns, one.ramp_s) for one in changes]
+        return [self.ramp(site, one.to, one.start_ns, one.ramp_s) for one in changes]
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without operators."""

@@ -12,6 +12,7 @@ from tests.analysis.logs import rewritten
 from tests.theory.delay_equations import inertia, regressor, theta_of
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.port_energy import held_work, trapezoid_work
+from trilat_net.scenario.arms import build_arm
 
 from .written import pair, simulated, under
 
@@ -148,7 +149,8 @@ def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
 
 
 def _pd(spec, part, e, ed):
-    gravity = _regressed(spec, part, 0.0 * e, 0.0 * e, spec.arm.theta * spec.control.gravity)
+    theta = build_arm(spec.arm, spec.task, {}, chains=False).theta
+    gravity = _regressed(spec, part, 0.0 * e, 0.0 * e, theta * spec.control.gravity)
     Kd = np.array(getattr(spec.control, "Kd", (0.0, 0.0)))
     return gravity - np.array(spec.control.K) * e - Kd * ed - np.array(spec.control.d) * part.qd
 

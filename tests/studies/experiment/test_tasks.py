@@ -82,7 +82,7 @@ def test_after_a_handover_the_second_user_alone_leads(tmp_path: Path) -> None:
     for planned, row, log in zip(done.plan.trials, rows, open_logs(done), strict=True):
         (change,), appears_s = log.scenario.timeline, find_appearance_s(done, planned)
         assert (change.at_s, change.ramp_s) == (appears_s + 3.0, 1.0)
-        assert (log.scenario.dominance["s"], change.shares) == (
+        assert (log.scenario.dominance["s"], change.to) == (
             {"m1": 1.0, "m2": 0.0},
             {"m1": 0.0, "m2": 1.0},
         )

@@ -46,9 +46,9 @@ def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str
         if site.control.plugged:
             assert getattr(site.control, "gravity", 0.95) == 0.95
             continue
-        known = site.control.gains(site.arm.theta)
+        known = site.control.gains(found.arms[name].theta)
         first = known.known if np.any(known.known) else known.theta_hat0
-        assert first[3:] == pytest.approx(0.95 * site.arm.theta[3:])
+        assert first[3:] == pytest.approx(0.95 * found.arms[name].theta[3:])
     with_same_control = {name: site.control for name, site in found.sites.items()}
     assert found.links == experiment.scenario.links
     assert len(with_same_control) == len(experiment.scenario.names)
@@ -145,7 +145,7 @@ SHARES = st.floats(50.0, 150.0)
 def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
     """Otherwise V' <= 0 does not stand, and a law would be searched where it cannot work."""
     scenario, knowledge = trio(), build_model_information(percent)
-    truth = scenario.sites["s"].arm.theta
+    truth = scenario.arms["s"].theta
     low, high = knowledge.box_sides(scenario, "s")
     assert (np.array(low) < truth).all()
     assert (np.array(high) > truth).all()
