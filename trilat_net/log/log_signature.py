@@ -8,9 +8,8 @@ nothing else. Only a file that agrees with its chain is signed.
 import base64
 import json
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +27,6 @@ from .running_digest import DIGESTS, DigestState, Integrity
 SUFFIX = ".sig"
 """Ending of a signature's file, behind the whole name of the log."""
 _FORMAT = "trilat-net log signature 1"
-_LOADERS: dict[Any, Callable[[bytes], object]] = {
-    Ed25519PrivateKey: partial(serialization.load_pem_private_key, password=None),
-    Ed25519PublicKey: serialization.load_pem_public_key,
-}
 _MOST_BYTES = 65_536
 """Of a key, and of a signature's file."""
 
@@ -174,7 +169,10 @@ def _load_key(path: Path, kind: Any, wanted: str) -> Any:
         data = stream.read(_MOST_BYTES)
     key: object = None
     with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
-        key = _LOADERS[kind](data)
+        if kind is Ed25519PrivateKey:
+            key = serialization.load_pem_private_key(data, password=None)
+        else:
+            key = serialization.load_pem_public_key(data)
     if not isinstance(key, kind):
         raise UsageError(f"{path}: is no {wanted}")
     return key
