@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from trilat_net.errors import SessionError
 from trilat_net.net import topics
-from trilat_net.net.membership import LATE_GATHER_NS, Epoch
+from trilat_net.net.membership import Epoch
+from trilat_net.net.session import LATE_GATHER_NS
 
 from .parties import STEP_NS, Party
 

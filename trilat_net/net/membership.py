@@ -267,10 +267,6 @@ class Membership:
             self._publisher.publish("refused", text, about=info.member)
 
 
-LATE_GATHER_NS = 1_500_000_000
-"""Time to wait for the other members of a running session after the first one is met."""
-
-
 class Epoch(NamedTuple):
     """Tick 0 of a session, and the first tick of a site that joins late.
 

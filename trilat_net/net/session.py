@@ -18,15 +18,7 @@ from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import (
-    LATE_GATHER_NS,
-    Epoch,
-    EventPublisher,
-    LateSites,
-    Membership,
-    liveliness_token,
-    read_messages,
-)
+from .membership import Epoch, EventPublisher, LateSites, Membership, liveliness_token, read_messages
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
@@ -34,6 +26,8 @@ EPOCH_AHEAD_NS = 500_000_000
 """Time from the announcement of an epoch to the epoch, without two round trips."""
 DECIDE_NS = 150_000_000
 """Time before the epoch by which every reply must have arrived, without a round trip."""
+LATE_GATHER_NS = 1_500_000_000
+"""Time to wait for the other members of a running session after the first one is met."""
 
 
 class SessionJoin:
