@@ -11,14 +11,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.vectors import Array
 from ..log.record_columns import Ints
 from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 
 Rows = slice | Ints
-Bools = NDArray[np.bool_]
 _LEAST_EIGENVALUE = 1e-12
 """Below this an eigenvalue of J J' is of an axis along which the end effector cannot move at all."""
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..core.session_life import HELD_OVERRUN_TICKS
 from ..core.ticks import find_alarm
-from ..errors import LogError
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..net.messages import MODES, ModeMeaning
@@ -81,10 +80,7 @@ def list_changes(log: Log) -> list[AppliedChange]:
     for site in log.sites:
         log.commands(site)  # refuses what is no change of that site's
         for tick, texts in log.changes(site).items():
-            try:
-                found += [AppliedChange(msgspec.json.decode(t, type=Change), site, tick) for t in texts]
-            except msgspec.MsgspecError as error:
-                raise LogError(f"{log.source}: a record names a change that is none: {error}") from None
+            found += [AppliedChange(msgspec.json.decode(text, type=Change), site, tick) for text in texts]
     before_s = recorded_end_s(log)
     kept = (c for c in found if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS)
     return sorted(kept, key=lambda changed: changed.change.at_s)

@@ -167,11 +167,11 @@ class RunningEnergy:
             return None
         windows = self._windows
         end_s = min(complete[site] / windows[site].rate_hz for site in windows)
+        oldest_s = max(window.first / window.rate_hz for window in windows.values())
         if self._done_s is None:
-            self._done_s = max(window.first / window.rate_hz for window in windows.values())
+            self._done_s = oldest_s
         if end_s - self._done_s < STEP_S:
             return None
-        oldest_s = max(window.first / window.rate_hz for window in windows.values())
         begin_s = max(self._done_s, oldest_s)
         end_s = min(end_s, begin_s + LONGEST_STEP_S)
         self._done_s = end_s
