@@ -7,7 +7,6 @@ simulation supplies starting values only.
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -49,50 +48,6 @@ _MAX_HALVINGS = 20
 _SETTLING_TICKS = 20_000
 _FLAT = 1e-8
 """A singular value this small, relative to the largest, belongs to a direction of further equilibria."""
-
-
-class EquilibriumRun(NamedTuple):
-    """The end of a run: its time, s, its largest joint speed in the last second, rad/s, and the pose.
-
-    Attributes:
-        at_rest: True if it ended at an equilibrium; otherwise the pose is the mean over its last quarter.
-        diverged: True if a site left its limits.
-        q: joint angles, shape (N, n), rad; of shorter arms followed by zeros.
-        theta_hat: estimates, shape (N, P), so as well; of a law of one's own its memory.
-    """
-
-    t_s: float
-    speed_rad_s: float
-    at_rest: bool
-    diverged: bool
-    q: Array
-    theta_hat: Array
-
-
-def run_to_equilibrium(scenario: Scenario) -> EquilibriumRun:
-    """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration.
-
-    Raises:
-        ScenarioError: virtual time cannot run it.
-    """
-    ticks = sum(map(scenario.ticks, scenario.names))
-    most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
-    run = FusedRun(prolong_scenario(scenario, most_s))
-    until_s = scenario.duration_s
-    while True:
-        states = run.advance_watching(until_s)
-        speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
-        if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
-            break
-        until_s *= 2.0
-    diverged = run.diverged_s is not None
-    at_rest = not diverged and speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
-    q, theta_hat = (run.q, run.theta_hat) if at_rest else (values.mean(axis=0) for values in states)
-    laws = [spec.control for spec in scenario.sites.values()]
-    if any(isinstance(law, ImportedLaw) for law in laws):
-        rows = zip(laws, theta_hat, run.memories, strict=True)
-        theta_hat = pad_rows([own if isinstance(law, ImportedLaw) else row for law, row, own in rows])
-    return EquilibriumRun(run.ran_s, speed_rad_s, at_rest, diverged, q, theta_hat)
 
 
 def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
@@ -389,18 +344,32 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
-    end = run_to_equilibrium(scenario)
-    if end.diverged:
+    """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration."""
+    ticks = sum(map(scenario.ticks, scenario.names))
+    most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
+    run, until_s = FusedRun(prolong_scenario(scenario, most_s)), scenario.duration_s
+    while True:
+        states = run.advance_watching(until_s)
+        speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
+        if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
+            break
+        until_s *= 2.0
+    if run.diverged_s is not None:
         rest = predict_from_start(conditions, scenario)
-        how = f"the run diverges at {end.t_s:.4g} s; {rest.how}"
+        how = f"the run diverges at {run.ran_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
-    how = (
-        f"the run is at rest at {end.t_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
-        if end.at_rest
-        else f"the run still moves at {end.t_s:.4g} s ({end.speed_rad_s:.2g} rad/s): the equilibrium nearest "
-        "to the mean of its last quarter"
-    )
-    start = Equilibrium(end.q, _complete_estimates(conditions, end.theta_hat), how, 0.0)
+    if speed_rad_s < EQUILIBRIUM_SPEED_RAD_S:
+        q, theta_hat = run.q, run.theta_hat
+        how = f"the run is at rest at {run.ran_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
+    else:
+        q, theta_hat = (values.mean(axis=0) for values in states)
+        how = f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): the equilibrium nearest "
+        how += "to the mean of its last quarter"
+    laws = [spec.control for spec in scenario.sites.values()]
+    if any(isinstance(law, ImportedLaw) for law in laws):  # of such a law the estimate is its memory
+        rows = zip(laws, theta_hat, run.memories, strict=True)
+        theta_hat = pad_rows([own if isinstance(law, ImportedLaw) else row for law, row, own in rows])
+    start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
     start = _settle_memories(conditions, start, 1)
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
