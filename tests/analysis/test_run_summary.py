@@ -162,7 +162,7 @@ def written(folder: Path, data: bytes) -> Path:
 def test_gaps_are_the_records_that_are_not_there(tmp_path: Path, lost: set[int]) -> None:
     """But for those behind the last one, which no number tells of."""
     path = written(tmp_path, edited(WHOLE, record=without("m1", lost)))
-    facts = FileInventory([path]).channels("paper", RATES)[STATE]
+    facts = FileInventory([path]).channels("paper", RATES, {})[STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
     assert named == {n for n in lost if n < last}
@@ -177,7 +177,7 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
         paths.append(tmp_path / f"{n}.mcap")
         paths[-1].write_bytes(edited(WHOLE, record=half))
     inventory = FileInventory(paths)
-    facts = inventory.channels("paper", RATES)[STATE]
+    facts = inventory.channels("paper", RATES, {})[STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
     assert [file["finished"] for file in inventory.files] == [True, True]
     assert info(*paths).facts["sites"]["m1"]["missing"] == 0

@@ -30,7 +30,7 @@ from trilat_net.analysis.certificate.stability_certificate import (
     StabilityVerdict,
 )
 from trilat_net.analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
-from trilat_net.analysis.twin_growth import measure_virtual_twins
+from trilat_net.analysis.twin_growth import TWINS, measure_virtual_twins
 from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
@@ -600,7 +600,7 @@ def say_of_run(scenario: Scenario) -> str:
     whole = Evidence(Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(DigestState.INTACT, ""))
     roots = find_end_pose_roots(run)  # type: ignore[arg-type]
     end = run.find_end()
-    twins = measure_virtual_twins(scenario, end, scenario.duration_s)
+    twins = measure_virtual_twins(scenario, end, scenario.duration_s, TWINS)
     return str(Certificate([], no_v, end, whole, None, roots=roots, twins=twins).stability)
 
 

@@ -104,11 +104,11 @@ class FileInventory:
         )
 
     def channels(
-        self, session: str = "", rates_hz: Mapping[str, int] | None = None, absences: Absences | None = None
+        self, session: str, rates_hz: Mapping[str, int], absences: Absences
     ) -> dict[str, JsonObject]:
         """Returns the facts of every channel by topic; gaps of those of a session's sites."""
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
-        return {topic: self._channel(topic, session, rates_hz or {}, absences or {}) for topic in names}
+        return {topic: self._channel(topic, session, rates_hz, absences) for topic in names}
 
     def _channel(
         self, topic: str, session: str, rates_hz: Mapping[str, int], absences: Absences

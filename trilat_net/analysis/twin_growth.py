@@ -265,9 +265,7 @@ def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool =
     return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
-def measure_virtual_twins(
-    scenario: Scenario, end: RunEnd, duration_s: float, count: int = TWINS
-) -> TwinGrowth:
+def measure_virtual_twins(scenario: Scenario, end: RunEnd, duration_s: float, count: int) -> TwinGrowth:
     """Returns the same of a run in virtual time, of so many seconds, without a log.
 
     Raises:

@@ -399,10 +399,10 @@ class FusedRun:
         """Returns by how much a field of the sites' state differs at the most."""
         return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
 
-    def advance_watching(self, until_s: float, states: int = 100) -> tuple[Array, Array]:
-        """Continues the run; returns q, (K, N, 2), rad, and theta_hat, (K, N, 5), of its last quarter."""
+    def advance_watching(self, until_s: float) -> tuple[Array, Array]:
+        """Continues the run; returns q, (100, N, n), rad, and theta_hat, (100, N, P), of its last quarter."""
         found = []
-        for t_s in np.linspace(0.75 * until_s, until_s, states):
+        for t_s in np.linspace(0.75 * until_s, until_s, 100):
             self.advance(float(t_s))
             found.append((self.q, self.theta_hat))
         q, theta_hat = map(np.array, zip(*found, strict=True))

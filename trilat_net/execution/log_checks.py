@@ -101,9 +101,7 @@ def check_log_files(sources: Sequence[str], min_coverage: float, allowed: CodeCo
         return [Finding("executed again", f"cannot be: {error}", False)]
 
 
-def _checks(
-    log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None = None
-) -> Iterator[Finding]:
+def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None) -> Iterator[Finding]:
     others = [name for name in log.sites if name not in log.executed_sites]  # of an open-loop rerun
     recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
     yield _records_line(log, result)

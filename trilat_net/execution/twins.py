@@ -105,16 +105,16 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
     )
 
 
-def choose_pushes(scenario: Scenario, count: int, delta: float = PUSH_RAD) -> list[Push]:
+def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
     """Returns so many pushes: each joint, as far as they go, the estimates, and random ones of all joints.
 
-    The random ones are by less and by more than `delta`: growth that is not of small motions alone differs.
+    The random ones are by less and more than `PUSH_RAD`: growth that is not of small motions alone differs.
     """
-    each = [(joint.replace(" joint ", ".q"), delta) for joint in list_joints(scenario)]
+    each = [(joint.replace(" joint ", ".q"), PUSH_RAD) for joint in list_joints(scenario)]
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
-    chosen = [("theta", delta)] * (learns and count > 2)
+    chosen = [("theta", PUSH_RAD)] * (learns and count > 2)
     random = max(1, min(3, count - len(each) - len(chosen)))
-    chosen += [("q", factor * delta) for factor in (1.0, 1e-3, 1e3)[:random]]
+    chosen += [("q", factor * PUSH_RAD) for factor in (1.0, 1e-3, 1e3)[:random]]
     pushes = [aim_push(scenario, *one) for one in (chosen + each)[:count]]
     return [one._replace(again=True, largest=LARGEST) for one in pushes]
 
@@ -223,7 +223,10 @@ class _TwinRuns:
         with np.errstate(divide="ignore", invalid="ignore"):
             for end_s in self._ends.tolist():
                 self._make_window(end_s)
-            return self._collect()
+        t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
+        kept = zip(self._largest, self._last, self._scales, map(tuple, self._pushed), self._died, strict=True)
+        paths = [TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)]
+        return Twins(paths, self._joints, self._speed, self._same)
 
     def _make_window(self, end_s: float) -> None:
         last_ns = math.ceil(end_s * NS_PER_S) - 1
@@ -301,12 +304,6 @@ class _TwinRuns:
             factor = pushed / max(q, qd)
             twin.approach(self._run, factor)
             self._scale[n] -= math.log(factor)
-
-    def _collect(self) -> Twins:
-        t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
-        kept = zip(self._largest, self._last, self._scales, map(tuple, self._pushed), self._died, strict=True)
-        paths = [TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)]
-        return Twins(paths, self._joints, self._speed, self._same)
 
 
 SAME_RUN = 1e-7

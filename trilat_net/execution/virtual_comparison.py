@@ -145,9 +145,8 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
     scenario = _recorded_scenario(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
-    states = {name: log[name].states for name in log.sites}
     arms = {
-        name: {s.tick: PlantState(s.q, s.qd, s.tau_x, s.bodies) for s in states[name]}
+        name: {s.tick: PlantState(s.q, s.qd, s.tau_x, s.bodies) for s in log[name].states}
         for name in log.scenario.external
     }
     with process.pause_gc():
@@ -161,7 +160,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
                     progress(before + n, total)
                 yield site.name, output
 
-        recorded = RecordedNetwork({name: _complete_arrivals(log, name) for name in states}, peers)
+        recorded = RecordedNetwork({name: _complete_arrivals(log, name) for name in log.sites}, peers)
         fed = compare_records(log, execute(recorded, 0), arrivals=True)
         if arms:
             plain = RecordComparison(0, 0, None)

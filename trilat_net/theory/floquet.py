@@ -79,9 +79,9 @@ class SiteTickMap(NamedTuple):
     names: tuple[str, ...]
 
 
-def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian, h_s: float) -> SiteTickMap:
+def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     """Returns one site over a period, from the derivatives of its rates (`differentiate_rates`)."""
-    at, rates = jacobian.at, jacobian.rates
+    at, rates, h_s = jacobian.at, jacobian.rates, 1.0 / site.rate_hz
     second = site.scheme is Scheme.SECOND_ORDER
     arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
     n = at.states + (at.joints if second else 0)
@@ -138,10 +138,7 @@ class CoupledTicks(NamedTuple):
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
     """Returns what moves of the sites over a period of their own rates, and their effects on each other."""
     sites = differentiate_rates(conditions, rest)
-    maps = [
-        linearise_site_tick(site, own, 1.0 / site.rate_hz)
-        for site, own in zip(conditions.sites, sites, strict=True)
-    ]
+    maps = [linearise_site_tick(site, own) for site, own in zip(conditions.sites, sites, strict=True)]
     owners = np.repeat(np.arange(len(maps)), [len(one.P) for one in maps])
     couplings = couple_sites(conditions, rest, sites)
     effects = np.zeros((len(couplings), len(owners), len(owners)))
