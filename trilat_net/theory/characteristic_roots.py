@@ -50,10 +50,10 @@ _SAME_VALUE = 1e-11
 """Singular values this small, relative to Delta's terms, belong to one root."""
 _MAX_DISTANCE_PER_S = 1e6
 """Newton's method has failed if it is this far from its guess, 1/s."""
-_ZERO = 1e-12
+ZERO_SHARE = 1e-12
 """A singular value this small, relative to the largest, is zero."""
 _LONGEST_CHAIN = 4
-_NAMED_SHARE = 0.3
+NAMED_SHARE = 0.3
 """States with at least this share of the largest participation are named."""
 _INITIAL_ORDER = 12
 MAX_GENERATOR_SIZE = 1600
@@ -264,7 +264,7 @@ def _solve_for_root(pencil: Pencil, first: complex, names: Sequence[str]) -> Cha
     if shares is None:
         return None
     states = np.round(shares[1] / shares[1].max(), 6)  # equal ones stay in their order
-    order = [int(n) for n in np.argsort(-states, kind="stable") if states[n] >= _NAMED_SHARE]
+    order = [int(n) for n in np.argsort(-states, kind="stable") if states[n] >= NAMED_SHARE]
     rounded = complex(s.real, abs(s.imag) if abs(s.imag) > SAME_ROOT_TOLERANCE else 0.0)
     return CharacteristicRoot(rounded, shares[0], tuple(names[n] for n in order))
 
@@ -304,7 +304,7 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
             return 0, 0
         toeplitz = np.sum([np.kron(np.eye(length, k=-power), D) for power, D in enumerate(terms)], axis=0)
         values = np.linalg.svd(toeplitz, compute_uv=False)
-        counts.append(int(np.sum(values <= _ZERO * values[0])))
+        counts.append(int(np.sum(values <= ZERO_SHARE * values[0])))
         if counts[-1] == counts[-2]:
             break
     return counts[-1], counts[-1] - counts[1]

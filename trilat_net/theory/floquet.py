@@ -38,8 +38,9 @@ from ..core.delay import DelayKind, TraceEnd
 from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array, IntArray
 from ..scenario.sample_uses import draw_uses
-from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
 from .characteristic_roots import (
+    NAMED_SHARE,
+    ZERO_SHARE,
     CharacteristicRoot,
     Complex,
     Pencil,
@@ -47,6 +48,7 @@ from .characteristic_roots import (
     extract_moving_part,
     limit_blas_threads,
 )
+from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
 from .linear_loop import SiteJacobian, couple_sites, differentiate_rates
 from .operating_point import Equilibrium, OperatingConditions
 
@@ -173,9 +175,7 @@ _RESIDUAL, _LOOSE_RESIDUAL = 1e-9, 1e-4
 """The largest residual of a multiplier, relative to it; the other when the columns are at an end."""
 _SMALLEST = 1e-7
 """Multipliers below this share of the largest are not looked for."""
-_ZERO = 1e-12
 _SAME_ROOT = 1e-6
-_NAMED_SHARE = 0.3
 
 
 class SamplesInUse(NamedTuple):
@@ -280,7 +280,7 @@ class _SpanMap:
         self._parts = _plan_parts(self._ticks, used, -(-max(self._ticks) // _PART_TICKS))
         self.scales: list[float] = []
         _, values, right = np.linalg.svd(np.eye(n) - loop.S - sum(loop.effects.values()))
-        self.neutral = np.linalg.qr(self.hold(right[values <= _ZERO * values[0]].T))[0]
+        self.neutral = np.linalg.qr(self.hold(right[values <= ZERO_SHARE * values[0]].T))[0]
 
     def hold(self, X: Array) -> Array:
         """Returns columns whose states X, shape (n, columns), have always been so."""
@@ -342,7 +342,7 @@ def _find_multipliers(span: _SpanMap, n: int, wanted: int) -> tuple[Complex, Com
             W -= basis @ onto
             H[:, -block.shape[1] :] += onto
         left, lengths, right = np.linalg.svd(W, full_matrices=False)
-        new = lengths > _ZERO * np.abs(H).max()
+        new = lengths > ZERO_SHARE * np.abs(H).max()
         left, beyond = left[:, new], (lengths[:, np.newaxis] * right)[new]
         mu, y = np.linalg.eig(H)
         order = np.argsort(-np.abs(mu), kind="stable")
@@ -421,6 +421,6 @@ def _describe_modes(
         if same:
             roots[same[0]] = roots[same[0]]._replace(multiplicity=roots[same[0]].multiplicity + 1)
             continue
-        named = [loop.names[m] for m in order if sizes[m, n] >= _NAMED_SHARE * sizes[order[0], n]]
+        named = [loop.names[m] for m in order if sizes[m, n] >= NAMED_SHARE * sizes[order[0], n]]
         roots.append(CharacteristicRoot(root, 1, tuple(named)))
     return sorted(roots, key=lambda root: -root.s.real)

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
+from ..core.task_space import PLACE
 from ..core.vectors import Array
 from ..laws.conditions import LinearForm, Place
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
-from .textbook_arm import PLACE_COORDINATES, evaluate_reference
+from .textbook_arm import evaluate_reference
 
 _DEPENDENT = 1e-9
 """Rows of a regressor that are dependent to this, relative to the largest, are."""
@@ -146,7 +147,7 @@ def differentiate_references(
     for i, row in enumerate(conditions.alpha):
         for j in np.flatnonzero(row):
             found[i, int(j)] = row[j] * np.eye(len(shared[i]))
-        if len(shared[i]) > PLACE_COORDINATES and conditions.sites[i].layout.task:
+        if len(shared[i]) > PLACE and conditions.sites[i].layout.task:
             for peer in {i, *np.flatnonzero(row).tolist()}:
                 poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
                 poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[peer]))

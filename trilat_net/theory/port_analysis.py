@@ -24,6 +24,7 @@ from ..analysis.arm_rows import build_arm_rows
 from ..analysis.dominance_history import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
+from ..core.task_space import PLACE
 from ..core.vectors import Array
 from ..errors import UsageError
 from ..results import finite_or_none
@@ -46,7 +47,6 @@ from .port_passivity import (
 )
 from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
 from .site_dynamics import follow_peers, lay_out_arguments, place_arm
-from .textbook_arm import PLACE_COORDINATES
 
 
 def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) -> OperatingConditions:
@@ -74,7 +74,7 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> por
     """
     if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites):
         return None
-    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE_COORDINATES:
+    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE:
         return None
     C = loop.C.copy()
     delays_s = conditions.age_s[conditions.alpha != 0.0]
@@ -181,10 +181,8 @@ class PortAnalysis(NamedTuple):
 
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of an impedance at the ports of a number; 0: at all of them."""
-        turns = not self.axes or max(self.axes) > PLACE_COORDINATES
-        units = {
-            "N s/m" if self.axes and port <= PLACE_COORDINATES else "N m s/rad" for port in [number] if port
-        }
+        turns = not self.axes or max(self.axes) > PLACE
+        units = {"N s/m" if self.axes and port <= PLACE else "N m s/rad" for port in [number] if port}
         return " and ".join(units or (["N s/m"] if self.axes else []) + ["N m s/rad"] * turns)
 
 

@@ -29,6 +29,7 @@ from ..analysis.arm_rows import Numbers, multiply_columns, solve_columns
 from ..analysis.following import find_task_reference
 from ..core.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
 from ..core.site_setup import ChainSetup, SiteSetup, TaskSetup
+from ..core.task_space import PLACE
 from ..core.vectors import Array
 
 _EPSILON = np.zeros((3, 3, 3))
@@ -233,8 +234,6 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     return R + turned + np.multiply.outer(at_rest @ across @ across, 1.0 - np.cos(q)), p
 
 
-PLACE_COORDINATES = 3
-"""Coordinates of a task that are a place; those behind it are a rotation vector."""
 SINGULAR = 1e-9
 """A pose whose lower bound of the Jacobian's least squared singular value is below this is singular."""
 _SMALL = 1e-4
@@ -251,9 +250,8 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     by_sine = np.where(small, of_sine, np.sin(angle) / angle)
     by_cosine = np.where(small, of_cosine, (1.0 - np.cos(angle)) / angle**2)
     across = build_cross_matrix(vector)
-    squared = np.einsum("ab...,bc...->ac...", across, across)
     eye = np.eye(3).reshape(3, 3, *(1,) * (vector.ndim - 1))
-    turned: Numbers = eye + by_sine * across + by_cosine * squared
+    turned: Numbers = eye + by_sine * across + by_cosine * _multiply(across, across)
     return turned
 
 
@@ -306,17 +304,13 @@ def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -
         shared: of each site what it shares.
     """
     followed = [(share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share]
-    places = sum(share * pose[:PLACE_COORDINATES] for share, pose in followed)
-    if len(own) == PLACE_COORDINATES:
+    places = sum(share * pose[:PLACE] for share, pose in followed)
+    if len(own) == PLACE:
         return np.asarray(places)
-    R = rotation_from_vector(own[PLACE_COORDINATES:])
-    apart = sum(
-        share * turn_from(rotation_from_vector(pose[PLACE_COORDINATES:]), R) for share, pose in followed
-    )
-    reference = np.einsum("ab...,bc...->ac...", rotation_from_vector(-np.asarray(apart)), R)
-    return np.concatenate(
-        [np.asarray(places) + 0.0 * own[:PLACE_COORDINATES], vector_from_rotation(reference)]
-    )
+    R = rotation_from_vector(own[PLACE:])
+    apart = sum(share * turn_from(rotation_from_vector(pose[PLACE:]), R) for share, pose in followed)
+    reference = _multiply(rotation_from_vector(-np.asarray(apart)), R)
+    return np.concatenate([np.asarray(places) + 0.0 * own[:PLACE], vector_from_rotation(reference)])
 
 
 class Following(NamedTuple):
@@ -364,7 +358,7 @@ def follow_joints(Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_d
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
     """Returns what a site shares of its pose: place and rotation vector, or the place, shape (m, ...)."""
     place = task.scale * arm.end_effector_position()
-    if len(task.axes) == PLACE_COORDINATES:
+    if len(task.axes) == PLACE:
         return place
     return np.concatenate([place, vector_from_rotation(arm.end_effector_orientation())])
 
@@ -384,12 +378,12 @@ def follow_in_task(
     task, m = site.chain.task, site.layout.shared
     x, one = share_pose(task, arm), (1,) * (q.ndim - 1)
     axes = np.array(task.axes).reshape(m, *one)
-    scales = np.array([task.scale] * PLACE_COORDINATES + [1.0] * PLACE_COORDINATES)[:m].reshape(m, 1, *one)
+    scales = np.array([task.scale] * PLACE + [1.0] * PLACE)[:m].reshape(m, 1, *one)
     whole, whole_rate = (scales * J[:m] for J in (arm.pose_jacobian(), arm.pose_jacobian_rate(qd)))
     xd, e = multiply_columns(whole, qd), x - x_des
-    if m > PLACE_COORDINATES:
-        R, R_des = (rotation_from_vector(pose[PLACE_COORDINATES:]) for pose in (x, x_des + 0.0 * x))
-        e = np.concatenate([e[:PLACE_COORDINATES], turn_from(R_des, R)])
+    if m > PLACE:
+        R, R_des = (rotation_from_vector(pose[PLACE:]) for pose in (x, x_des + 0.0 * x))
+        e = np.concatenate([e[:PLACE], turn_from(R_des, R)])
     e, ed = axes * e, axes * (xd - xd_des)
     J, Jd = axes[:, np.newaxis] * whole, axes[:, np.newaxis] * whole_rate
     A, least = _damp(task, J)
