@@ -198,6 +198,21 @@ def test_a_changed_log_does_not_equal_virtual_time() -> None:
         assert twin.identical == twin.records - 1
 
 
+@pytest.mark.parametrize("entry", [[70_000, 3, 0], [-1, 3, 0], [0, 2**58, 0], [0, -5, 0]])
+@pytest.mark.parametrize("gap", [range(0), range(5, 80)])
+def test_a_sample_of_nobody_is_never_late(entry: list[int], gap: range) -> None:
+    """Not where so many records are missing, either, that no arrivals are assumed."""
+
+    def record(r: dict) -> dict | None:
+        if (r["site"], r["tick"]) == ("s", 90):
+            r["rx"].append(entry)
+        return None if r["site"] == "s" and r["tick"] in gap else r
+
+    twins = compare_with_virtual(opened(edited(recorded("paper"), record=record)))
+    assert twins.absent == []
+    assert twins.plain.first is None
+
+
 def test_the_twin_without_hands_has_nobody_at_the_arms() -> None:
     log = opened(recorded("paper", {"duration_s": 1.2}))
     twin = simulate_without_operators(log)

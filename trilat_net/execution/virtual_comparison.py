@@ -22,7 +22,7 @@ from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
 from .verify import RecordDifference, describe_law_failure, equal_bits, equal_record, find_first_difference
-from .virtual_network import Network, RecordedNetwork, complete_deliveries
+from .virtual_network import Network, RecordedNetwork, complete_deliveries, recorded_deliveries
 
 
 class RecordComparison(NamedTuple):
@@ -89,13 +89,15 @@ def find_absent_samples(log: Log) -> list[LateSample]:
         site = Site(log.scenario.setup(name)._replace(own=None))  # only its links matter: no law runs
         part, ordered = log[name], log.commands(name)
         _, rows = part.arrivals
+        ticks = [log.scenario.ticks(peer) for peer in part.peers]
         came = [set(rows[rows[:, 0] == j, 1].tolist()) for j in range(len(part.peers))]
         asked = [0] * len(part.peers)
         for state in part.states:
             for command in ordered.get(state.tick, ()):
                 site.order(command, state.t_ns)
             for peer, tick, _ in state.rx:
-                due = site.release_tick(peer, tick)
+                made = 0 <= peer < len(ticks) and 0 <= tick < ticks[peer]  # a damaged record names any
+                due = site.release_tick(peer, tick) if made else None
                 if due is not None and due < state.tick and not site.measures(peer):
                     absent.append(LateSample(name, site.peers[peer], tick, due, state.tick))
             for j, sender in enumerate(part.peers):
@@ -175,7 +177,7 @@ def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntr
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
     with suppress(LogError):
         return complete_deliveries(part, rates_hz, [log.last_ticks[peer] for peer in part.peers]).at
-    return {state.tick: state.rx for state in part.states}
+    return recorded_deliveries(part).at
 
 
 def _recorded_scenario(log: Log) -> Scenario:
