@@ -49,7 +49,6 @@ from .rerun_execution import (
 from .resumption import read_output
 from .verify import RecordDifference
 from .virtual import SiteChannels, SiteEntry, describe_accounts
-from .virtual_network import Deliveries
 
 
 class LogAndRerun(NamedTuple):
@@ -115,7 +114,7 @@ class LinkEffect(NamedTuple):
 
 
 def compare_site_rerun(
-    log: Log, request: RerunRequest, site: RerunSite, deliveries: Deliveries, ticks: Sequence[RerunTick]
+    log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
     """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
     before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
@@ -131,7 +130,7 @@ def compare_site_rerun(
         compared=len(rows),
         identical=sum(tick.same for tick in executed),
         stands=len(ticks) - len(executed),
-        assumed=sum(tick.tick in deliveries.unrecorded for tick in executed),
+        assumed=sum(tick.tick in site.deliveries.unrecorded for tick in executed),
         lacking=site.lacking,
         first=site.first,
         diverged_at_s=last.t_ns / NS_PER_S if last is not None and last.mode is Mode.DIVERGED else None,
@@ -330,7 +329,7 @@ def rerun(
         ticks = list(execution.run(progress))
         for name, site in execution.sites.items():
             own = [tick for tick in ticks if tick.site == name]
-            sites[name], over = compare_site_rerun(before, request, site, execution.deliveries[name], own)
+            sites[name], over = compare_site_rerun(before, request, site, own)
             links |= {link.link: link for link in over}
     return Rerun(before, request, ticks, sites, links)
 

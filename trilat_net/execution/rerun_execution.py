@@ -235,6 +235,7 @@ class RerunSite:
     Samples of executed peers appear in `samples` as they are computed.
 
     Attributes:
+        deliveries: what arrives at it.
         first: the first difference from the log's records.
         lacking: number of samples that arrived and are not in the log.
     """
@@ -256,7 +257,7 @@ class RerunSite:
         self.diverged = False
         setup = scenario.setup(name)
         self._site, self._channel = Site(setup), setup.channel
-        self._part, self._deliveries, self._changed = part, deliveries, bool(request.changes)
+        self._part, self.deliveries, self._changed = part, deliveries, bool(request.changes)
         self._inputs = RecordedInputs(part, samples, log.last_ticks, log.commands(name), setup.links)
         self._last = min(deliveries.last, scenario.ticks(name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
@@ -300,7 +301,7 @@ class RerunSite:
         return made
 
     def _execute(self, n: int | None) -> RerunTick:
-        arrivals, missing = self._inputs.arrivals(self._deliveries.at.get(self.k, ()))
+        arrivals, missing = self._inputs.arrivals(self.deliveries.at.get(self.k, ()))
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)
         changes = [change for _, change in self._inputs.take_changes(self.k)]
@@ -334,7 +335,7 @@ MEMORY_S = 120
 
 
 class RerunExecution:
-    """The sites of a rerun, executed, and their deliveries.
+    """The sites of a rerun, executed.
 
     Raises:
         LogError: the log does not tell enough.
@@ -347,9 +348,9 @@ class RerunExecution:
             name: log[name].by_tick for name in request.recorded
         }
         samples |= self._recent  # filled as they are computed
-        self.deliveries = {name: self._find_deliveries(name) for name in request.replaced}
         self.sites = {
-            name: RerunSite(log, request, name, found, samples) for name, found in self.deliveries.items()
+            name: RerunSite(log, request, name, self._find_deliveries(name), samples)
+            for name in request.replaced
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
@@ -375,7 +376,7 @@ class RerunExecution:
         A site that left its limits makes no more ticks. With changes, the others end with it.
         """
         sites = list(self.sites.values())
-        total = sum(found.last + 1 - found.first for found in self.deliveries.values())
+        total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)
         pending = sorted((site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done)
         done, last_ns = 0, None
         while pending and (last_ns is None or pending[0][0] <= last_ns):
@@ -400,7 +401,7 @@ class RerunExecution:
         """True if every sample of a site's next tick, k, has been computed, or never will be."""
         receiver = self._request.replaced[place]
         peers = self._log[receiver].peers
-        for peer, tick, _ in self.deliveries[receiver].at.get(k, ()):
+        for peer, tick, _ in self.sites[receiver].deliveries.at.get(k, ()):
             sender = self.sites.get(peers[peer])
             if sender is not None and not sender.done and tick >= sender.k:
                 return False

@@ -179,9 +179,8 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
             at = lay_out_arguments(site)
             moved.append(np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]]))
         deviation = _select_loop_states(conditions, moved)
-        kept = _project_on_zero_roots(
-            linear_loop.linearise_loop(conditions, rest, every_estimate=True), deviation
-        )
+        loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
+        kept = _project_on_zero_roots(loop, deviation)
         if kept is None:
             break
         rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))

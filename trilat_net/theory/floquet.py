@@ -87,10 +87,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     second = site.scheme is Scheme.SECOND_ORDER
     arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
     n = at.states + (at.joints if second else 0)
-    own, peers = (
-        np.eye(at.arguments, n),
-        np.eye(at.arguments, at.inputs.stop - at.inputs.start, -at.inputs.start),
-    )
+    peers = np.eye(at.arguments, at.inputs.stop - at.inputs.start, -at.inputs.start)
+    own = np.eye(at.arguments, n)
     own[at.states :] = 0.0
     by_law = np.eye(at.joints) + rates.tau[:, at.external_torque]  # one of one's own may use what it feels
     inverse_inertia = np.linalg.solve(by_law.T, rates.qdd[:, at.external_torque].T).T

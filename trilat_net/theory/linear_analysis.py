@@ -37,12 +37,11 @@ from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium, follow_equilibrium, pad_rows
 from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, find_deepest_contact, iterate_linear_edges, parse_edge_range
-from .linear_loop import LinearLoop, linearise_loop
+from .linear_loop import LinearLoop, linearise_loop, share_poses
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
 from .port_passivity import HandMatrices
-from .site_dynamics import share_own_pose
 
 DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
@@ -79,12 +78,10 @@ class LinearAnalysis(Result):
     @property
     def end_effectors(self) -> tuple[Array, ...]:
         """What each site shares of its pose at the equilibrium in task space; nothing in joint space."""
-        sites, q = self.conditions.sites, self.rest.q
+        sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
-        return tuple(
-            share_own_pose(site, own[: site.layout.joints]) for site, own in zip(sites, q, strict=True)
-        )
+        return tuple(share_poses(self.conditions, self.rest))
 
     @property
     def decisive(self) -> Spectrum:

@@ -121,7 +121,8 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     return arguments
 
 
-def _share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+def share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns what each site shares of its pose at an equilibrium, shape (m,) each."""
     return [
         site_dynamics.share_own_pose(site, q[: site.layout.joints])
         for site, q in zip(conditions.sites, rest.q, strict=True)
@@ -130,7 +131,7 @@ def _share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Arr
 
 def find_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Returns what each site follows at an equilibrium, shape (m,) each."""
-    shared = _share_poses(conditions, rest)
+    shared = share_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
         return list(conditions.alpha @ np.array(shared))
     return [evaluate_reference(row, own, shared) for row, own in zip(conditions.alpha, shared, strict=True)]
@@ -143,7 +144,7 @@ def differentiate_references(
 
     It is alpha_ij but for orientations that do not agree, which have one by the site's own pose as well.
     """
-    found, shared = {}, _share_poses(conditions, rest)
+    found, shared = {}, share_poses(conditions, rest)
     for i, row in enumerate(conditions.alpha):
         for j in np.flatnonzero(row):
             found[i, int(j)] = row[j] * np.eye(len(shared[i]))
@@ -314,7 +315,7 @@ def add_law_forms(
     E = np.ones(size)
     for i, form in enumerate(forms):
         if form is not None:
-            _add_form(conditions, sites, (at, i), form, terms)
+            _add_form(conditions, sites, at, i, form, terms)
     for i, form in enumerate(forms):  # when all that accelerates an arm is there
         for j in form.list_receivers() if form is not None else ():
             channel = at[i, ("to", j)]
@@ -323,7 +324,7 @@ def add_law_forms(
                 for A, B in terms.values():
                     A[channel], B[channel] = A[at[i, "qd"]], B[at[i, "qd"]]
             terms[0.0][0][channel, channel] -= np.eye(len(sites[i].rates.qdd))
-    (A, B), *_ = [terms.pop(0.0)]
+    A, B = terms.pop(0.0)
     C = np.hstack([loop.C, np.zeros((len(loop.C), size - loop.C.shape[1]))])
     delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
     return loop._replace(names=tuple(names), A=A, B=B, C=C, delayed=delayed, E=E)
@@ -355,12 +356,12 @@ def _place_form_states(
 def _add_form(
     conditions: OperatingConditions,
     sites: Sequence[SiteJacobian],
-    where: tuple[_Places, int],
+    places: _Places,
+    i: int,
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    (places, i), site = where, sites[where[1]]
-    ports = np.cumsum([0, *(one.at.joints for one in sites)])
+    site, ports = sites[i], np.cumsum([0, *(one.at.joints for one in sites)])
 
     def late(j: int) -> tuple[Array, Array]:
         zeros = np.zeros_like(terms[0.0][0]), np.zeros_like(terms[0.0][1])

@@ -7,7 +7,7 @@ was not produced by the equations that it claims.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -119,9 +119,7 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
     """
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(own) for site, own in records.items()}
-    energies = derive_site_energies(
-        log.scenario, records, pasts, lambda site, t_s: trace_dominance(log, site, t_s)
-    )
+    energies = derive_site_energies(log.scenario, records, pasts, partial(trace_dominance, log))
     return energies if energies and len(find_common_times(energies)) > 1 else {}
 
 

@@ -197,9 +197,8 @@ class RunningEnergy:
         energies = derive_site_energies(self._scenario, records, pasts, self._trace)
         for alpha in find_dominance_matrices(energies):
             if len(groups := find_closed_groups(alpha)) > 1:
-                names = tuple(tuple(records)[n] for n in groups[0])
-                others = tuple(tuple(records)[n] for n in groups[1])
-                self.reason = describe_closed_groups((names, others))
+                names = list(records)
+                self.reason = describe_closed_groups([[names[n] for n in group] for group in groups[:2]])
                 return None
         balance = compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
         for site in self._start:
