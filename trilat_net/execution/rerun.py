@@ -283,10 +283,7 @@ class Rerun(Result):
             "without_effect": [changed.key for changed in self.request.without_effect],
             "identical": self.identical,
             "diverged": self.diverged,
-            "sites": {
-                name: {**_nest(effect), "first": effect.first and effect.first._asdict()}
-                for name, effect in self.sites.items()
-            },
+            "sites": {name: _nest(effect) for name, effect in self.sites.items()},
             "links": {name: _nest(effect) for name, effect in self.links.items()},
             "notes": self.notes,
         }

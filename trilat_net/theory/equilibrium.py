@@ -110,7 +110,7 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
         free = np.flatnonzero(effects.any(axis=1) & ~np.array(speeds))
         step = np.zeros(len(loop.names))
         step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
-        share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
+        share = _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP)
         for _ in range(_MAX_HALVINGS):  # touching a wall changes the next step
             tried = _shift_equilibrium(conditions, rest, share * step)
             after = compute_equilibrium_residual(conditions, tried)
@@ -326,7 +326,7 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
             return q
         assert following.J is not None
         step = np.linalg.lstsq(following.J, -following.e, rcond=_FLAT)[0]
-        q = q + step * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
+        q = q + step * (_MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
     raise ScenarioError(
         f"its end effector does not reach the pose: {np.abs(following.e).max():.2g} m or rad are left",
         path=f"sites.{site.name}.q0_rad",
@@ -364,7 +364,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         q, theta_hat = (values.mean(axis=0) for values in states)
         how = f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): the equilibrium nearest "
         how += "to the mean of its last quarter"
-    laws = [spec.control for spec in scenario.sites.values()]
+    laws = scenario.controls
     if any(isinstance(law, ImportedLaw) for law in laws):  # of such a law the estimate is its memory
         rows = zip(laws, theta_hat, run.memories, strict=True)
         theta_hat = pad_rows([own if isinstance(law, ImportedLaw) else row for law, row, own in rows])

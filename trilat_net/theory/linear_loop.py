@@ -102,19 +102,15 @@ class LinearLoop(NamedTuple):
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
     """Returns the arguments of every site's rates at an equilibrium, shape (arguments,) each."""
-    arguments = []
-    for site, q, theta_hat in zip(conditions.sites, rest.q, rest.theta_hat, strict=True):
-        at = site_dynamics.lay_out_arguments(site)
-        x = np.zeros(at.arguments)
-        x[at.q], x[at.estimate] = q[: at.joints], theta_hat[: at.parameters]
-        arguments.append(x)
-    for x, site, x_des in zip(arguments, conditions.sites, find_references(conditions, rest), strict=True):
-        x[site_dynamics.lay_out_arguments(site).q_des] = x_des
+    layouts = list(map(site_dynamics.lay_out_arguments, conditions.sites))
+    arguments = [np.zeros(at.arguments) for at in layouts]
+    poses = zip(rest.q, rest.theta_hat, find_references(conditions, rest), strict=True)
+    for at, x, (q, theta_hat, q_des) in zip(layouts, arguments, poses, strict=True):
+        x[at.q], x[at.estimate], x[at.q_des] = q[: at.joints], theta_hat[: at.parameters], q_des
     reflected = [one.reflected for one in conditions.rates(arguments)]
-    for x, site, felt in zip(arguments, conditions.sites, conditions.alpha @ reflected, strict=True):
-        x[site_dynamics.lay_out_arguments(site).peer_torque] = felt
-    for i, (x, site) in enumerate(zip(arguments, conditions.sites, strict=True)):
-        at, others = site_dynamics.lay_out_arguments(site), [j for j in range(len(arguments)) if j != i]
+    for i, (at, x, felt) in enumerate(zip(layouts, arguments, conditions.alpha @ reflected, strict=True)):
+        x[at.peer_torque] = felt
+        others = [j for j in range(len(arguments)) if j != i]
         for place in range(at.peers):
             j, rest_qd = others[place], np.zeros(at.coordinates)
             x[at.of_peer(place)] = np.r_[rest.q[j][: at.coordinates], rest_qd, -reflected[j]]
