@@ -39,9 +39,8 @@ class AppliedChange(NamedTuple):
     def text(self) -> str:
         """The value after it."""
         if self.change.order:
-            return self.change.order.replace("_", " ") + f", {self.change.ticks} ticks" * bool(
-                self.change.ticks
-            )
+            ticks = f", {self.change.ticks} ticks" if self.change.ticks else ""
+            return self.change.order.replace("_", " ") + ticks
         if self.change.link:
             return self.change.after.describe()
         shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.to.items() if share)

@@ -168,9 +168,8 @@ def couple_sites(
         whole = block_diag(references.get((i, j), zero), share, share)
         if at.peers:
             alone = np.zeros((at.peers, len(whole), len(whole)))
-            alone[j - (j > i)] = np.diag(
-                np.repeat([1.0, 1.0, -1.0], at.coordinates)
-            )  # tau_x is not ON its arm
+            # its tau_x is not ON its arm
+            alone[j - (j > i)] = np.diag(np.repeat([1.0, 1.0, -1.0], at.coordinates))
             whole = np.vstack([whole, *alone])
         coupling[i, j] = whole
     return coupling

@@ -202,7 +202,9 @@ def analyse_ports(
         ScenarioError: the scenario has no linear loop.
         UsageError: no site of that name, or an empty band.
     """
-    _check_band(*band_hz)
+    low, high = band_hz
+    if not 0.0 < low < high:
+        raise UsageError(f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz")
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
     of = of or scenario.slave
@@ -240,11 +242,6 @@ def analyse_ports(
         axes=name_ports(conditions),
         measured=check_against_hands(Y, w_rad_s, *_place_hands(scenario, conditions, rest, loop, hands)),
     )
-
-
-def _check_band(low: float, high: float) -> None:
-    if not 0.0 < low < high:
-        raise UsageError(f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz")
 
 
 def _place_hands(
