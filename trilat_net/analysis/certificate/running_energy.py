@@ -148,15 +148,13 @@ class RunningEnergy:
         if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
             self.reason = self.reason or "shares change when a peer is lost: trilat certify tells V"
         self._scenario, self._windows = scenario, windows
-        plans = {site: list_scripted_ramps(scenario, site) for site in windows}
-        self._start = {site: start for site, (start, _) in plans.items()}
-        self._ramps = {site: list(ramps) for site, (_, ramps) in plans.items()}
+        self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
         self._done_s: float | None = None
         self._supplied = 0.0
 
     def take_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
         """Notes changes that a site took in; those of its dominance factors count."""
-        self._ramps[site] += [change.ramp for change in changes if change.ramp is not None]
+        self._dominance[site][1].extend(change.ramp for change in changes if change.ramp is not None)
 
     def advance(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Returns V since the last call; None if it is not known yet.
@@ -186,7 +184,7 @@ class RunningEnergy:
         if any(last - first < 1 for first, last in spans.values()):
             return None
         records = {site: self._windows[site].rows(*span) for site, span in spans.items()}
-        reach = {site: spans[site][0] for site in spans}
+        reach = {site: first for site, (first, _) in spans.items()}
         for own in records.values():
             for peer, used in own.used.items():
                 reach[peer] = min(reach[peer], max(int(used.min()) - 2, 0))
@@ -201,10 +199,8 @@ class RunningEnergy:
                 self.reason = describe_closed_groups([[names[n] for n in group] for group in groups[:2]])
                 return None
         balance = compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
-        for site in self._start:
-            self._start[site], self._ramps[site] = forget_ramps(
-                self._start[site], self._ramps[site], begin_s - 1.0
-            )
+        for site, known in self._dominance.items():
+            self._dominance[site] = forget_ramps(*known, begin_s - 1.0)
         if balance is None:  # a session that was joined late: what was under way then is not known
             return None
         supplied = self._supplied + balance.external_work
@@ -212,4 +208,4 @@ class RunningEnergy:
         return EnergyCourse(balance.t_s, balance.V, supplied)
 
     def _trace(self, site: str, t_s: Array) -> DominanceHistory:
-        return evaluate_ramps(self._start[site], self._ramps[site], t_s, 1.0 / self._windows[site].rate_hz)
+        return evaluate_ramps(*self._dominance[site], t_s, 1.0 / self._windows[site].rate_hz)
