@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,13 +107,14 @@ class FileInventory:
     ) -> dict[str, JsonObject]:
         """Returns the facts of every channel by topic; gaps of those of a session's sites."""
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
-        return {topic: self._channel(topic, session, rates_hz, absences) for topic in names}
+        return {
+            topic: self._channel(topic) | _numbers(topic, self._came[topic][1], session, rates_hz, absences)
+            for topic in names
+        }
 
-    def _channel(
-        self, topic: str, session: str, rates_hz: Mapping[str, int], absences: Absences
-    ) -> JsonObject:
+    def _channel(self, topic: str) -> JsonObject:
         about = self._about.get(topic, ChannelInfo(topic, "", "", "", {}))
-        log_ns, sequence, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came[topic])
+        log_ns, _, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came[topic])
         first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
         span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
         return {
@@ -127,12 +127,11 @@ class FileInventory:
             "between_ms": percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6),
             "encoding": about.encoding,
             "schema": about.schema,
-            **_numbers(topic, sequence, session, rates_hz, absences),
         }
 
 
 def _numbers(
-    topic: str, sequence: Any, session: str, rates_hz: Mapping[str, int], absences: Absences
+    topic: str, sequence: Sequence[int], session: str, rates_hz: Mapping[str, int], absences: Absences
 ) -> JsonObject:
     """Returns the gaps of a channel with consecutive numbers; else None for each."""
     where = topics.parse_key(topic.removeprefix("/"))
@@ -140,7 +139,7 @@ def _numbers(
     if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
         return {"missing": None, "gaps": None, "duplicates": None}
     account, channel, rate_hz = Account(), where.channel, rates_hz[where.member]
-    for tick in sequence.tolist():
+    for tick in sequence:
         account.take(number_message(channel, tick, rate_hz))
     for first, last in absences.get(where.member, ()):  # not made: they are not missing
         account.begin_anew(*(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first)))

@@ -158,16 +158,6 @@ def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
     bent = -np.trace(inverse @ (half + half.transpose(0, 2, 1)) @ inverse, axis1=1, axis2=2)
     if damping.any():
         inverse = np.linalg.inv(A + damping[:, np.newaxis, np.newaxis] * np.eye(len(axes)))
-    to_posture = task.posture_rate * (np.array(task.posture) - q)
-    psi, psi_rate = to_posture, -task.posture_rate * qd
-    return TaskFollowing(
-        Lambda,
-        J,
-        Jd,
-        psi,
-        psi_rate,
-        inverse,
-        damping,
-        np.where(damping > 0.0, bent / trace**2, 0.0),
-        np.sqrt(least),
-    )
+    damping_rate = np.where(damping > 0.0, bent / trace**2, 0.0)
+    psi, psi_rate = task.posture_rate * (np.array(task.posture) - q), -task.posture_rate * qd
+    return TaskFollowing(Lambda, J, Jd, psi, psi_rate, inverse, damping, damping_rate, np.sqrt(least))
