@@ -311,8 +311,8 @@ def write_virtual_log(
     t_ns = 0
     try:
         with process.pause_gc():
-            told: dict[str, Any] = {"commands": commands, "hands": acts, "plants": plants}
-            for site, arrivals, output in execute_virtual(scenario, network, **told):
+            ticks = execute_virtual(scenario, network, commands=commands, hands=acts, plants=plants)
+            for site, arrivals, output in ticks:
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
                 members[site.name].tick(arrivals, output)
