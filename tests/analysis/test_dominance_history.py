@@ -9,17 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
+from tests.log_editing import edited, opened, recorded
 from trilat_net.analysis.dominance_history import (
     compute_lyapunov_weights,
     evaluate_ramps,
     find_closed_groups,
     find_kd_scales,
+    find_lost_peers,
     left_perron_vector,
     trace_dominance,
 )
 from trilat_net.core.dominance import apply_ramps
 from trilat_net.core.link import link_dtype
 from trilat_net.core.ticks import DominanceRamp
+from trilat_net.errors import LogError
 
 RATE_HZ = 50
 ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
@@ -131,3 +134,14 @@ def test_a_site_that_nobody_follows_has_no_weight() -> None:
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:
     assert find_closed_groups(PAIRS) == ((0, 1), (2, 3))
+
+
+@pytest.mark.parametrize("mem", [[], [0.5] * 11])
+def test_a_record_that_lacks_who_is_lost_is_told(mem: list[float]) -> None:
+    rule = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "duration_s": 0.1}
+    data = recorded("paper", rule | {"on_stale.align_limit_rad": 2.0})
+    broken = edited(data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r)
+    times_s = np.array([0.05])
+    assert not find_lost_peers(opened(data), "s", times_s).any()
+    with pytest.raises(LogError, match="a record of s does not have 12 numbers in `mem`"):
+        find_lost_peers(opened(broken), "s", times_s)

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import trilat_net
-from tests.log_editing import edited, recorded, without
+from tests.log_editing import edited, opened, recorded, without
 from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
 from trilat_net.errors import LogError
 
@@ -193,3 +193,10 @@ def test_progress_runs_once_through_all(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
         FileInventory([tmp_path])
+
+
+def test_ticks_made_are_those_of_a_sites_last_start() -> None:
+    log = opened(recorded("two_sites", {"duration_s": 0.2}))
+    last = next(event for event in log.events if (event.kind, event.member) == ("end", "s"))
+    log.events.insert(0, msgspec.structs.replace(last, ticks=30, t_ns=0))
+    assert summarise_run(log)["sites"]["s"]["made_ticks"] == last.ticks == 200

@@ -296,8 +296,9 @@ def percentiles(
 
 
 def made_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site made, by its own event; None without one."""
-    return next((event.ticks for event in log.events if (event.kind, event.member) == ("end", site)), None)
+    """Returns the number of ticks that a site made, by the event of its last start; None without one."""
+    made = [event.ticks for event in log.events if (event.kind, event.member) == ("end", site)]
+    return made[-1] if made else None
 
 
 def count_overruns(part: SiteLog) -> int:

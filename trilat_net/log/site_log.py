@@ -253,6 +253,19 @@ class SiteLog:
         """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
         return self._read(record_columns.decode_ints, field)
 
+    def memory(self, first: int, count: int) -> Array:
+        """Returns so many numbers of `mem` from a place on, of every record, shape (K, count).
+
+        Raises:
+            LogError: a record does not have them.
+        """
+        try:
+            rows = np.array([row[first : first + count] for row in self.mem], dtype=np.float64)
+            return rows.reshape(len(self), count)
+        except ValueError:  # they are of several lengths, or too short
+            needed = f"{first + count} numbers in `mem`"
+            raise LogError(f"{self._source}: a record of {self.name} does not have {needed}") from None
+
     def record(self, n: int) -> State:
         """Returns the record at a place, decoded and checked alone; -1 is the last one."""
         return self._decode([self.payloads[n]])[0]

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
+from tests.log_editing import edited, opened, recorded
 from tests.unit_arm import hand, unit_scenario
 from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
+from trilat_net.errors import LogError
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.certificate_text import describe_certificate
@@ -198,3 +200,12 @@ def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str,
     found = observe_energies(simulate_scenario(scenario))
     assert found.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in found.premises)
+
+
+@pytest.mark.parametrize("mem", [[], [0.0] * 4])
+def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
+    data = recorded("two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"})
+    broken = edited(data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r)
+    assert observe_energies(opened(data)).curves
+    with pytest.raises(LogError, match="a record of s does not have"):
+        observe_energies(opened(broken))

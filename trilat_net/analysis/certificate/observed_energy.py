@@ -184,12 +184,11 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     rule = log.scenario.sites[name].on_stale.rule
     life = part.layout.life_memory(len(part.peers), degrades=rule.degrades)
     own = life if rule.action is StaleAction.GLIDE else part.layout.shared + 1
-    mem = np.array([row[own:] for row in part.mem[:count]]).reshape(count, -1)
-    memory, first = {}, 0
+    memory = {}
     for attribute in getattr(law, "remembers", ()):
         length = np.size(getattr(law, attribute))
-        memory[attribute] = mem[:, first : first + length]
-        first += length
+        memory[attribute] = part.memory(own, length)[:count]
+        own += length
     sent = {key: values[:count] for key, values in part.sent.items()}
     peers = []
     for peer in part.peers:
