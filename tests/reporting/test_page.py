@@ -163,9 +163,10 @@ def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
     some = logs.timed(logs.simulated("paper"))
     log = logs.rewritten(some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live")
-    paths = write_report(log, tmp_path, twin=logs.twin("paper"), verdicts=VERDICTS)
+    twin = logs.twin("paper")
+    paths = write_report(log, tmp_path, certificate=certify(log), twin=twin, verdicts=VERDICTS)
     assert [path.name for path in paths] == ["report.html", "summary.json"]
-    pictures = write_report_figures(log, tmp_path, logs.twin("paper"))
+    pictures = write_report_figures(log, tmp_path, twin)
     assert {"positions.png", "arms.png"} <= {path.name for path in pictures}
     assert "the file was not finished" in paths[0].read_text(encoding="utf-8")
 

@@ -37,13 +37,19 @@ LIMIT_COLOUR = "limit"
 class Charts:
     """The charts of a log; `twin` is the same experiment without operators, or None.
 
-    `bounds_m` are those of `workspace_box_m`.
+    Attributes:
+        bounds_m: left, right, bottom and top of a box around the motion of all arms, m.
+        factor: units per m of pictures of the arms: 1 for planar arms, whatever their size.
     """
 
-    def __init__(self, log: Log, twin: Log | None, bounds_m: arm_poses.PictureBox) -> None:
+    def __init__(self, log: Log, twin: Log | None) -> None:
         self._log = log
-        self._bounds_m = bounds_m
         self._twin = twin
+        times = np.linspace(0.0, recorded_end_s(log), 60)
+        poses = [arm_poses.pose_at(log, site, t) for site in log.sites for t in times]
+        self.bounds_m = left, right, bottom, top = arm_poses.pose_box_m(poses)
+        planar = all(arm.chain is None for arm in log.scenario.arms.values())
+        self.factor = 1.0 if planar else PICTURE_SIDE / max(right - left, top - bottom)
         self._changes = list_changes(log)
         self._tables: list[JsonObject] = []
         self._titles = [f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)]
@@ -72,6 +78,7 @@ class Charts:
                 for index, site in enumerate(self._log.sites)
             },
             "arms": [self._arm(index, site) for index, site in enumerate(self._log.sites)],
+            "bounds_m": [self.factor * bound for bound in self.bounds_m],
         }
 
     def _table(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> int:
@@ -239,7 +246,7 @@ class Charts:
         if not sizes_m:
             return []
         traced = arm_poses.trace_bodies_m(arm, sizes_m, self._log[site].bodies[rows])
-        return [picture_scale(self._log, self._bounds_m) * path.reshape(len(rows), -1) for path in traced]
+        return [self.factor * path.reshape(len(rows), -1) for path in traced]
 
     def _projected(self, site: str) -> JsonObject:
         part, arm = self._log[site], self._log.scenario.arms[site]
@@ -252,8 +259,7 @@ class Charts:
             arm_poses.project_arm_m(arm, desired),
             arm_poses.project_arm_m(arm, actual, onto_floor=True),
         )
-        factor = picture_scale(self._log, self._bounds_m)
-        points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * factor
+        points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * self.factor
         edges = self._edges(site, rows)
         table = self._store(site, part.tick[rows], np.hstack([points.reshape(len(rows), -1), *edges]))
         return {"points": points.shape[2], "bodies": len(edges), "table": table}
@@ -261,20 +267,6 @@ class Charts:
 
 def _chart(section: str, title: str, unit: str, series: list[JsonObject], **options: Any) -> JsonObject:
     return {"section": section, "title": title, "unit": unit, "series": series, **options}
-
-
-def workspace_box_m(log: Log) -> arm_poses.PictureBox:
-    """Returns left, right, bottom and top of a box around the motion of all arms, m."""
-    times = np.linspace(0.0, recorded_end_s(log), 60)
-    return arm_poses.pose_box_m([arm_poses.pose_at(log, site, t) for site in log.sites for t in times])
-
-
-def picture_scale(log: Log, bounds_m: arm_poses.PictureBox) -> float:
-    """Returns the units per m of pictures of the arms: 1 for planar arms, whatever their size."""
-    if all(arm.chain is None for arm in log.scenario.arms.values()):
-        return 1.0
-    left, right, bottom, top = bounds_m
-    return PICTURE_SIDE / max(right - left, top - bottom)
 
 
 def _packed(column: NDArray[Any], kind: str) -> str:

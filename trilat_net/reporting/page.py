@@ -27,9 +27,9 @@ from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
-from . import charts
 from .appearance import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 from .certificate_text import describe_certificate, list_energies
+from .charts import Charts
 from .figures.age_and_lateness import explain_missing_loop_times
 from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
@@ -55,42 +55,37 @@ def write_report(
     log: Log,
     folder: Path,
     *,
+    certificate: Certificate,
     twin: Log | None = None,
-    certificate: Certificate | None = None,
     verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
     """Writes report.html and summary.json, and returns their paths.
 
-    Charts are made before the verdicts are read, which may still be in the making. Without a certificate the
-    page has no section of it, and without `twin`, the same experiment without operators, no motion due to
-    them.
+    Charts are made before the verdicts are read, which may still be in the making. Without `twin`, the same
+    experiment without operators, the page has no motion due to them.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
-    section = verdict = ""
-    if certificate is not None:
-        facts["certificate"] = certificate.to_dict()
-        section = _render_certificate(certificate)
-        mark, text = describe_certificate(certificate)[0]
-        kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
-        found = f'<li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li>'
-        verdict = f'<ul class="verdicts">{found}</ul>'
-        pictures = []
-        if certificate.balance is not None:
-            pictures.append(("V and energies", draw_functional(log, certificate)))
-        if certificate.observed is not None and certificate.observed.curves:
-            drawn = draw_observed_energy(log, certificate.observed)
-            pictures.append(("energies that the laws declare", drawn))
-        if certificate.twins is not None and certificate.twins.pushes:
-            pictures.append(
-                ("what became of small pushes", draw_twins(PushedTwins(log, 0.0, certificate.twins)))
-            )
-        for words, drawn in pictures:
-            stream = io.BytesIO()
-            drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
-            data = base64.b64encode(stream.getvalue()).decode()
-            section += f'<img src="data:image/png;base64,{data}" alt="{words}" class="picture">'
-        section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
+    facts["certificate"] = certificate.to_dict()
+    section = _render_certificate(certificate)
+    mark, text = describe_certificate(certificate)[0]
+    kind, shown = {"ok": ("passed", "✓ "), "FAIL": ("failed", "✗ ")}.get(mark, ("open", "? "))
+    found = f'<li class="{kind}"><b>{shown}</b>stability: {escape(text)}</li>'
+    verdict = f'<ul class="verdicts">{found}</ul>'
+    pictures = []
+    if certificate.balance is not None:
+        pictures.append(("V and energies", draw_functional(log, certificate)))
+    if certificate.observed is not None and certificate.observed.curves:
+        drawn = draw_observed_energy(log, certificate.observed)
+        pictures.append(("energies that the laws declare", drawn))
+    if certificate.twins is not None and certificate.twins.pushes:
+        pictures.append(("what became of small pushes", draw_twins(PushedTwins(log, 0.0, certificate.twins))))
+    for words, drawn in pictures:
+        stream = io.BytesIO()
+        drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
+        data = base64.b64encode(stream.getvalue()).decode()
+        section += f'<img src="data:image/png;base64,{data}" alt="{words}" class="picture">'
+    section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
     facts["checks"] = [line.line() for line in lines]
     page, numbers = folder / "report.html", folder / "summary.json"
@@ -112,9 +107,8 @@ def render_report(
     The page begins with `verdict`, as HTML too.
     """
     scenario = log.scenario
-    bounds = charts.workspace_box_m(log)
-    factor = charts.picture_scale(log, bounds)
-    data = {**charts.Charts(log, twin, bounds).data(), "bounds_m": [factor * bound for bound in bounds]}
+    drawn = Charts(log, twin)
+    data = drawn.data()
     return Template(_asset("report.html")).substitute(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
@@ -124,7 +118,7 @@ def render_report(
         sites=_render_sites(log, facts),
         loops=_render_loops(log, facts),
         links=_links(log, facts),
-        strip=render_arms_svg(log, bounds, factor),
+        strip=render_arms_svg(log, drawn.bounds_m, drawn.factor),
         sections=certificate + _sections(log, data["charts"]),
         assumed=_render_assumptions(scenario),
         again=_render_commands(log),
