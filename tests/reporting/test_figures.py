@@ -102,9 +102,9 @@ def test_the_stated_mean_is_drawn_only_while_it_holds():
     assert "mean delay as stated" not in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_estimates_show_the_sites_that_are_asked_for():
-    figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"), sites=["m2"])
-    assert [len(lines(axes)) for axes in figure.axes] == [1] * 5
+def test_estimates_have_a_line_per_site_and_the_truth():
+    figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"))
+    assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
     assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
 
@@ -155,15 +155,15 @@ def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
     arm = log.scenario.arms["c"]
     base, elbow, end_effector = arm_poses.joint_positions_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
-    figure = arm_poses.draw_arms(log, instants=[0.0, 1.0])
-    assert len(figure.axes) == 8
+    instants = arm_poses.choose_instants_s(log)
+    figure = arm_poses.draw_arms(log)
+    assert len(figure.axes) == 4 * len(instants)
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
         (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
         points = np.concatenate([np.transpose(line.get_data()) for line in axes.lines])
         assert (points > (left, bottom)).all()
         assert (points < (right, top)).all()
-    instants = arm_poses.choose_instants_s(log)
     assert (instants[0], instants[-1]) == (0.0, pytest.approx(2.0))
     assert (np.diff(instants) > 0.0).all()
     assert 3 <= len(instants) <= arm_poses.INSTANTS

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 from importlib import import_module
-from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 _COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "FAIL": "red"}
 MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {"note": "note"}
 """Of findings, by their state."""
-NO_STYLES: Mapping[str, str] = MappingProxyType({})
 
 
 class TextTable(NamedTuple):
@@ -44,7 +42,7 @@ class TextTable(NamedTuple):
     rows: Sequence[Sequence[str]]
     align: str = "l"
     units: Sequence[str] = ()
-    styles: Mapping[str, str] = NO_STYLES
+    styles: Mapping[str, str] = {}
 
     @property
     def titles(self) -> list[str]:

@@ -136,13 +136,9 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
 
 
 @draws("arms", "the arms at a few instants", in_report=True)
-def draw_arms(log: Log, form: FigureSize = REPORT_SIZE, *, instants: Sequence[float] | None = None) -> Figure:
-    """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m.
-
-    The instants, s, are those of `choose_instants_s` unless given.
-    """
-    count = _NARROW_INSTANTS if form.narrow else INSTANTS
-    times = choose_instants_s(log, count) if instants is None else list(instants)
+def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m."""
+    times = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
     drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
     planar = all(arm.chain is None for arm in log.scenario.arms.values())
     left, right, bottom, top = pose_box_m([p for row in drawn.values() for p in row])
@@ -184,7 +180,7 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
     axes.plot(0.0, 0.0, **_BASE)
 
 
-def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float = 1.0) -> str:
+def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
     """Returns HTML with a row per site and a column per instant; bounds: left, right, bottom, top, m.
 
     A picture has `factor` units per m.

@@ -90,12 +90,10 @@ draws(
 def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the energies that the laws declare: lines and what is known of them, stores, arms' work, J.
 
-    A line has the color of the site that it comes to. Energies that cannot be judged give the reason.
+    A line has the color of the site that it comes to.
     """
     kinds = {one.kind for one in observed.curves}
     panels = [kind for kind in _OBSERVED_PANELS if kind in kinds]
-    if not panels:
-        return style.empty_figure(observed.text, form)
     with style.time_figure(log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8) as plot:
         rows = style.add_panels(plot.figure, len(panels), 1, sharex=True)[:, 0]
         at = dict(zip(panels, rows, strict=True))

@@ -260,42 +260,38 @@ def _learns(log: Log) -> bool:
     unless(_learns, "no estimate changed in this run"),
     in_report=True,
 )
-def draw_parameter_estimates(
-    log: Log, form: FigureSize = REPORT_SIZE, *, sites: Sequence[str] | None = None
-) -> Figure:
+def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the estimates of the parameters over time with the true values; Fig. 6 of the paper.
 
-    They are those of all sites unless `sites` are given; the paper shows master 1. A chain has a row per
-    link, two in a narrow figure.
+    They are those of all sites; the paper shows master 1. A chain has a row per link, two in a narrow figure.
     """
-    chosen = log.sites if sites is None else tuple(sites)
-    if log.scenario.arms[chosen[0]].chain is not None:
-        return _draw_link_estimates(log, form, chosen)
+    if log.scenario.arms[log.sites[0]].chain is not None:
+        return _draw_link_estimates(log, form)
     rows = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
     with style.time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
         panels = plot.figure.subplot_mosaic([[*row] for row in rows])
-        for index, (_, unit) in enumerate(log.scenario.arms[chosen[0]].parameters):
+        for index, (_, unit) in enumerate(log.scenario.arms[log.sites[0]].parameters):
             axes = panels[str(index + 1)]
-            _draw_estimate(plot, chosen, index, axes)
+            _draw_estimate(plot, log.sites, index, axes)
             symbol = rf"$\theta_{index + 1}$ ({style.typeset_unit(unit)})"
             axes.set_ylabel(symbol if form.narrow else f"estimate of {symbol}")
-            plot.mark(axes, chosen)
-        entries = [*style.site_legend_entries(log, chosen), ("true value", style.LIMIT_LINE)]
+            plot.mark(axes, log.sites)
+        entries = [*style.site_legend_entries(log, log.sites), ("true value", style.LIMIT_LINE)]
         plot.finish(list(panels.values()), entries)
     return plot.figure
 
 
-def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Figure:
-    arm = max((log.scenario.arms[site] for site in sites), key=lambda each: each.counts.joints)
+def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
+    arm = max((log.scenario.arms[site] for site in log.sites), key=lambda each: each.counts.joints)
     columns = LINK_PARAMETERS // (2 if form.narrow else 1)
     rows = len(arm.theta) // columns
     with style.time_figure(log, form, 0.8 + 0.74 * rows) as plot:
         grid = style.add_panels(plot.figure, rows, columns, sharex=True)
         panels: list[Axes] = [*grid.flat]
         for index, (axes, (name, unit)) in enumerate(zip(panels, arm.parameters, strict=True)):
-            known = [s for s in sites if index < len(log.scenario.arms[s].theta)]
+            known = [s for s in log.sites if index < len(log.scenario.arms[s].theta)]
             _draw_estimate(plot, known, index, axes, 0.9)
-            plot.mark(axes, sites, numbered=False)
+            plot.mark(axes, log.sites, numbered=False)
             link, _, symbol = name.rpartition(".")
             axes.set_title(
                 f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})", fontsize=5.5, pad=3.5
@@ -305,7 +301,7 @@ def _draw_link_estimates(log: Log, form: FigureSize, sites: Sequence[str]) -> Fi
             style.flatten_rounding(axes)
             if not index % LINK_PARAMETERS:
                 style.label_row(axes, f"{1 + index // LINK_PARAMETERS}: {link}", form)
-        entries = [*style.site_legend_entries(log, sites), ("true value", style.LIMIT_LINE)]
+        entries = [*style.site_legend_entries(log, log.sites), ("true value", style.LIMIT_LINE)]
         plot.finish([*grid[-1]], entries)
         for axes in grid[-1]:
             axes.set_xlabel("t (s)", fontsize=5.5, labelpad=1.0)
