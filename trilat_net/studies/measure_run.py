@@ -232,22 +232,20 @@ _END_NS = round(END_WINDOW_S * NS_PER_S)
 class SiteStats:
     """Statistics of one site, so far.
 
-    Args:
-        peer_rates: tick rate of every peer, Hz, in scenario order.
-        synchronised_rad: the |e| below which the site counts as synchronised, rad.
-        stretches: per window of [expect] the statistics within it; None where a window is another site's.
-
     Attributes:
+        stretches: per window of [expect] the statistics within it; None where a window is another site's.
         apart_ns: time of the last record whose |e| was not below `synchronised_rad`; -1 before one was.
         age_max_ms: per peer the largest age of the sample in use, shape (P,).
     """
 
-    def __init__(
-        self, peer_rates: Sequence[int], synchronised_rad: float, stretches: Sequence[WindowStats | None] = ()
-    ) -> None:
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
         self._peer_rates = np.array(peer_rates, dtype=np.int64)
-        self._synchronised_rad = synchronised_rad
-        self.stretches = tuple(stretches)
+        self._synchronised_rad = scenario.expect.synchronised_rad
+        self.stretches = [
+            WindowStats(window, scenario, site) if window.site in ("", site) else None
+            for window in scenario.expect.windows
+        ]
         self.records = 0
         self.peak_error_rad = self.peak_torque_nm = self.peak_speed_rad_s = 0.0
         self.apart_ns = -1
@@ -423,7 +421,7 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns its metrics."""
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
-    tallies = {name: _site_stats(scenario, name) for name in scenario.names}
+    tallies = {name: SiteStats(scenario, name) for name in scenario.names}
     diverged_at_s, late_samples = run_in_batches(
         scenario, {name: tally.add for name, tally in tallies.items()}
     )
@@ -446,7 +444,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
     diverged_at_s = log.diverged_s
-    tallies = {name: _site_stats(scenario, name) for name in log.sites}
+    tallies = {name: SiteStats(scenario, name) for name in log.sites}
     missing = 0
     for name, tally in tallies.items():
         part = log[name]
@@ -462,15 +460,6 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         missing=missing,
     )
     return msgspec.structs.replace(found, metrics=measure_whole(log, scenario.expect.metrics))
-
-
-def _site_stats(scenario: Scenario, site: str) -> SiteStats:
-    peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
-    stretches = [
-        WindowStats(window, scenario, site) if window.site in ("", site) else None
-        for window in scenario.expect.windows
-    ]
-    return SiteStats(peer_rates, scenario.expect.synchronised_rad, stretches)
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):

@@ -119,6 +119,8 @@ def test_every_missing_record_of_a_log_is_counted() -> None:
 PERIOD_NS = 10_000_000
 TALLIED = 400
 BUCKET_NS = 50_000_000
+RATES = {"sites.m1.rate_hz": 100, "sites.m2.rate_hz": 50, "sites.s.rate_hz": 100}
+HEARD = load_scenario("free", {**RATES, "expect.synchronised_rad": 1.0})
 
 
 def records(seed: int) -> RecordBatch:
@@ -129,8 +131,8 @@ def records(seed: int) -> RecordBatch:
     return RecordBatch(k * PERIOD_NS, *rng.normal(size=(5, TALLIED, 2)), np.maximum(used, -1))
 
 
-def tallied(rows: RecordBatch, cuts: list[int], synchronised_rad: float = 1.0) -> SiteStats:
-    tally = SiteStats([100, 50], synchronised_rad)
+def tallied(rows: RecordBatch, cuts: list[int]) -> SiteStats:
+    tally = SiteStats(HEARD, "s")
     edges = [0, *sorted(cuts), TALLIED]
     for first, last in pairwise(edges):
         tally.add(RecordBatch(*(part[first:last] for part in rows)))
@@ -174,7 +176,7 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
 
 
 def test_what_it_keeps_does_not_grow_with_the_records() -> None:
-    tally, block = SiteStats([100, 50], 1.0), records(1)
+    tally, block = SiteStats(HEARD, "s"), records(1)
     for n in range(30):
         tally.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
     assert len(tally.end(0).t_ns) <= 2 * TALLIED
@@ -191,7 +193,7 @@ def test_a_link_that_never_had_a_sample_has_no_age() -> None:
 def test_a_bucket_without_records_says_so() -> None:
     rows = records(1)
     keep = (rows.t_ns // BUCKET_NS) != 7
-    tally = SiteStats([100, 50], 1.0)
+    tally = SiteStats(HEARD, "s")
     tally.add(RecordBatch(*(part[keep] for part in rows)))
     assert [n for n, row in enumerate(tally.buckets) if row[0] < 0] == [7]
 
