@@ -15,7 +15,7 @@ together, have strayed. An arm hangs if both links point down at the end and did
 if their mean ends more than 0.2 rad from the pose in a log without a push that could explain it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
@@ -72,9 +72,8 @@ def check_comparable(scenario: Scenario) -> None:
         )
     t_s = np.arange(0.0, scenario.duration_s, 1.0 / _LOOK_HZ)
     pose = compute_consensus_pose(scenario, t_s)
-    for name, hand in _springs(scenario):
-        on, target = _target(hand, t_s)
-        apart = np.abs(target - pose) * on * (np.array(hand.stiffness_nm_rad) > 0.0)
+    for name, stiffness, on, target in _follow_springs(scenario, t_s):
+        apart = np.abs(target - pose) * on * (stiffness > 0.0)
         if apart.max(initial=0.0) > CONFLICT_RAD:
             at_s = t_s[apart.max(axis=1).argmax()]
             raise ScenarioError(
@@ -102,9 +101,8 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     start = np.sum([weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()], axis=0)
     stiffness = np.zeros((len(t_s), len(start)))
     torque = np.zeros((len(t_s), len(start)))
-    for name, hand in _springs(scenario):
-        on, target = _target(hand, t_s)
-        pull = weights[name] * np.array(hand.stiffness_nm_rad) * on
+    for name, spring, on, target in _follow_springs(scenario, t_s):
+        pull = weights[name] * spring * on
         stiffness += pull
         torque += pull * target
     held = stiffness > 0.0
@@ -113,15 +111,12 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     return np.take_along_axis(rows, last, axis=0)
 
 
-def _springs(scenario: Scenario) -> list[tuple[str, JointSpring]]:
-    hands = ((name, hand) for name, spec in scenario.sites.items() for hand in spec.hands)
-    return [(name, hand) for name, hand in hands if isinstance(hand, JointSpring)]
-
-
-def _target(hand: JointSpring, t_s: Array) -> tuple[Array, Array]:
-    """Returns where a hand is at work, shape (K, 1), 0 or 1, and its target, shape (K, n), rad."""
-    on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
-    return on, follow_target(hand.actor, t_s)[0]
+def _follow_springs(scenario: Scenario, t_s: Array) -> Iterator[tuple[str, Array, Array, Array]]:
+    """Yields each spring's site, stiffness, where it is at work, 0 or 1, shape (K, 1), and target, rad."""
+    for name, spec in scenario.sites.items():
+        for hand in (hand for hand in spec.hands if isinstance(hand, JointSpring)):
+            on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
+            yield name, np.array(hand.stiffness_nm_rad), on, follow_target(hand.actor, t_s)[0]
 
 
 STRAYED_RAD = 0.2
