@@ -19,7 +19,7 @@ from ...reporting import style
 from ...reporting.appearance import make_print_size
 from ..intervals import MeanInterval
 from ..study_folder import encode_csv
-from .bench_results import BenchPlace, BenchResults, build_bench_page, encode_runs, name_law
+from .bench_results import BenchResults, build_bench_page, encode_runs, name_law
 
 FIGURES_OF_BENCH = {
     "stable": ("share of stable runs", ""),
@@ -41,7 +41,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     label, quantity = FIGURES_OF_BENCH[name]
     tasks = [task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"]
     links = results.plan.links
-    fields = {task: _collect(results, task, links, quantity) for task in tasks}
+    fields = {task: _collect(results, task, quantity) for task in tasks}
     known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
     scale: Any = Normalize(0.0, 1.0)
     if quantity:
@@ -54,7 +54,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
         grid = style.add_panels(figure, len(tasks), 1, sharex=True, height_ratios=ratios)[:, 0]
         for axes, (task, field) in zip(grid, fields.items(), strict=True):
             image = axes.imshow(field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest")
-            _mark(axes, results, task, links)
+            _mark(axes, results, task)
             axes.set_title(task)
         grid[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
         figure.colorbar(image, ax=list(grid), label=label, fraction=0.03)
@@ -65,26 +65,20 @@ def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
     return [one for one in results.plan.laws if any(results.of(task, one[0]))]
 
 
-def _collect(results: BenchResults, task: str, links: list[str], quantity: str) -> Array:
+def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     """Returns the numbers of a panel, shape (laws, links); NaN where there is none."""
-    rows = _rows(results, task)
+    rows, links = _rows(results, task), results.plan.links
     field = np.full((len(rows), len(links)), np.nan)
     for place in results.of(task):
-        field[rows.index((place.cell.law, place.cell.form)), links.index(place.cell.link)] = _number(
-            place, quantity
-        )
+        value = place.mean(quantity) if quantity else place.stable / len(place.runs)
+        if value is not None:
+            at = rows.index((place.cell.law, place.cell.form)), links.index(place.cell.link)
+            field[at] = value.mean if isinstance(value, MeanInterval) else value
     return field
 
 
-def _number(place: BenchPlace, quantity: str) -> float:
-    if not quantity:
-        return place.stable / len(place.runs)
-    value = place.mean(quantity)
-    return np.nan if value is None else value.mean if isinstance(value, MeanInterval) else value
-
-
-def _mark(axes: Axes, results: BenchResults, task: str, links: list[str]) -> None:
-    rows = _rows(results, task)
+def _mark(axes: Axes, results: BenchResults, task: str) -> None:
+    rows, links = _rows(results, task), results.plan.links
     axes.set_yticks(range(len(rows)), [name_law(*one) for one in rows], fontsize=_TEXT_PT)
     axes.grid(visible=False)
     axes.set_facecolor(_NONE)

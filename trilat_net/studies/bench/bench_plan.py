@@ -310,10 +310,10 @@ def tune_laws(
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, wanted.values()))
     for form, laws in wanted.items():
         for round_trip_ms in TUNED_ROUND_TRIPS_MS:
-            settings = name_settings(build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}"))
+            base = load_tuning_task(form, round_trip_ms)
             for size in sorted({len(SEARCH_SPACES[law].knobs) for law in laws}):
                 alike = [law for law in laws if len(SEARCH_SPACES[law].knobs) == size]
-                plan = plan_tuning(BASES[form], settings, laws=alike, budget=size * budget)
+                plan = plan_tuning(base.source, base.overrides, laws=alike, budget=size * budget)
                 found += [_keep(form, round_trip_ms, one) for one in plan.run(jobs, on=on).found]
                 progress(len(found), total)
     return found
