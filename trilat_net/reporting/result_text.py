@@ -103,6 +103,11 @@ class TextTable(NamedTuple):
         ]
 
 
+def format_number(value: float | None, digits: int = 3) -> str:
+    """Returns a number as a cell of a table shows it; a dash for None."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
 class MarkedText(NamedTuple):
     """A line behind a mark.
 

@@ -13,7 +13,7 @@ from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, co
 from ..errors import UsageError
 from ..log.log_reader import Log, open_log
 from ..reporting.certificate_text import describe_judgement
-from ..reporting.result_text import Block, MarkedText, TextTable
+from ..reporting.result_text import Block, MarkedText, TextTable, format_number
 from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
@@ -144,7 +144,7 @@ def _tabulate_quantities(found: MetricComparison, means: Sequence[MeanInterval |
     for group, members in groupby(found.rows, key=lambda row: row.quantity.group):
         rows.append([group])
         for row in members:
-            values = ["-" if value is None else f"{value:.4g}" for value in row.values]
+            values = [format_number(value, 4) for value in row.values]
             values += [str(of_row[row] or "-")] if means else []
             rows.append([f"  {row.quantity.name}", row.quantity.unit or "-", *values])
     heads = ("", "unit", *found.columns, *(["mean, 95 %"] if means else []))

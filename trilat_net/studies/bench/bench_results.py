@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from ...analysis.run_end import EndBehaviour, Stability
-from ...reporting.result_text import Block, TextTable
+from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv
@@ -324,7 +324,7 @@ def tabulate_round_trips(results: BenchResults) -> TextTable:
         for law, _ in results.plan.laws:
             first, later = error(law, task, "rtt8"), error(law, task, "rtt272")
             times = ratio(error(law, task, "rtt1088"), first), ratio(error(law, task, "rtt272-loss50"), later)
-            rows.append((task, law, "-" if first is None else f"{first:.4g}", *times))
+            rows.append((task, law, format_number(first, 4), *times))
     heads = ("task", "law", "error at 8 ms, rad", "1088 ms: times that", "272 ms: half lost, times none lost")
     return TextTable(heads, rows, align="llr")
 

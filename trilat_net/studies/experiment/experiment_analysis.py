@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import UsageError
 from ...files import find_version, make_folder, write_whole
-from ...reporting.result_text import Block, TextTable
+from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
 from ..study_folder import encode_csv
 from .condition_figures import draw_conditions, draw_learning
@@ -234,11 +234,11 @@ class ExperimentAnalysis(Result):
             found = [
                 (
                     f"{one.second} - {one.first}",
-                    _number(one.difference),
+                    format_number(one.difference),
                     _span(one.interval),
-                    _number(one.t),
-                    _number(one.p_holm),
-                    _number(one.d_z),
+                    format_number(one.t),
+                    format_number(one.p_holm),
+                    format_number(one.d_z),
                 )
                 for one in self.comparisons[measure]
             ]
@@ -334,10 +334,6 @@ def compute_experiment_power(
         UsageError: the effect is too small to be found.
     """
     return PowerOfExperiment(effect, participants, seed)
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
 
 
 def _span(interval: tuple[float, float] | None) -> str:

@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
-from ...reporting.result_text import Block, TextTable
+from ...reporting.result_text import Block, TextTable, format_number
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
@@ -67,7 +67,7 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
         best, cheapest = ends or [(None, None)] * 2
         classes = (str(counts[outcome]) for outcome in reversed(CandidateClass))
         places = str(len(front)), str(len(tuned.shared(found)))
-        numbers = map(_number, (*best, *cheapest[::-1]))
+        numbers = map(format_number, (*best, *cheapest[::-1]))
         rows.append((found.space.law, str(len(found.tried)), *classes, *places, *numbers))
     heads = (*heads, f"least {value}", "at effort N m", "least effort N m", f"at {value}")
     return TextTable(heads, rows, align="lr")
@@ -114,12 +114,12 @@ _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s"
 def _score_cells(score: CandidateScore) -> tuple[str, ...]:
     error = _with_interval(score.error_rad, score.error_half_rad)
     effort = _with_interval(score.effort_nm, score.effort_half_nm)
-    spread, pose, settled = map(_number, (score.spread_rad, score.pose_rad, score.settled_s))
+    spread, pose, settled = map(format_number, (score.spread_rad, score.pose_rad, score.settled_s))
     return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.3g}"
 
 
 def _with_interval(mean: float | None, half: float | None) -> str:
-    return _number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
+    return format_number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
@@ -181,10 +181,6 @@ def build_tuning_page(tuned: TuningResult) -> str:
 
 def _block(lines: Sequence[str]) -> str:
     return "\n".join(["```", *lines, "```"])
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
 
 
 FRONT_WIDTH_IN = 3.5
