@@ -177,7 +177,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
 
 class _DwellGoal(TrialGoal):
-    """A goal that is met by staying where `_is_met` says, from `from_s` after its target appears on."""
+    """A goal that is met by staying where `_is_met` says."""
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
         super().__init__(start_m, task.width_m)

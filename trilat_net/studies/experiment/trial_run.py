@@ -31,13 +31,7 @@ from ...log.site_log import SiteLog
 from ...scenario import Scenario, parse_scenario
 from ...scenario.operators.program_hand import HandPlayer, HandSite
 from ...scenario.scenario_types import Change
-from .movement_measures import (
-    energy_j,
-    measure_pair,
-    movement_time_s,
-    path_length_m,
-    sparc,
-)
+from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
 from .protocol import PlannedTrial, Protocol, limit_forces
 from .synthetic_participant import SyntheticParticipant
 from .tasks import Outcome, TrialGoal

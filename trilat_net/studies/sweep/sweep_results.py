@@ -23,10 +23,7 @@ from ...files import import_extra, write_whole
 from ...results import Result
 from ...scenario.scenario_reader import read_source
 from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..study_folder import (
-    format_command,
-    set_options,
-)
+from ..study_folder import format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff
 from .sweep_plan import SweepPlan, plan_from_json
 
