@@ -108,7 +108,7 @@ class ExperimentSessions:
         """Makes a trial until one counts; false if the experiment was ended before."""
         plan, planned = self.experiment.plan, step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
-        trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest, whose="")
+        trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
         path = make_folder(self.experiment.folder / LOGS) / planned.file
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True

@@ -37,7 +37,7 @@ def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[bool, float, fl
     """Whether it succeeded, when the target appears and when the trial ends, by the log's numbers alone."""
     planned = done.plan.trials[int(row["trial_number"]) - 1]
     scenario = done.plan.scenarios[planned.condition]
-    goal = ExperimentTrial(done.plan.protocol, scenario, planned, done.plan.digest, whose="").make_goal()
+    goal = ExperimentTrial(done.plan.protocol, scenario, planned, done.plan.digest).make_goal()
     part = open_log(done.folder / row["log"])["s"]
     arm, task = scenario.arms["s"], done.plan.protocol.task
     at_m = np.array([arm.end_effector(q) for q in part.q])

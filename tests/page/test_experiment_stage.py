@@ -197,7 +197,6 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
         experiment.plan.scenarios["near"],
         experiment.plan.trials[0],
         experiment.plan.digest,
-        whose="",
     )
     assert trial.begin().take(0.0, [-0.6, 1.2]) is None
     people = People(experiment)

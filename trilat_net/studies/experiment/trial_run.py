@@ -83,27 +83,24 @@ class TrialJudge:
 
 
 class ExperimentTrial:
-    """A trial of the plan, of people or synthetic participants.
+    """A trial of the plan, of people.
 
     Attributes:
+        people: whether they are people, and no models of them.
         planned: its place in the plan.
         slave, arm: the site whose arm it is about, and that arm.
         scenario: its own, which lasts as long as the trial may.
         appears_s, longest_s: when its target appears, and when it has ended at the latest, s.
     """
 
-    def __init__(
-        self,
-        protocol: Protocol,
-        scenario: Scenario,
-        planned: PlannedTrial,
-        digest: str,
-        whose: str = "synthetic ",
-    ) -> None:
+    people = True
+
+    def __init__(self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str) -> None:
         self.protocol, self.planned = protocol, planned
-        self.slave, self.arm, self.people = scenario.slave, scenario.arms[scenario.slave], not whose
+        self.slave, self.arm = scenario.slave, scenario.arms[scenario.slave]
         spec = scenario.sites[self.slave]
         self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
+        whose = "" if self.people else "synthetic "
         about = f"trial {planned.number} of {protocol.name}: {whose}{', '.join(planned.group)}, condition "
         about += (
             f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
@@ -244,6 +241,8 @@ class ExperimentTrial:
 
 class SyntheticTrial(ExperimentTrial):
     """A trial of synthetic participants."""
+
+    people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
         found = dict[str, HandPlayer]()
