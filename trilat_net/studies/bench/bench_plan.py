@@ -278,8 +278,8 @@ def find_stale(entries: Iterable[TunedGains]) -> list[str]:
 
 def choose_round_trip(mean_ms: float) -> int:
     """Returns at which round trip the gains for a link were tuned: the next one that is no shorter."""
-    longer = [tuned_ms for tuned_ms in TUNED_ROUND_TRIPS_MS if tuned_ms >= mean_ms]
-    return longer[0] if longer else TUNED_ROUND_TRIPS_MS[-1]
+    longer = (tuned_ms for tuned_ms in TUNED_ROUND_TRIPS_MS if tuned_ms >= mean_ms)
+    return next(longer, TUNED_ROUND_TRIPS_MS[-1])
 
 
 def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, place: int) -> bool:

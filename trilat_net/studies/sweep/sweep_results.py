@@ -87,8 +87,7 @@ class SweepResults(Result):
 
     def outcome(self, row: ResultRow) -> CellResult:
         """Returns the result of a run."""
-        known = (field for field in CellResult.__struct_fields__ if field in row)  # older files lack some
-        return msgspec.convert({field: row[field] for field in known}, CellResult)
+        return msgspec.convert(row, CellResult)  # whose defaults stand for what older files lack
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
