@@ -16,6 +16,7 @@ import numpy as np
 
 from ...errors import UsageError
 from ...files import find_version, make_folder, write_whole
+from ...reporting import style
 from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
 from ..study_folder import encode_csv
@@ -184,15 +185,14 @@ class ExperimentAnalysis(Result):
         for name, text in texts.items():
             write_whole(made / name, text, force=True)
         self.paths = [made / name for name in texts]
-        for measure in self.means:
-            path = made / f"{measure}.png"
-            draw_conditions(self.of(measure), measure, unit=self.unit).savefig(path, dpi=200)
-            self.paths.append(path)
+        figures = {name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means}
         if len({row["trial"] for row in self.learning_rows}) > 1:
             protocol = self._experiment.plan.protocol
             learnt = "difference" if protocol.staircase else protocol.task.learnt
-            self.paths.append(made / "learning.png")
-            draw_learning(self.learning_rows, learnt, unit=self.unit).savefig(self.paths[-1], dpi=200)
+            figures["learning"] = draw_learning(self.learning_rows, learnt, unit=self.unit)
+        for name, figure in figures.items():
+            self.paths.append(made / f"{name}.png")
+            style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
         return self
 
     def fit_models(self) -> Iterator[MixedModel]:
