@@ -74,14 +74,14 @@ def draw_operator_displacement(
 @draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
-    limits: dict[str, Array] = {}
+    limits = list[Array]()
     for site in log.sites:
         largest = np.abs(site_signals.controller_torques(log[site])).max(axis=0, initial=0.0)
         stated = np.broadcast_to(log.scenario.sites[site].limits.tau_limit_nm, largest.shape)
         if (largest >= stated).any():
-            limits[site] = stated
+            limits.append(stated)
     signal = style.site_records(log, site_signals.controller_torques)
-    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", [*limits.values()])
+    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", limits)
 
 
 def _draw_joints(

@@ -122,7 +122,7 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
         limit = _find_exponent_limit(plane)
         shown = np.ma.masked_invalid(panel.exponents_per_s)
         axes.pcolormesh(x, y, shown, cmap=_EXPONENTS, vmin=-limit, vmax=limit, rasterized=True)
-        for at, edge in find_map_edges(plane, panel) if plane.y.key else []:
+        for at, edge in find_map_edges(plane, panel):
             ends = np.interp([edge.low, edge.high], plane.y.values, plane.y.places)
             axes.vlines(np.interp(at, plane.x.values, plane.x.places), *ends, **_VERDICT_EDGE)
     elif plane.seeds > 1:
@@ -316,7 +316,7 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     for line in theory:
         heads += [line.text, "difference"]
     rows = []
-    verdicts = find_map_edges(plane, panel) if plane.y.key else []
+    verdicts = find_map_edges(plane, panel)
     zeros = [(x, edge) for line in measured for x, edge in _list_crossings(line, plane)]
     for x, edge in zeros if plane.judged_by_twins else verdicts:
         row = [f"{x:g}", _format_edge(edge), "below" if edge.stable_below else "above"]
