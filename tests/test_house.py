@@ -35,7 +35,7 @@ def test_a_module_name_is_used_once() -> None:
 def test_the_house_is_no_larger_than_it_may_be() -> None:
     lines = [path.read_text(encoding="utf-8").count("\n") for path in house.files()]
     assert len(lines) <= 321
-    assert sum(lines) <= 77_511  # 69 300, and what the issues 28 to 30 allow: 2 000, 2 500, 3 800
+    assert sum(lines) <= 77_298  # 69 300, and what the issues 28 to 30 allow: 2 000, 2 500, 3 800
 
 
 @pytest.mark.push

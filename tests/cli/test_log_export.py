@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import polars as pl
@@ -111,13 +112,14 @@ def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> Non
 
 @contextmanager
 def no_file_longer_than(size: int) -> Iterator[None]:
-    """As a full disk, for every library that writes."""
+    """As a full disk, for every library that writes; but Python would keep modules that are cut off there."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with mock.patch.object(sys, "dont_write_bytecode", True):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -17,7 +17,8 @@ from trilat_net.core.jit import COMPILING
 from trilat_net.process import ENDING_SIGNALS, Interrupt, let_signals_kill
 
 LOG = Path(__file__).parents[1] / "golden" / "v3.mcap"
-WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1"}
+WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+"""Of short files Python would keep modules that are cut off."""
 
 
 def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.CompletedProcess[str]":

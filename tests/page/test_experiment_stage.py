@@ -24,7 +24,7 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.studies.experiment.experiment_analysis import analyse_experiment
 from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment, open_experiment
-from trilat_net.studies.experiment.trial_run import ExperimentTrial, SyntheticTrial
+from trilat_net.studies.experiment.trial_run import ExperimentTrial, SyntheticTrial, TrialJudge
 
 from .people import NO_SESSION, Killed, People
 
@@ -198,7 +198,7 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
         experiment.plan.trials[0],
         experiment.plan.digest,
     )
-    assert trial.begin().take(0.0, [-0.6, 1.2]) is None
+    assert TrialJudge(trial).take(0.0, [-0.6, 1.2], [0.0, 0.0]) is None
     people = People(experiment)
     left: list[int] = [1]
 
