@@ -61,8 +61,8 @@ def write_report(
 ) -> list[Path]:
     """Writes report.html and summary.json, and returns their paths.
 
-    Charts are made before the verdicts are read, which may still be in the making. Without `twin`, the same
-    experiment without operators, the page has no motion due to them.
+    The certificate's pictures are made before the verdicts are read, which may still be in the making.
+    Without `twin`, the same experiment without operators, the page has no motion due to them.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
