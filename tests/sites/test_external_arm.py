@@ -564,6 +564,8 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     for tick, reason, torque in ((110, LifeReason.RELEASED, None), (120, LifeReason.STOP, (1.5, -2.5))):
         say(at(tick, mode="stopped", mem=[0.0, 0.0, 1e6, 0.0, 0.0, float(reason)]))
         assert port.torque() == torque
+    say(at(125, mode="fault", mem=[]))  # since when, it does not say
+    assert port.torque() is None
     say(at(130, mode="diverged"))
     assert port.torque() is None
     assert not port.over

@@ -228,13 +228,13 @@ class ArmClient(OutsideClient):
         `BRAKE_NS` after a fault began, or a dead-man switch was let go: until then its torque brings it to
         rest.
         """
-        record, fresh = self.record, self.fresh
-        if not fresh or record is None:
+        if (record := self.record) is None or not self.fresh:
             return None
         shared = len(record.q_des)
-        released = record.mode == "stopped" and record.mem[2 * shared + 1] == LifeReason.RELEASED
-        since_ns = record.mem[shared] if record.mode == "fault" or released else record.t_ns
-        return tuple(record.tau) if record.t_ns - since_ns < BRAKE_NS else None
+        reason = record.mem[2 * shared + 1 : 2 * shared + 2]
+        released = record.mode == "stopped" and reason == [LifeReason.RELEASED]
+        since_ns = record.mem[shared : shared + 1] if record.mode == "fault" or released else [record.t_ns]
+        return tuple(record.tau) if since_ns and record.t_ns - since_ns[0] < BRAKE_NS else None
 
 
 def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
