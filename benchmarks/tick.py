@@ -48,7 +48,7 @@ class TickParts:
     def stamp(self) -> None:
         """Does what a tick does with times."""
         k = next(self.counter)
-        self.timing.schedule.deadline(k)
+        self.timing.deadline(k)
         self.take(self.samples)
         self.timing.sent(k, AT_NS)
         self.timing.echo()
@@ -62,7 +62,7 @@ class TickParts:
     def whole(self) -> bytes:
         """Does all that a tick does up to its sample."""
         k = next(self.counter)
-        self.timing.schedule.deadline(k)
+        self.timing.deadline(k)
         taken = self.take(self.decode())
         done = self.site.step(TickInput(k, taken))
         sent_ns, echoed = self.timing.sent(k, AT_NS), self.timing.echo()

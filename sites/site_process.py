@@ -267,7 +267,7 @@ class RunningSite:
 
         These are of tick k, whose nominal time is given.
         """
-        grid_ns = self._timing.schedule.deadline(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
+        grid_ns = self._timing.schedule.due_ns(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
         self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)

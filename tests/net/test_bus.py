@@ -232,7 +232,7 @@ def test_stamped_ring_that_is_full_loses_the_oldest(pair: tuple[Bus, Bus]) -> No
 
 
 @given(capacity=st.integers(1, 5), takes=st.lists(st.booleans(), max_size=60))
-def test_a_stamped_message_is_polled_or_waits_or_is_the_oldest(capacity: int, takes: list[bool]) -> None:
+def test_a_stamped_message_is_polled_waits_or_is_the_oldest(capacity: int, takes: list[bool]) -> None:
     ring = StampingRing(Ticking(), bytes, capacity)
     held: list[int] = []
     taken = 0

@@ -89,7 +89,7 @@ class Session:
 
     def _due(self, n: int, k: int) -> int:
         site = self.sites[n]
-        ahead_ns = site.timing.schedule.deadline(k) - site.clock.monotonic_ns()
+        ahead_ns = site.timing.schedule.due_ns(k) - site.clock.monotonic_ns()
         return self.true.monotonic_ns() + round(ahead_ns / (1 + site.clock._drift_ppb / S)) + 1
 
     def _tick(self, n: int, k: int) -> PeerSample:
@@ -258,7 +258,7 @@ def test_who_shares_the_leaders_clock_is_not_steered() -> None:
     for k in range(0, 5000, 100):
         timing.meters[0].take(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
         assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []
-    assert timing.schedule.deadline(10_000) == 5 + 10 * S
+    assert timing.schedule.due_ns(10_000) == 5 + 10 * S
     assert timing.schedule.slew == 0.0
 
 
@@ -276,7 +276,7 @@ EPOCH_NS = 5_000_000_123
 
 @given(st.integers(0, 10**9), st.integers(1, 4000))
 def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(k: int, rate_hz: int) -> None:
-    assert TickSchedule(EPOCH_NS, rate_hz).deadline(k) == EPOCH_NS + k * S // rate_hz
+    assert TickSchedule(EPOCH_NS, rate_hz).due_ns(k) == EPOCH_NS + k * S // rate_hz
 
 
 @given(
@@ -291,14 +291,14 @@ def test_it_never_steps_and_never_slews_beyond_the_limit(
     grid, k = TickSchedule(EPOCH_NS, rate_hz), 0
     for ticks, error_ns, drift in steers:
         k += ticks
-        before = grid.deadline(k)
+        before = grid.due_ns(k)
         grid.steer(k, error_ns, drift)
-        assert grid.deadline(k) == before
+        assert grid.due_ns(k) == before
         assert abs(grid.slew) <= SLEW_LIMIT == 200_000.0
         nominal_ns = tick_ns(k + rate_hz, rate_hz) - tick_ns(k, rate_hz)
-        assert abs(grid.deadline(k + rate_hz) - before - nominal_ns) <= nominal_ns * 200e-6 + 1
+        assert abs(grid.due_ns(k + rate_hz) - before - nominal_ns) <= nominal_ns * 200e-6 + 1
         for n in range(k, k + 5):
-            assert grid.deadline(n + 1) > grid.deadline(n)
+            assert grid.due_ns(n + 1) > grid.due_ns(n)
 
 
 @pytest.mark.parametrize("drift_ppb", [-150_000, -100_000, 0, 37_000, 150_000])
@@ -309,7 +309,7 @@ def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(drift_ppb: int, begi
     grid = TickSchedule(begin_ns, 1000)
     errors = []
     for k in range(0, 60_000, 100):
-        due_ns = grid.deadline(k)
+        due_ns = grid.due_ns(k)
         error_ns = leader.reads(due_ns) - tick_ns(k, 1000)
         errors.append(error_ns)
         grid.steer(k, error_ns, drift_ppb)

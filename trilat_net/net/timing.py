@@ -34,7 +34,7 @@ _SETTLE_S = 2.0  # time constant of an error: slow against the noise of an estim
 
 
 class TickSchedule:
-    """Deadlines of one site's ticks, on its clock.
+    """The grid of one site's ticks, on its clock.
 
     Attributes:
         slew: lag of the schedule against the clock, ns/s.
@@ -48,8 +48,8 @@ class TickSchedule:
         self._from_ns, self._base_ns = 0, epoch_ns
         self._slew_per_ns = 0.0
 
-    def deadline(self, k: int) -> int:
-        """Returns the deadline of tick k on the site's clock, ns."""
+    def due_ns(self, k: int) -> int:
+        """Returns when tick k lies on the grid, on the site's clock, ns."""
         passed_ns = k * NS_PER_S // self._rate_hz - self._from_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
@@ -58,7 +58,7 @@ class TickSchedule:
 
         The tick is late by `error_ns` against that schedule; `drift`, ns/s, is that of the leader's clock.
         """
-        self._base_ns = self.deadline(k)
+        self._base_ns = self.due_ns(k)
         self._from_ns = k * NS_PER_S // self._rate_hz
         self.error_ns = error_ns
         self.slew = min(max(-drift - error_ns / _SETTLE_S, -SLEW_LIMIT), SLEW_LIMIT)
@@ -275,8 +275,8 @@ class SiteTiming:
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline(self, k: int) -> int:
-        """Returns when the site is to wake up for tick k, on its clock, ns: in its turn."""
-        return self.schedule.deadline(k) + self.turn_ns
+        """Returns when the site is to wake up for tick k, on its clock, ns: on the grid, and in its turn."""
+        return self.schedule.due_ns(k) + self.turn_ns
 
     def opening(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
@@ -298,7 +298,7 @@ class SiteTiming:
             meter.admit(known)
             return []
         k = t_ns * self._rate_hz // NS_PER_S
-        at_ns = self.schedule.deadline(k)
+        at_ns = self.schedule.due_ns(k)
         offset_ns, wide_ns = epoch_ns + k * NS_PER_S // self._rate_hz - at_ns, bound_ns + FIRST_BOUND_NS
         sides = offset_ns - wide_ns, offset_ns + wide_ns, -DRIFT_LIMIT, DRIFT_LIMIT
         estimate = OffsetEstimate(at_ns, offset_ns, 0.0, *sides)
@@ -323,7 +323,7 @@ class SiteTiming:
     def settle(self, k: int, now_ns: int) -> list[ClockNotice]:
         """Estimates one clock, steers the schedule from tick k on, returns the events; ten times a second."""
         notices: list[ClockNotice] = []
-        due_ns = self.schedule.deadline(k)
+        due_ns = self.schedule.due_ns(k)
         for _ in self.meters:  # one estimate at a time, in turn: it takes a part of a tick
             self._turn = (self._turn + 1) % len(self.meters)
             meter = self.meters[self._turn]

@@ -184,11 +184,11 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     rule = log.scenario.sites[name].on_stale.rule
     life = part.layout.life_memory(len(part.peers), degrades=rule.degrades)
     own = life if rule.action is StaleAction.GLIDE else part.layout.shared + 1
-    memory = {}
-    for attribute in getattr(law, "remembers", ()):
-        length = np.size(getattr(law, attribute))
-        memory[attribute] = part.memory(own, length)[:count]
-        own += length
+    attributes = getattr(law, "remembers", ())
+    lengths = [np.size(getattr(law, attribute)) for attribute in attributes]
+    mem = part.memory(own, sum(lengths))[:count]
+    parts = np.split(mem, np.cumsum(lengths, dtype=np.int64)[:-1], axis=1)
+    memory = dict(zip(attributes, parts, strict=False))  # without any, the one part is empty
     sent = {key: values[:count] for key, values in part.sent.items()}
     peers = []
     for peer in part.peers:
