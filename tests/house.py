@@ -72,11 +72,3 @@ def definitions(path: Path) -> set[str]:
                 f"{node.name}.{below.name}" for below in node.body if isinstance(below, ast.FunctionDef)
             }
     return found
-
-
-def bodies(path: Path) -> Iterator[tuple[str, int]]:
-    """Yields every function with the lines of its body, docstring aside."""
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            body = node.body[1:] if ast.get_docstring(node) is not None else node.body
-            yield node.name, body[-1].end_lineno - body[0].lineno + 1 if body else 0
