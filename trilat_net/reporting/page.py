@@ -9,7 +9,7 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from importlib import resources
@@ -35,6 +35,7 @@ from .figures.arm_poses import render_arms_svg
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.joint_motion import explain_absent_operator
 from .figures.twin_differences import draw_twins
+from .page_data import Chart
 from .style import typeset
 
 _PAGE_DPI = 110
@@ -48,6 +49,7 @@ _MOST_MODES = 200
 _MOST_ALARMS = 8
 """Alarms that are shown in large."""
 _WORST = ("FAULT", "STOPPED")
+_NO_VALUE = "the log has no value to draw"
 _PREMISE_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
 
 
@@ -108,7 +110,7 @@ def render_report(
     """
     scenario = log.scenario
     drawn = Charts(log, twin)
-    data = drawn.data()
+    data, missing = drawn.data()
     return Template(_asset("report.html")).substitute(
         name=escape(scenario.name),
         title=escape(scenario.title or scenario.name),
@@ -119,13 +121,13 @@ def render_report(
         loops=_render_loops(log, facts),
         links=_links(log, facts),
         strip=render_arms_svg(log, drawn.bounds_m, drawn.factor),
-        sections=certificate + _sections(log, data["charts"]),
+        sections=certificate + _sections(log, data.charts, missing),
         assumed=_render_assumptions(scenario),
         again=_render_commands(log),
         versions=_render_versions(log),
         licence=escape(_asset("uPlot-LICENSE")),
         # what ends a script element early cannot stand in JSON with this escape, which means the same
-        data=_json(data).replace("<", "\\u003c"),
+        data=_json(data.to_builtins()).replace("<", "\\u003c"),
         css=_asset("report.css"),
         site_css=_site_css(log),
         js=_asset("report.js") + _asset("arms.js"),
@@ -134,11 +136,19 @@ def render_report(
     )
 
 
-def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
-    filled = {chart["section"] for chart in drawn}
+def _sections(log: Log, drawn: Sequence[Chart], missing: Mapping[str, Sequence[str]]) -> str:
+    """Returns the sections of charts, and which charts the page lacks and why.
+
+    Args:
+        log: the log.
+        drawn: the charts of the page.
+        missing: by section, the titles of charts for which the log has no value.
+    """
+    filled = {chart.section for chart in drawn}
     chains = any(arm.chain for arm in log.scenario.arms.values())
     absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
-    html, missing = "", []
+    html = ""
+    reasons: list[str] = []
     for key, (heading, sentence) in _WORDS["charts"].items():
         if key in filled:
             kind = "charts small" if key == "estimates" and chains else "charts"
@@ -146,10 +156,12 @@ def _sections(log: Log, drawn: Sequence[dict[str, Any]]) -> str:
                 sentence = _WORDS["notes"]["chain_estimates"]
             body = f'<p class="note">{escape(sentence)}</p><div class="{kind}" data-section="{key}"></div>'
             html += f"<section><h2>{escape(heading)}</h2>{body}</section>"
+            reasons += [f"{title} ({_NO_VALUE})" for title in missing.get(key, ())]
         elif absent.get(key):
-            missing.append(f"{heading.lower()} ({absent[key]})")
-    reasons = f'<p class="note">Not on this page: {escape("; ".join(missing))}.</p>' if missing else ""
-    return html + reasons
+            reasons.append(f"{heading.lower()} ({absent[key]})")
+        elif key in missing:
+            reasons.append(f"{heading.lower()} ({_NO_VALUE})")
+    return html + (f'<p class="note">Not on this page: {escape("; ".join(reasons))}.</p>' if reasons else "")
 
 
 def _links(log: Log, facts: JsonObject) -> str:

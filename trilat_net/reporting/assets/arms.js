@@ -24,12 +24,12 @@
     row.append(cell);
     const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
       "aria-label": arm.site });
-    if (arm.links_m) element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
+    if (arm.kind === "planar") element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
     const shadow = element(svg, "polyline", { class: "shadow" });
     const desired = element(svg, "polyline", { class: "desired" });
     const actual = element(svg, "polyline", { class: `arm site-${arm.colour}` });
     const bodies = Array.from({ length: arm.bodies }, () => element(svg, "polyline", { class: "body" }));
-    const joints = Array.from({ length: arm.points || 2 }, () => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
+    const joints = Array.from({ length: arm.kind === "planar" ? 2 : arm.points }, () => element(svg, "circle", { class: `joint fill-${arm.colour}`, r: 0.055 }));
     element(svg, "rect", { class: "base", x: -0.05, y: -0.05, width: 0.1, height: 0.1 });
     return { arm, shadow, desired, actual, joints, bodies };
   });
@@ -52,7 +52,7 @@
     return [[x, y], [x + l2 * Math.cos(q1 + q2), y - l2 * Math.sin(q1 + q2)]];
   };
   const places = (arm, q) => {  // of the arm's joints, of its reference's, and of the shadows of a chain
-    if (arm.links_m) return [bends(arm.links_m, q[0], q[1]), bends(arm.links_m, q[2], q[3]), []];
+    if (arm.kind === "planar") return [bends(arm.links_m, q[0], q[1]), bends(arm.links_m, q[2], q[3]), []];
     const point = (first, n) => [q[first + 2 * n], -q[first + 2 * n + 1]];
     return [0, 1, 2].map((part) => Array.from({ length: arm.points }, (_, n) => point(2 * arm.points * part, n)));
   };

@@ -1,4 +1,5 @@
 // Draws the charts of a report from the data in the page. One time axis for all of them.
+// Every field that is read here is declared in `page_data.py` and always sent.
 (() => {
   "use strict";
   const page = JSON.parse(document.getElementById("data").textContent);
@@ -36,6 +37,15 @@
       if (column[index + step] !== undefined) return index + step;
     }
     return index;
+  };
+
+  // Values between two gaps, through which no line leads: they are drawn as points.
+  const isolated = (u, seriesIndex) => {
+    const column = u.data[seriesIndex];
+    const own = column.flatMap((value, index) => (value === undefined ? [] : [index]));
+    const known = (place) => place >= 0 && place < own.length && column[own[place]] !== null;
+    const alone = own.filter((_, place) => known(place) && !known(place - 1) && !known(place + 1));
+    return alone.length ? alone : null;
   };
 
   let plots = [];
@@ -80,10 +90,9 @@
 
   // Shades where sites do not follow their peers, and what was changed when.
   function marks(chart) {
-    const sites = chart.sites || Object.keys(page.spans);
-    const changes = page.changes.filter((change) => sites.includes(change.site) && (change.link || !chart.links));
+    const changes = page.changes.filter((change) => chart.sites.includes(change.site) && (change.link || !chart.links));
     return (u) => clipped(u, (ctx, bbox, x) => {
-      for (const [index, mode, from, to] of sites.flatMap((site) => page.spans[site])) {
+      for (const [index, mode, from, to] of chart.sites.flatMap((site) => page.spans[site])) {
         ctx.globalAlpha = mode === "return" ? 0.1 : 0.25;
         ctx.fillStyle = colour(index);
         ctx.fillRect(x(from), bbox.top, x(to) - x(from), bbox.height);
@@ -104,7 +113,7 @@
   function horizontals(lines) {
     return (u) => clipped(u, (ctx, bbox, x) => {
       ctx.setLineDash([6 * devicePixelRatio, 3 * devicePixelRatio]);
-      for (const { value, colour: index, from = 0, to = page.end_s } of lines) {
+      for (const { value, colour: index, from, to } of lines) {
         const y = u.valToPos(value, "y", true);
         ctx.strokeStyle = colour(index);
         stroke(ctx, x(from), y, x(to), y);
@@ -130,13 +139,13 @@
 
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
-    const lines = chart.lines || [];
+    const { lines } = chart;
     const range = (u, min, max) => {
       const values = lines.map((line) => line.value);
       if (chart.log) return [0.7 * Math.min(min ?? 1, ...values), 2 * Math.max(max ?? 1, ...values)];
       let low = Math.min(min ?? 0, ...values, ...(chart.zero ? [0] : []));
       let high = Math.max(max ?? 1, ...values);
-      const pad = Math.max(0.06 * (high - low), (chart.margin || 0) * high) || 0.1 * Math.abs(high) || 0.1;
+      const pad = Math.max(0.06 * (high - low), chart.margin * high) || 0.1 * Math.abs(high) || 0.1;
       return [chart.zero ? low : low - pad, high + pad];
     };
     const shared = order.length > 1 && !order.some((series) => series.dash);
@@ -152,7 +161,7 @@
       series: [
         { label: "t", value: (u, v) => (v == null ? "–" : `${v.toFixed(3)} s`) },
         ...order.map((series, n) => ({
-          label: series.label, stroke: colour(series.colour), dash: dashOf(series), points: { show: false }, pxAlign: 0,
+          label: series.label, stroke: colour(series.colour), dash: dashOf(series), points: { show: false, filter: isolated }, pxAlign: 0,
           width: shared ? 2.4 - (1.3 * n) / (order.length - 1) : series.dash ? 1.1 : 1.8,
           value: (u, v) => number(v, chart.unit),
         })),
@@ -204,7 +213,7 @@
         { label: "from", value: (u, v) => (v == null ? "–" : `${Number(v.toPrecision(3))} ${chart.unit}`) },
         ...chart.series.map((series, n) => ({
           label: series.label, stroke: colour(series.colour), width: 2.2 - (1.2 * n) / Math.max(1, chart.series.length - 1),
-          dash: dashOf(series), paths: uPlot.paths.stepped({ align: 1 }), points: { show: false },
+          dash: dashOf({ colour: series.colour, dash: false }), paths: uPlot.paths.stepped({ align: 1 }), points: { show: false },
           value: (u, v) => (v == null ? "–" : `${v < 1 ? 0 : v} ticks`),
         })),
       ],
@@ -230,6 +239,7 @@
     }, [floats(chart.x), ...chart.series.map((series) => floats(series.values))], box);
   }
 
+  const BUILDERS = { time: timeChart, histogram, distribution };
   const boxes = page.charts.map((chart) => {
     const figure = document.createElement("figure");
     const caption = document.createElement("figcaption");
@@ -243,8 +253,7 @@
   function build() {
     plots.forEach((plot) => plot.destroy());
     timePlots = [];
-    const kind = (chart) => (chart.edges ? histogram : chart.points ? distribution : timeChart);
-    plots = page.charts.map((chart, n) => kind(chart)(chart, boxes[n]));
+    plots = page.charts.map((chart, n) => BUILDERS[chart.kind](chart, boxes[n]));
   }
 
   window.trilat = { page, tables, plots: () => timePlots, show: () => {} }; // the arms join in

@@ -1,0 +1,59 @@
+"""Pages that a browser has opened, and what is wrong with them: errors, empty frames, charts without points.
+
+Invariant:
+- Only what the browser has drawn counts: pixels of canvases and pictures, boxes of shapes. The data of a page prove
+  nothing.
+- A page may read no field that it was not sent, unless it asks first whether the field is there.
+"""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, BrowserContext, Page
+
+OBSERVER = Path(__file__).with_name("observe_page.js")
+
+
+class WatchedPage:
+    """A page whose errors are collected from its beginning.
+
+    Attributes:
+        page: the page.
+        errors: errors of its scripts and of its console, and requests that failed, in order.
+    """
+
+    def __init__(self, context: BrowserContext) -> None:
+        self.errors: list[str] = []
+        context.add_init_script(path=OBSERVER)
+        self.page = context.new_page()
+        self.page.on("pageerror", lambda error: self.errors.append(f"uncaught: {error.stack or error}"))
+        self.page.on("console", self._take_message)
+        self.page.on("requestfailed", lambda request: self.errors.append(f"not loaded: {request.url}"))
+
+    def _take_message(self, message: Any) -> None:
+        if message.type in ("error", "assert"):
+            self.errors.append(f"console: {message.text}")
+
+    def assert_whole(self, unsent: Collection[str] = ()) -> None:
+        """Asserts that the page has no error and no empty frame, and that every chart has drawn points.
+
+        Args:
+            unsent: fields that the page may read although nobody has sent them.
+        """
+        assert self.errors == []
+        assert self.page.evaluate("observed.faults()") == []
+        assert set(self.page.evaluate("observed.unsent()")) <= set(unsent)
+
+
+@contextmanager
+def watched_page(browser: Browser, **options: Any) -> Iterator[WatchedPage]:
+    """A page in a context of its own; at its end it has had no error."""
+    context = browser.new_context(**options)
+    try:
+        watched = WatchedPage(context)
+        yield watched
+        assert watched.errors == []
+    finally:
+        context.close()
