@@ -1,8 +1,8 @@
 """Pages that a browser has opened, and what is wrong with them: errors, empty frames, charts without points.
 
 Invariant:
-- Only what the browser has drawn counts: pixels of canvases and pictures, boxes of shapes. The data of a page prove
-  nothing.
+- Only what the browser has drawn counts: pixels of canvases and pictures, boxes of shapes. The
+  data of a page prove nothing.
 - A page may read no field that it was not sent, unless it asks first whether the field is there.
 """
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, BrowserContext, Page
+from playwright.sync_api import Browser, BrowserContext
 
 OBSERVER = Path(__file__).with_name("observe_page.js")
 

@@ -1,0 +1,138 @@
+"""Runs of every kind that a report must show, from all delay models and laws to logs without a record."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import trilat_net
+from tests.analysis import logs
+from tests.analysis.certificate import runs
+from tests.chains import six_joints
+from tests.control_laws.law_settings import LAWS as PLUGGED_LAWS
+from tests.core.guarded_runs import guarded, stopped_log
+from tests.sites.sessions import Session, gliding, reached
+from tests.task_arms import planar_task, posed_arms
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.scenario import Scenario, list_shipped, load_scenario, parse_scenario
+
+MakeLog = Callable[[], Log]
+
+LINKS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "constant": {"delay_ms": 120.0},
+    "uniform": {"delay_ms": 80.0, "half_width_ms": 40.0},
+    "normal": {"delay_ms": 80.0, "deviation_ms": 15.0},
+    "gamma": {"delay_ms": 80.0, "deviation_ms": 30.0, "loss": 0.1, "loss_burst": 4.0},
+    "lognormal": {"delay_ms": 80.0, "deviation_ms": 30.0, "order": "in_order"},
+    "hyperexponential": {"floor_ms": 30.0, "fast_ms": 5.0, "slow_ms": 200.0, "slow_share": 0.02},
+    "ar1": {"delay_ms": 80.0, "deviation_ms": 20.0, "correlation": 0.9, "playout_ms": 90.0},
+    "sine": {"delay_ms": 60.0, "amplitude_ms": 30.0, "period_s": 0.7},
+    "trace": {"trace": "0 20000, 400000 90000, 800000 lost, 1200000 40000", "at_end": "loop"},
+    "low_orbit": {"slot_s": 0.5, "duplicate": 0.1, "outages_s": [[0.8, 1.1]]},
+}
+"""A link of each delay model that virtual time can have; "measured" needs a network."""
+
+LAW_SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
+    **PLUGGED_LAWS,
+    "adaptive": ("paper", {}),
+    "adaptive_box": ("box", {}),
+    "p_d": ("p_d_margin", {}),
+    "p_f": ("contact", {}),
+    "pd_d": ("two_sites", {}),
+    "wave": ("two_sites", {"scheme": "digital"}),
+    "tdpa": ("two_sites", {"scheme": "digital"}),
+    "tanks": ("two_sites", {"scheme": "digital"}),
+    "own": ("two_sites", {"control": {"law": "tests.laws:Adaptive"}}),
+}
+"""Per law a scenario that it runs in, and settings."""
+
+SHORT = {"duration_s": 2.0, "rate_hz": 200}
+
+
+def simulate(name: str, overrides: Mapping[str, Any] = {}) -> Log:
+    """A short run of a shipped scenario."""
+    return trilat_net.simulate(load_scenario(name, {**SHORT, **overrides}))
+
+
+def run_with_law(law: str) -> Log:
+    """A short run in which every site has a law."""
+    name, settings = LAW_SETTINGS[law]
+    named = {} if "control" in settings else {"control.law": law}
+    return simulate(name, {**named, **settings})
+
+
+def run_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) -> Log:
+    """A session of sites and a recorder; the slave is given orders at times, s after the start."""
+    with TemporaryDirectory() as folder:
+        session = Session.whole(scenario, Path(folder), ends={})
+
+        def give_orders(bus: Bus, clock: Clock) -> None:
+            begun_ns = clock.monotonic_ns()
+            for at_s, order in orders:
+                clock.sleep_until(begun_ns + int(at_s * 1e9))
+                reached(bus, clock).order(["s"], order)
+
+        if orders:
+            session.stranger(give_orders)
+        session.run()
+        return open_log(BytesIO(session.path.read_bytes()))
+
+
+def in_fault() -> Log:
+    """A slave under the rule `glide` that its hand pushes beyond its limit of speed."""
+    limits = {"qd_limit_rad_s": 0.2}
+    return trilat_net.simulate(guarded(limits, where="sites.s."))
+
+
+def torn(ticks: int, *sites: str) -> Log:
+    """A log that ends after few ticks, without some sites."""
+    whole = logs.timed(logs.simulated("paper"))
+    return logs.rewritten(
+        whole,
+        lambda record: record.tick < ticks and record.site in (sites or whole.sites),
+        finished=False,
+        driver="live",
+    )
+
+
+def with_gaps() -> Log:
+    """A log in which a site has single records between gaps."""
+    return logs.rewritten(
+        logs.simulated("paper"), lambda record: record.site != "m1" or record.tick % 100 == 0
+    )
+
+
+VARIED: dict[str, MakeLog] = {
+    **{f"shipped {name}": partial(trilat_net.simulate, name) for name in list_shipped()},
+    **{
+        f"delay {model}": partial(simulate, "paper", {"link": {"model": model, **keys}})
+        for model, keys in LINKS.items()
+    },
+    "delay measured": lambda: run_session(
+        load_scenario("two_sites", {**SHORT, "link": {"model": "measured"}})
+    ),
+    **{f"law {law}": partial(run_with_law, law) for law in LAW_SETTINGS},
+    "six joints": lambda: trilat_net.simulate(parse_scenario(six_joints(1.0), overrides={"rate_hz": 200})),
+    "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task(rate_hz=200))),
+    "posed task": lambda: trilat_net.simulate(parse_scenario(posed_arms(1.0), overrides={"rate_hz": 200})),
+    "carried bodies": lambda: simulate(
+        "paper", {"sites.s.plant": {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}}
+    ),
+    "four sites": lambda: logs.timed(logs.simulated("four")),
+    "live change": lambda: logs.busy().log,
+    "stop and enable": stopped_log,
+    "orders in a session": lambda: run_session(gliding(4.0), ((1.5, "stop"), (3.0, "enable"))),
+    "fault": in_fault,
+    "diverged": logs.diverged,
+    "everything": lambda: runs.run("rich").log,
+    "no record": lambda: torn(0),
+    "one record a site": lambda: torn(1),
+    "one of three sites": lambda: torn(200, "m1"),
+    "single records": with_gaps,
+}
+"""What is varied, and a run of it."""
