@@ -269,12 +269,10 @@ def sweep(
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values is not valid.
-        UsageError: the folder holds something else, or polars is not installed.
+        UsageError: the folder holds something else.
     """
     from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
-    from .studies.sweep.sweep_results import require_polars
 
-    require_polars()
     texts = _texts(set, duration_s)
     more: dict[str, Any] = {"laws": laws, "longest_s": longest_s, "judge": judge, "metrics": metrics}
     plan = plan_sweep(scenario, texts, over=over, seeds=seeds, **more)

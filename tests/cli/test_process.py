@@ -127,7 +127,7 @@ def test_logs_and_studies_need_what_every_system_has(tmp_path: Path) -> None:
     )
     assert "θ → 0" in printed
     assert len(list((tmp_path / "start").glob("*.process"))) >= 2  # of a worker too
-    sweeps = [pandas.read_parquet(tmp_path / name / "results.parquet") for name in ("one", "two")]
+    sweeps = [pandas.read_csv(tmp_path / name / "results.csv") for name in ("one", "two")]
     assert sweeps[0].equals(sweeps[1])
 
 

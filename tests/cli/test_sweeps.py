@@ -31,7 +31,7 @@ def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Pa
     assert sum(int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")) == 12
     assert "times real time per process" in text
     assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1  # without lines of progress
-    assert "results: runs/sweep-trio-001/results.parquet" in lines
+    assert "results: runs/sweep-trio-001/results.csv" in lines
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again
     for line in (line for line in again if line.startswith("  trilat sweep ")):
@@ -40,7 +40,7 @@ def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Pa
 
 
 def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
-    for source in ("done", "done/results.parquet"):
+    for source in ("done", "done/results.csv"):
         text = trilat("sweep", source, "--cell", "6", cwd=folder).succeeds()
     assert text.startswith("trilat sim trio.toml --set link.delay_ms=20 --set control.Kd=3 --seed 1 ")
     trilat(*text.split()[1:], cwd=folder).succeeds()
@@ -48,12 +48,12 @@ def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
 
 
 def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
-    before = (folder / "done" / "results.parquet").read_bytes()
+    before = (folder / "done" / "results.csv").read_bytes()
     for how in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
         text = trilat("sweep", *how, cwd=folder).succeeds()
         assert "12 runs are done already" in text
         assert "nothing was left to run" in text
-    assert (folder / "done" / "results.parquet").read_bytes() == before
+    assert (folder / "done" / "results.csv").read_bytes() == before
 
 
 def test_a_folder_that_is_called_as_a_scenario_is_none(folder: Path) -> None:
@@ -79,7 +79,7 @@ BAD = {
     "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["holds something"]),
     "nothing to sweep": ([], ["--over"]),
     "no seeds": (["--over", "control.Kd=1,2", "--seeds", "5..1"], ["1..20"]),
-    "a cell of a scenario": (["--cell", "3"], ["trio.toml", "Parquet"]),
+    "a cell of a scenario": (["--cell", "3"], ["trio.toml", "no results of a sweep"]),
 }
 
 
@@ -103,7 +103,7 @@ def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
 
 def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -> None:
     names = sorted(path.name for path in (folder / "done").iterdir())
-    assert {"map.md", "map.png", "map.svg", "results.parquet"} <= set(names)
+    assert {"map.md", "map.png", "map.svg", "results.csv"} <= set(names)
     text = (folder / "done" / "map.md").read_text()
     assert f"trilat sweep trio.toml {' '.join(OVER)} --map\n" in text
 
@@ -115,7 +115,7 @@ def test_results_are_drawn_once_more_the_same(folder: Path) -> None:
     assert "done/map.png" in text
     for name, data in before.items():
         assert (folder / "done" / name).read_bytes() == data
-    trilat("sweep", "done/results.parquet", "--map", "--width", "7", "--jobs", "1", cwd=folder).succeeds()
+    trilat("sweep", "done/results.csv", "--map", "--width", "7", "--jobs", "1", cwd=folder).succeeds()
     assert (folder / "done" / "map.png").read_bytes() != before["map.png"]
 
 
@@ -140,7 +140,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("done", "--cell", "12"), "numbered from 0 to 11"),
         (("--cell", "1"), "--cell is of results"),
         (("--resume", "none"), "no sweep was begun there"),
-        (("none.parquet",), "no results of a sweep"),
+        (("none.csv",), "no results of a sweep"),
         (("--over", "control.Kd=1,2"), "name a scenario"),
         (("done", "--map", "--confirm", "1"), "--map and --confirm exclude each other"),
         (("done", "--map", "--cell", "1"), "--map and --cell exclude each other"),

@@ -108,7 +108,7 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
         ({**LINK, "ramp_s": 2.0}, "timeline[0].ramp_s", "only shares have a ramp"),
         ({**LINK, "to": {"delay_ms": -1}}, "timeline[0].to.delay_ms", ">= 0"),
         ({**LINK, "to": {"delay": 1}}, "timeline[0].to.delay", "did you mean 'delay_ms'"),
-        ({**LINK, "to": {"model": "uniform", "delay_ms": 5}}, "timeline[0].to", "half_width_ms is missing"),
+        ({**LINK, "to": {"model": "gamma", "delay_ms": 5}}, "timeline[0].to", "deviation_ms is missing"),
         ({**LINK, "to": {"order": "last"}}, "timeline[0].to.order", "'newest' or 'in_order'"),
         ({**LINK, "to": {"loss": 1.0, "loss_burst": 3}}, "timeline[0].to.loss", "must be below"),
         ({**LINK, "to": {"outages_s": [[1, 2]]}}, "timeline[0].to.outages_s", "cannot change"),

@@ -236,10 +236,9 @@ def sweep_command(
         tolerance: Width of an edge relative to its value.
         confirm: With results: run this many cells on each side of the edge live.
     """
-    from ..studies.sweep import plan_sweep, sweep_results
+    from ..studies.sweep import plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
 
-    sweep_results.require_polars()
     given = _check_modes(options.given_options(context))
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
@@ -319,8 +318,6 @@ def parse_seed_count(text: str | None) -> int | list[int]:
 def _is_results(source: str) -> bool:
     """True if a source names the results of a sweep; names of shipped scenarios never do."""
     from ..scenario import list_shipped
-    from ..studies.sweep.sweep_run import PLAN_FILE
+    from ..studies.sweep.sweep_results import PLAN_FILE
 
-    return source not in list_shipped() and (
-        source.endswith(".parquet") or (Path(source) / PLAN_FILE).exists()
-    )
+    return source not in list_shipped() and (source.endswith(".csv") or (Path(source) / PLAN_FILE).exists())

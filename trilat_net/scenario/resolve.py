@@ -392,7 +392,9 @@ def _complete_link(
     """Returns a resolved link with the trace that its file has; refuses one that lacks a key."""
     if link["model"] == "trace":
         link = _read_trace_file(link, name, trace_path or path, folder)
-    for field in msgspec.structs.fields(DELAY_MODELS[link["model"]]):
+    kind = DELAY_MODELS[link["model"]]
+    link = {**kind.derive_keys(link), **link}
+    for field in msgspec.structs.fields(kind):
         if field.required and field.name not in link:
             where = "; give it here or in [link]" if trace_path else ""
             raise ScenarioError(f"is missing{where}", path=f"{path}.{field.name}")
@@ -497,4 +499,5 @@ def _change_link(written: Any, link: str, present: TomlTable, path: str) -> Toml
         raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
     if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
         raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
+    after = {**DELAY_MODELS[after["model"]].derive_keys(after), **after}
     return {**after, "outages_s": before["outages_s"]} if "outages_s" in before else after

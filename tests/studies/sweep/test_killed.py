@@ -71,9 +71,9 @@ def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Pat
         "interrupted",
     ]
     assert done + 10 <= kept < RUNS
-    assert not (parts / "results.parquet").exists()
+    assert not (parts / "results.csv").exists()
     text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
     assert f"{kept} runs are done already" in text
-    assert (parts / "results.parquet").read_bytes() == (tmp_path / "whole/results.parquet").read_bytes()
+    assert (parts / "results.csv").read_bytes() == (tmp_path / "whole/results.csv").read_bytes()
     made = keys(parts / JOURNAL_FILE)
     assert len(made) == len(set(made)) == RUNS

@@ -268,3 +268,40 @@ def test_an_invalid_axis_is_refused_with_a_valid_one(text: str, words: tuple[str
     problem = axis_refused(text)
     for word in words:
         assert word in problem
+
+
+@pytest.mark.parametrize(
+    ("overrides", "laws"),
+    [
+        (["link.model=uniform"], []),
+        (["link.model=uniform", "link.half_width_ms=10"], []),
+        (["link.model=gamma", "link.deviation_ms=4"], []),
+        (["link.model=sine", "link.amplitude_ms=5", "link.period_s=1"], []),
+        (["link.preset=rtt68-loss10"], []),
+        (["control.d=2"], ["p_d"]),
+        (["link.model=uniform", "control.d=2"], ["p_d", "pd_d"]),
+    ],
+)
+def test_overrides_may_need_what_is_swept(overrides: list[str], laws: list[str]) -> None:
+    plan = plan_sweep("free", overrides, over=["link.delay_ms=20:60:20"], laws=laws)
+    again = plan_from_json(json.loads(json.dumps(plan.facts())))
+    assert again.facts() == plan.facts()
+    for number in range(plan.cells):
+        cell = plan.cell(number)
+        scenario = plan.scenario(*cell.overrides)
+        assert again.scenario(*again.cell(number).overrides).sha256 == scenario.sha256
+        assert {link.delay_ms for link in scenario.links.values()} == {cell.values[0]}  # type: ignore[attr-defined]
+        if laws:
+            assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {cell.law}
+
+
+def test_an_axis_of_models_needs_no_widths() -> None:
+    plan = plan_sweep("free", ["link.delay_ms=40"], over=["link.model=uniform,constant"])
+    assert plan.cells == 2
+
+
+@pytest.mark.parametrize("text", ["name = 'x'", "no TOML", "name = 'x'\nsites = 5\n"])
+def test_a_broken_scenario_is_refused_with_laws(text: str, tmp_path: Path) -> None:
+    (tmp_path / "broken.toml").write_text(text)
+    with pytest.raises(ScenarioError, match="broken"):
+        plan_sweep(tmp_path / "broken.toml", laws=["p_d"], over=["control.d=1,2"])

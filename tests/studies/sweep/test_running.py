@@ -150,4 +150,4 @@ def test_a_summary_counts_every_run_once(tmp_path: Path, monkeypatch: pytest.Mon
     assert "in 1 cell nothing is random: one seed was run there" in text
     assert "stable with some seeds and not with others" in text
     assert "95 % interval" in text
-    assert "all in places.parquet" in text
+    assert "all in places.csv" in text

@@ -1,9 +1,10 @@
 """Results: what was run, number for number, in a file that other programs read; shares with intervals."""
 
+import csv
 import json
 import math
 import sys
-import types
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,6 @@ from trilat_net.studies.sweep.sweep_results import (
     collect_grid_points,
     encode_results,
     reproduction_duration_s,
-    require_polars,
 )
 
 from .quick import DELAYS, Judge, asked, outcome_of
@@ -45,7 +45,7 @@ def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -
     again = read_results(path)
     assert list(again.rows) == list(results.rows)
     assert again.plan.facts() == results.plan.facts()
-    assert read_results(path / "results.parquet") == again
+    assert read_results(path / "results.csv") == again
     for row in again.rows:
         assert again.outcome(row) == judge(row["scenario"], 4.0)
         assert f"seed = {row['seed']}" in row["scenario"]
@@ -72,23 +72,60 @@ def test_bytes_do_not_depend_on_order_in_which_runs_ended(
     with prepare_sweep_folder(results.plan, path).journal() as journal:
         entries = list(journal.done.values())
     for order in (entries, entries[::-1]):
-        facts = json.loads((path / "plan.json").read_text())
-        data = encode_results(results.plan, build_result_rows(results.plan, order), facts)
-        assert data == (path / "results.parquet").read_bytes()
+        table = encode_results(results.plan, build_result_rows(results.plan, order))
+        assert table.encode() == (path / "results.csv").read_bytes()
 
 
-def test_another_program_reads_it_and_what_it_is(swept: tuple[Path, SweepResults, Judge]) -> None:
-    arrow = pytest.importorskip("pyarrow.parquet")
+def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) -> None:
     path, results, _ = swept
-    table = arrow.read_table(path / "results.parquet")
-    assert table.to_pylist() == [dict(row) for row in results.rows]
-    kinds = dict(zip(table.schema.names, map(str, table.schema.types), strict=True))
-    assert (kinds["link.loss"], kinds["cell"], kinds["random"]) == ("double", "int64", "bool")
-    assert "string" in kinds["link.order"]
-    facts = json.loads(arrow.read_metadata(path / "results.parquet").metadata[b"trilat_net.sweep"])
+    with (path / "results.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    for line, row in zip(lines, results.rows, strict=True):
+        for name, value in row.items():
+            if name == "scenario":
+                continue
+            if value is None or isinstance(value, bool):
+                assert line[name] == {None: "", True: "true", False: "false"}[value]
+            elif isinstance(value, float):
+                assert float(line[name]) == value
+            else:
+                assert line[name] == str(value)
+
+
+def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judge]) -> None:
+    pandas = pytest.importorskip("pandas")
+    path, results, _ = swept
+    frame = pandas.read_csv(path / "results.csv")
+    kinds = [str(frame.dtypes[name]) for name in ("link.loss", "cell", "random")]
+    assert kinds == ["float64", "int64", "bool"]
+    peaks_rad = [row["peak_error_rad"] for row in results.rows]
+    assert list(frame["peak_error_rad"]) == pytest.approx(peaks_rad, rel=1e-15)
+
+
+def test_the_request_stands_beside_the_table(swept: tuple[Path, SweepResults, Judge]) -> None:
+    path, results, _ = swept
+    facts = json.loads((path / "plan.json").read_text())
     assert facts["scenario_sha256"] == results.plan.base.sha256
     assert facts["text"] == results.plan.written.text
     assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
+
+
+def test_a_sweep_needs_no_optional_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pandas", "polars", "pyarrow"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    plan = asked(tmp_path, over=[DELAYS], seeds=2)
+    run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1)
+    assert len(read_results(tmp_path / "o").rows) == 3
+
+
+def test_a_very_long_scenario_is_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    plan = asked(tmp_path, over=[DELAYS])
+    rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
+    rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
+    (tmp_path / "o" / "results.csv").write_text(encode_results(plan, rows), newline="")
+    assert read_results(tmp_path / "o").rows == rows
 
 
 @pytest.mark.long
@@ -102,10 +139,11 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
         entries.append(
             CellRun(number, 1, False, "p_d", f"{number:064x}", diff_lines(text, base), outcome_of(text))
         )
-    data = encode_results(sweep, build_result_rows(sweep, entries), sweep.facts())
+    table = encode_results(sweep, build_result_rows(sweep, entries))
     assert len(entries) == 10_000
-    assert len(data) < 4e6
-    (tmp_path / "results.parquet").write_bytes(data)
+    assert len(table) < 10e6
+    (tmp_path / "results.csv").write_text(table)
+    (tmp_path / "plan.json").write_text(json.dumps(sweep.facts()))
     assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
 
 
@@ -129,20 +167,31 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
 
     begun = prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
     refused(begun, "no results", f"trilat sweep --resume {begun}")
-    refused(tmp_path / "none.parquet", "no results")
-    (tmp_path / "bad.parquet").write_bytes(b"PAR1 nothing PAR1")
-    refused(tmp_path / "bad.parquet", "cannot be read as Parquet")
-    require_polars().DataFrame({"a": [1]}).write_parquet(tmp_path / "other.parquet")
-    refused(tmp_path / "other.parquet", "holds no results of a sweep")
+    refused(tmp_path / "none.csv", "no results")
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    refused(tmp_path / "other.csv", "holds no results of a sweep", "plan.json")
 
 
-def test_without_polars_or_with_old_one_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "polars", types.ModuleType("polars"))
-    with pytest.raises(UsageError, match=r"polars 1\.30 or newer: pip install"):
-        require_polars()
-    monkeypatch.setitem(sys.modules, "polars", None)
-    with pytest.raises(UsageError, match=r"sweeps need polars: pip install 'trilat-net\[frames\]'"):
-        require_polars()
+@pytest.mark.parametrize(
+    ("damage", "word"),
+    [
+        (lambda text: text.replace("verdict", "verdicts", 1), "'verdict' is missing"),
+        (lambda text: text[:-60], "cannot be read"),
+        (lambda text: text.replace("0,", "zero,", 1), "cannot be read"),
+        (lambda text: text[: text.rindex("[")], "cannot be read"),
+        (lambda text: "PAR1 nothing PAR1\n\0", "holds no results"),
+    ],
+)
+def test_a_damaged_table_is_refused(
+    damage: Callable[[str], str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    folder = run_sweep(prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1).folder.path
+    table = folder / "results.csv"
+    table.write_text(damage(table.read_text()))
+    with pytest.raises(UsageError, match=word) as error:
+        read_results(folder)
+    assert str(table) in str(error.value)
 
 
 @pytest.fixture
@@ -164,9 +213,10 @@ def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
 
 
 def test_they_stand_in_a_file_where_there_are_seeds(points: list[GridPoint], tmp_path: Path) -> None:
-    polars = pytest.importorskip("polars")
-    rows = polars.read_parquet(tmp_path / "o" / GRID_POINTS_FILE).to_dicts()
-    for row, place in zip(rows, points, strict=True):
+    with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    for line, place in zip(lines, points, strict=True):
+        row = {name: float(text) if text and name != "law" else None for name, text in line.items()}
         assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
         assert (row["link.loss"], row["link.delay_ms"]) == place.values
         assert (row["stable_share_low"], row["stable_share_high"]) == place.interval

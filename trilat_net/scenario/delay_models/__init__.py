@@ -14,7 +14,7 @@ from msgspec import Meta
 from ...core.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel
 from ...core.plugged import list_numbers, plug
 from ...core.vectors import Points
-from ...fields import Frozen, KeyProblem, find_kinds
+from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
 
 MAX_DELAY_MS = MAX_DELAY_US / 1000
 """The longest delay."""
@@ -62,6 +62,11 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     outages_s: Annotated[tuple[tuple[OutageTime, OutageTime], ...], Meta(max_length=MAX_OUTAGES)] = ()
     order: Literal["newest", "in_order"] = "newest"
     playout_ms: Milliseconds = 0.0
+
+    @classmethod
+    def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - for the models that derive keys
+        """Returns keys that an author may leave out and that follow from the others of a link's table."""
+        return {}
 
     def _delay(self) -> LinkModel:
         """Returns the delay alone, as the core has it."""

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from ...core.delay import DelayKind, LinkModel, TraceEnd
 from ...core.vectors import Points
-from ...fields import KeyProblem
+from ...fields import KeyProblem, TomlTable, is_number
 from ..delay_models import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 from ..delay_traces import parse_trace
 
@@ -34,11 +34,17 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     Attributes:
         delay_ms: its mean, ms.
-        half_width_ms: half of its width, ms; at most the mean.
+        half_width_ms: half of its width, ms; at most the mean. An author may leave it out: half of the mean.
     """
 
     delay_ms: Milliseconds
     half_width_ms: Milliseconds
+
+    @classmethod
+    def derive_keys(cls, table: TomlTable) -> TomlTable:
+        """Returns the width that an author left out, so that naming the model suffices."""
+        delay_ms = table.get("delay_ms")
+        return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
     def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms)

@@ -308,17 +308,20 @@ def plan_sweep(
         UsageError: another argument cannot be right.
     """
     written, texts = read_experiment(source), tuple(overrides)
-    base = written.load(texts)
     axes = tuple(map(parse_axis, list_axes(over)))
     named = [laws] if isinstance(laws, str | type) else laws
     chosen = list(map(name_law_classes, named))
+    for law in chosen:
+        _check_law_name(law)
+    before = _load_base(written, texts, axes, chosen)
+    base = before.scenario
     keys = Counter(one.key for one in axes)
     for key, count in keys.items():
         if count > 1:
             raise ScenarioError("is swept twice: give one --over with all its values", path=key)
     if chosen and "control.law" in keys:
         raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
-    forced = {law: _law_overrides(written, texts, base, law) for law in chosen}
+    forced = {law: _law_overrides(written, texts, before, law) for law in chosen}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
     plan = SweepPlan(
@@ -345,9 +348,10 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
     written, texts = ExperimentText(facts["source"], facts["text"], folder), tuple(facts["overrides"])
-    base = allow_own_code(written.load(texts))
     axes = tuple(map(parse_axis, facts["over"]))
-    forced = {law: _law_overrides(written, texts, base, law) for law in facts["laws"]}
+    before = _load_base(written, texts, axes, facts["laws"])
+    base = allow_own_code(before.scenario)
+    forced = {law: _law_overrides(written, texts, before, law) for law in facts["laws"]}
     more = (facts["longest_s"], facts.get("judge", "verdict"), tuple(facts.get("metrics", ())))
     return SweepPlan(written, texts, base, axes, forced, tuple(facts["seeds"]), *more)
 
@@ -378,19 +382,72 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(asked)) or (own,)
 
 
-def _law_overrides(
-    written: ExperimentText, overrides: Sequence[str], base: Scenario, law: str
-) -> tuple[str, ...]:
+class _Base(NamedTuple):
+    """The experiment without what is swept.
+
+    Attributes:
+        scenario: the experiment.
+        forced: whether it is valid under a swept law only, and has the first of them.
+    """
+
+    scenario: Scenario
+    forced: bool
+
+
+def _load_base(
+    written: ExperimentText, overrides: Sequence[str], axes: Sequence[SweepAxis], laws: Sequence[str]
+) -> _Base:
+    """Returns the experiment without its axes and swept laws.
+
+    Overrides may need them: a link of another model needs the delay that an axis gives, and a gain belongs to
+    a law that is swept. The experiment is then that at the first value of each axis, and under the first law.
+
+    Raises:
+        ScenarioError: the experiment is not valid even there.
+    """
+    first = [axis.override(0) for axis in axes]
+    problem: ScenarioError | None = None
+    for law in ("", *laws[:1]):
+        of_law = _force_law(written, overrides, law) if law else ()
+        for of_axes in ((), first):
+            try:
+                scenario = written.load([*overrides, *of_law, *of_axes])
+            except ScenarioError as error:
+                problem = error
+            else:
+                return _Base(scenario, forced=bool(law))
+        written.load()  # an experiment that is not valid as written is refused for that
+    assert problem is not None
+    raise problem
+
+
+def _check_law_name(law: str) -> None:
+    """Refuses a law that does not exist.
+
+    Raises:
+        UsageError: no built-in law has this name, and it names no class.
+    """
     ours = [name for name in LAWS if name != "own"]
     if law not in ours and ":" not in law:
         hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
         raise UsageError(f"--law: there is no law {law!r}{hint}")
-    if all(identify_law(spec.control) == law for spec in base.sites.values()):
-        return ()
+
+
+def _force_law(written: ExperimentText, overrides: Sequence[str], law: str) -> tuple[str, ...]:
+    """Returns overrides that put a law into force at every site."""
     tables = tomllib.loads(written.text)
     apply_overrides(tables, overrides)
-    own = [name for name, site in tables["sites"].items() if "control" in site]
+    own = [name for name, site in tables.get("sites", {}).items() if "control" in site]
     return (f"control.law={law}", *(f"sites.{name}.control.law={law}" for name in own))
+
+
+def _law_overrides(
+    written: ExperimentText, overrides: Sequence[str], base: _Base, law: str
+) -> tuple[str, ...]:
+    sites = base.scenario.sites.values()
+    if not base.forced and all(identify_law(spec.control) == law for spec in sites):
+        return ()
+    return _force_law(written, overrides, law)
 
 
 def _refuse_unfit(plan: SweepPlan, law: int) -> None:

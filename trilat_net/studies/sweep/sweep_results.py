@@ -1,12 +1,16 @@
-"""The results of a sweep: its runs as self-describing Parquet, grid points over seeds, and both in words.
+"""The results of a sweep: its runs as a CSV table, grid points over seeds, and both in words.
 
-Invariant: results are a function of the plan, and their bytes of the runs alone. Each row's scenario, run
-again, reproduces the row. A grid point counts every run once; its stable share is taken over the decided runs
-and carries a 95 % Wilson interval within [0, 1]. Every command shown works: a reproduced run has the scenario
-hash of its row; if the swept scenario has changed since, the row's own text is written out and named instead.
+Invariant:
+- Results are a function of the plan, and their bytes of the runs alone.
+- Reading the table gives every number back bit for bit.
+- Each row's scenario, run again, reproduces the row.
+- A grid point counts every run once; its stable share is taken over the decided runs and carries a 95 % Wilson
+  interval within [0, 1].
+- Every command shown works: a reproduced run has the scenario hash of its row; if the swept scenario has
+  changed since, the row's own text is written out and named instead.
 """
 
-import io
+import csv
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,42 +23,23 @@ import msgspec
 from ...analysis.metrics.log_metrics import find_quantity
 from ...errors import ScenarioError, UsageError
 from ...execution.fused import RunTotals
-from ...files import import_extra, write_whole
+from ...files import write_whole
 from ...results import Result
 from ...scenario.scenario_reader import read_source
 from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..study_folder import format_command, set_options
-from .sweep_cell import CellClass, CellResult, CellRun, apply_diff
+from ..study_folder import encode_csv, format_command, set_options
+from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json
 
-RESULTS_FILE = "results.parquet"
-
-
-_PLAN_KEY = "trilat_net.sweep"
-"""The key of the file's metadata under which the plan stands, as JSON."""
-
-
-_ROWS_OF_A_GROUP = 16_384
+RESULTS_FILE = "results.csv"
+PLAN_FILE = "plan.json"
+"""The request of a sweep, in its folder: what `results.csv` is read with."""
 
 
 ResultRow = Mapping[str, Any]
 """A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, the metrics that were asked for
 under their keys, every field of `CellResult`, `scenario_sha256`, `command` and `scenario`, its canonical
 text. Verdict and motion are their words."""
-
-
-def require_polars() -> Any:
-    """Returns polars, which reads and writes results.
-
-    Raises:
-        UsageError: it is not installed, or too old to keep a file's metadata.
-    """
-    pl = import_extra("polars", "frames", "sweeps")
-    if not hasattr(pl, "read_parquet_metadata"):
-        raise UsageError(
-            "sweeps need polars 1.30 or newer: pip install --upgrade 'trilat-net[frames]' polars"
-        )
-    return pl
 
 
 @dataclass(frozen=True, repr=False)
@@ -137,54 +122,95 @@ def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
     return max(outcome.ran_s, min(plan.longest_s, plan.base.duration_s * 2.0**outcome.extended))
 
 
-def encode_results(plan: SweepPlan, rows: Sequence[ResultRow], facts: Mapping[str, Any]) -> bytes:
-    """Returns results as a Parquet file.
+_SCENARIO_COLUMN = "scenario_changes"
+"""The column of the table that holds a row's scenario: as JSON, by what it differs from the swept one."""
 
-    Raises:
-        UsageError: polars is not installed.
-    """
+_LONGEST_CELL = 2**26
+"""Letters of a cell at most; the csv module reads 131 072, and a scenario with a trace has more."""
+
+
+def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
+    """Returns results as CSV, a line per run."""
+    kinds = _kinds_of_results(plan)
+    lines = []
+    for row in rows:
+        changes = diff_lines(row["scenario"], plan.base.text)
+        cells = {name: _format_cell(row[name], kind) for name, kind in kinds.items()}
+        lines.append({**cells, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)})
+    return encode_csv(lines, [*kinds, _SCENARIO_COLUMN])
+
+
+def _kinds_of_results(plan: SweepPlan) -> dict[str, type]:
+    """Returns the type of each column of the table, except that of the scenarios."""
     kinds = {**_kinds_of_axes(plan), "seed": int, "random": bool}
     kinds |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
-    kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command", "scenario"), str)
-    plan_text = json.dumps(facts, ensure_ascii=False, sort_keys=True)
-    options = {"row_group_size": _ROWS_OF_A_GROUP, "metadata": {_PLAN_KEY: plan_text}}
-    return _encode_parquet(rows, kinds | {"extended": int}, **options)
+    kinds |= dict.fromkeys(("verdict", "motion", "reasons", "scenario_sha256", "command"), str)
+    return kinds | {"extended": int}
 
 
 def _kinds_of_axes(plan: SweepPlan) -> dict[str, type]:
     return {"cell": int, **{one.key: float if one.numeric else str for one in plan.axes}, "law": str}
 
 
-def _encode_parquet(rows: Sequence[ResultRow], kinds: Mapping[str, type], **options: Any) -> bytes:
-    pl = require_polars()
-    series = {name: pl.Series(name, [row[name] for row in rows], dtype=kinds[name]) for name in kinds}
-    made = io.BytesIO()
-    pl.DataFrame(series).write_parquet(made, compression="zstd", **options)
-    return made.getvalue()
+def _format_cell(value: Any, kind: type) -> str:
+    """Returns a value as the table has it: numbers so that they are read back bit for bit; None is empty."""
+    if value is None:
+        return ""
+    if kind is bool:
+        return "true" if value else "false"
+    return repr(float(value)) if kind is float else str(value)
+
+
+def _parse_cell(text: str, kind: type) -> Any:
+    """Returns the value of a cell.
+
+    Raises:
+        ValueError: the text is no value of this type.
+    """
+    if kind is str:
+        return text
+    if kind is bool:
+        return {"true": True, "false": False}[text]
+    return kind(text) if text else None
 
 
 def read_results(path: Path) -> SweepResults:
-    """Returns the results of a sweep.
+    """Returns the results of a sweep, by its folder or its table.
 
     Raises:
-        UsageError: there are none, or the sweep has not come to its end; or polars is not installed.
+        UsageError: there are none, or the sweep has not come to its end.
     """
-    pl = require_polars()
     file = path / RESULTS_FILE if path.is_dir() else path
     if not file.is_file():
         more = f"; go on with it: trilat sweep --resume {path}" if path.is_dir() else ""
         raise UsageError(f"{file}: there are no results of a sweep{more}")
+    request = file.with_name(PLAN_FILE)
+    if not request.is_file():
+        raise UsageError(f"{file}: holds no results of a sweep: there is no {PLAN_FILE} beside it")
     try:
-        facts = json.loads(pl.read_parquet_metadata(file)[_PLAN_KEY])
-        frame = pl.read_parquet(file)
-    except KeyError:
-        raise UsageError(f"{file}: holds no results of a sweep: its metadata name none") from None
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise UsageError(f"{file}: cannot be read as Parquet: {str(error).splitlines()[0]}") from None
-    return SweepResults(plan_from_json(facts), frame.to_dicts())
+        plan = plan_from_json(json.loads(request.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"{request}: cannot be read as the plan of a sweep") from None
+    csv.field_size_limit(_LONGEST_CELL)
+    try:
+        with file.open(encoding="utf-8", newline="") as stream:
+            lines = list(csv.DictReader(stream, strict=True))
+        rows = [_read_row(line, plan) for line in lines]
+    except KeyError as error:
+        raise UsageError(f"{file}: holds no results of a sweep: {error} is missing") from None
+    except (OSError, ValueError, TypeError, IndexError, csv.Error) as error:
+        raise UsageError(f"{file}: cannot be read as results of a sweep: {error}") from None
+    return SweepResults(plan, rows)
 
 
-GRID_POINTS_FILE = "places.parquet"
+def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
+    """Returns a line of the table as a row, with its scenario as text."""
+    row = {name: _parse_cell(line[name], kind) for name, kind in _kinds_of_results(plan).items()}
+    changes = json.loads(line[_SCENARIO_COLUMN])
+    return {**row, "scenario": apply_diff(changes, plan.base.text)}
+
+
+GRID_POINTS_FILE = "places.csv"
 
 
 class GridPoint(NamedTuple):
@@ -244,12 +270,8 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     return points
 
 
-def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
-    """Returns grid points as a Parquet file: counts, and the share of stable runs with its interval.
-
-    Raises:
-        UsageError: polars is not installed.
-    """
+def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> str:
+    """Returns grid points as CSV: counts, and the share of stable runs with its interval."""
     kinds = _kinds_of_axes(plan) | dict.fromkeys(("runs", *(one.value for one in CellClass)), int)
     kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
     kinds |= dict.fromkeys(
@@ -261,8 +283,9 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> bytes:
         numbers = [number for mean in one.means for number in mean or (None, None)]
         share = one.stable / one.decided if one.decided else None
         cells = (one.cell, *one.values, one.law, sum(one.counts), *one.counts, share, low, high, *numbers)
-        rows.append(dict(zip(kinds, cells, strict=True)))
-    return _encode_parquet(rows, kinds)
+        named = zip(kinds.items(), cells, strict=True)
+        rows.append({name: _format_cell(cell, kind) for (name, kind), cell in named})
+    return encode_csv(rows, list(kinds))
 
 
 _TOTALS = {
@@ -339,7 +362,7 @@ def _of_seeds(results: SweepResults) -> Iterator[str]:
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
     if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
-        yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in places.parquet"
+        yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in {GRID_POINTS_FILE}"
 
 
 def _cells(count: int) -> str:

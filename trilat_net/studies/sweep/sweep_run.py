@@ -29,19 +29,16 @@ from .sweep_cell import CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json
 from .sweep_results import (
     GRID_POINTS_FILE,
+    PLAN_FILE,
     RESULTS_FILE,
     SweepResults,
     build_result_rows,
     collect_grid_points,
     encode_grid_points,
     encode_results,
-    require_polars,
 )
 
 JOURNAL_FILE = "cells.journal"
-
-
-PLAN_FILE = "plan.json"
 _DIFFERENCES = {
     "text": "another text of the scenario",
     "scenario_sha256": "another scenario",
@@ -282,9 +279,7 @@ def run_sweep(
     Raises:
         ScenarioError: a cell cannot run; says which. What is done is kept.
         RunFailed: a cell ended its workers, or the cluster is gone. What is done is kept.
-        UsageError: polars is not installed.
     """
-    require_polars()
     plan = folder.plan
     clock = SystemClock()
     with folder.journal() as journal:
@@ -304,7 +299,7 @@ def run_sweep(
     if len(plan.seeds) > 1:
         points = encode_grid_points(plan, collect_grid_points(results))
         write_whole(folder.path / GRID_POINTS_FILE, points, remedy=folder.remedy)
-    table = encode_results(plan, rows, folder.facts)
+    table = encode_results(plan, rows)
     write_whole(folder.path / RESULTS_FILE, table, remedy=folder.remedy)
     simulated_s = sum(entry.outcome.ran_s for entry in made)
     return FinishedSweep(results, folder, len(made), simulated_s, wall_s, count)
