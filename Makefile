@@ -8,13 +8,14 @@ LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
 INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
-.PHONY: help demo play setup test pytest sessions containers push-set lint platforms test-long faults docs bench lock clean
+.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs bench lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
 	@echo "make play    take hold of three arms on a page in the browser, and look at what you made"
 	@echo "             OPTIONS='--duration 5' gives options to either"
 	@echo "make setup   make the virtual environment .venv from locked dependencies, and compile what the demo needs"
+	@echo "make extras EXTRAS=view    optional packages as well; without EXTRAS it lists them"
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every test, every live session, endurance"
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
@@ -50,6 +51,9 @@ $(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/uv.sta
 $(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*.py)
 	@$(BIN)/python -m tests.compile_core paper
 	@touch $@
+
+extras: setup
+	@$(BIN)/python -m tests.install_extras "$(EXTRAS)"
 
 $(VENV)/dev.stamp: requirements/dev.lock $(VENV)/runtime.stamp
 	$(INSTALL)

@@ -4,6 +4,8 @@ import doctest
 import inspect
 import json
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from html.parser import HTMLParser
 from pathlib import Path
@@ -25,6 +27,33 @@ FUNCTIONS = [name for name in tn.__all__ if name != "__version__"]
 def test_what_a_key_completes_is_what_there_is() -> None:
     assert dir(tn) == sorted(tn.__all__)
     assert all(getattr(tn, name) for name in dir(tn))
+
+
+@pytest.mark.parametrize("package", ["gymnasium", "matplotlib", "scipy", "loky", "polars", "websockets"])
+def test_a_missing_package_shows_in_the_call(package: str) -> None:
+    """In an interpreter of its own, since whatever was imported before stays."""
+    script = f"""
+import sys
+sys.modules[{package!r}] = None
+import trilat_net as tn
+from trilat_net.errors import UsageError
+for name in dir(tn):
+    assert hasattr(tn, name), name
+missing = [name for name in dir(tn) if (getattr(tn, name).__doc__ or "").startswith("Is not available")]
+for name in missing:
+    try:
+        getattr(tn, name)("paper")
+    except UsageError as error:
+        assert {package!r} in str(error), error
+    else:
+        raise SystemExit(name)
+print(*missing)
+"""
+    missing = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert ("make_env" in missing) == (package in ("gymnasium",))
+    assert ("figure" in missing) == (package == "matplotlib")
 
 
 COUNTERPARTS = {

@@ -3,16 +3,20 @@
 import ast
 import errno
 import os
+import re
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests import house
+from tests.install_extras import list_extras, parse_extras
 from tests.other_systems import replace_os
 from trilat_net import files
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
+    format_extra_install,
     make_results_folder,
     open_regular,
     refuse_existing,
@@ -182,3 +186,66 @@ def test_two_at_once_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytes
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(lambda _: make_results_folder(None, "x", force=False), range(24)))
     assert len(set(made)) == 24
+
+
+def make_clone(folder: Path) -> None:
+    """Makes a folder look like a clone in which the program runs from its sources."""
+    for name in ("Makefile", "pyproject.toml"):
+        (folder / name).write_text("")
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder from which the program seems to run."""
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "trilat_net" / "files.py"))
+    return tmp_path
+
+
+def test_an_installed_program_names_pip(program: Path) -> None:
+    assert program.is_dir()
+    assert format_extra_install("view") == "pip install 'trilat-net[view]'"
+
+
+def test_a_clone_names_its_makefile(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_clone(program)
+    monkeypatch.setattr(sys, "prefix", str(program / ".venv"))
+    assert format_extra_install("view") == f"make -C {program} extras EXTRAS=view"
+    monkeypatch.chdir(program)
+    assert format_extra_install("view") == "make extras EXTRAS=view"
+
+
+def test_a_clone_in_another_environment_names_pip(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_clone(program)
+    monkeypatch.setattr(sys, "prefix", "/opt/lab")
+    monkeypatch.setattr(sys, "executable", "/opt/lab/bin/python")
+    hint = format_extra_install("view")
+    assert hint == f"/opt/lab/bin/python -m pip install -e '{program}[view]'"
+
+
+def test_every_named_extra_can_be_installed() -> None:
+    named = {
+        keyword
+        for file in house.files()
+        for keyword in re.findall(r'import_extra\("[\w.]+", "(\w+)"', file.read_text(encoding="utf-8"))
+    }
+    assert {"view", "frames", "cluster", "stats"} <= named <= list_extras().keys()
+
+
+@pytest.mark.parametrize("text", ["view", "view,frames", "view frames", " view , frames "])
+def test_extras_stand_between_commas_or_spaces(text: str) -> None:
+    assert parse_extras(text) == ["view", "frames"][: 1 + ("frames" in text)]
+
+
+@pytest.mark.parametrize(("text", "word"), [("", "which extras"), ("views", "there is no extra views")])
+def test_a_wrong_extra_lists_what_there_is(text: str, word: str) -> None:
+    with pytest.raises(SystemExit, match=word) as error:
+        parse_extras(text)
+    for name in list_extras():
+        assert f"  {name} " in str(error.value)
+
+
+def test_the_locks_hold_every_extra() -> None:
+    locked = (Path(__file__).parents[1] / "requirements" / "dev.lock").read_text(encoding="utf-8")
+    for needs in list_extras().values():
+        for need in needs:
+            assert f"\n{re.split('[><=]', need)[0]}==" in f"\n{locked}"

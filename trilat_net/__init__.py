@@ -132,8 +132,44 @@ def __getattr__(name: str) -> _Any:
 
         return find_version()
     if name in _MODULES:
-        return getattr(_import_module(_MODULES[name]), name)
+        return _import_part(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _import_part(name: str) -> _Any:
+    """Returns what is offered by this name; where a package is missing, a stand-in that says so when it is called.
+
+    Programs look for names (`hasattr`, `dir`, completion) without the wish to use them.
+    """
+    from .errors import UsageError
+
+    try:
+        return getattr(_import_module(_MODULES[name]), name)
+    except UsageError as error:
+        return _make_stand_in(name, str(error))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "live", "recorder", "sites", "trilat_net"):
+            raise
+        from .files import STUDY_LIBRARIES
+
+        remedy = ", which trilat-net-core does without: pip install trilat-net"
+        problem = (
+            f"this needs {package}{remedy if package in STUDY_LIBRARIES else ', which is not installed'}"
+        )
+        return _make_stand_in(name, problem)
+
+
+def _make_stand_in(name: str, problem: str) -> _Any:
+    """Returns a function that stands for one whose package is missing."""
+    from .errors import UsageError
+
+    def stand_in(*_args: _Any, **_settings: _Any) -> _Any:
+        raise UsageError(problem)
+
+    stand_in.__name__ = stand_in.__qualname__ = name
+    stand_in.__doc__ = f"Is not available: {problem}"
+    return stand_in
 
 
 def __dir__() -> list[str]:

@@ -9,6 +9,7 @@ import errno
 import hashlib
 import itertools
 import os
+import shlex
 import shutil
 import stat
 import sys
@@ -51,7 +52,23 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise UsageError(f"{purpose} need {package}: pip install 'trilat-net[{extra}]'") from None
+        raise UsageError(f"{purpose} need {package}: {format_extra_install(extra)}") from None
+
+
+def format_extra_install(extra: str) -> str:
+    """Returns the command that installs an extra where this program runs.
+
+    - In the `.venv` of a clone: a target of the clone's Makefile, which installs locked versions.
+    - In another environment that uses a clone: pip, with the clone.
+    - Anywhere else: pip, with the distribution.
+    """
+    clone = Path(__file__).resolve().parents[1]
+    if not all((clone / name).is_file() for name in ("Makefile", "pyproject.toml")):
+        return f"pip install 'trilat-net[{extra}]'"
+    if Path(sys.prefix).resolve() != clone / ".venv":
+        return shlex.join([sys.executable, "-m", "pip", "install", "-e", f"{clone}[{extra}]"])
+    elsewhere = [] if Path.cwd() == clone else ["-C", str(clone)]
+    return shlex.join(["make", *elsewhere, "extras", f"EXTRAS={extra}"])
 
 
 def find_version() -> str:

@@ -90,7 +90,7 @@ def test_package_that_is_missing_is_named_with_what_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     done = trilat("log", "export", "run.mcap", "--to", form, cwd=folder)
-    done.refuses(f"pip install 'trilat-net[{name}]'")
+    done.refuses("need", f"extras EXTRAS={name}")
     assert [path.name for path in folder.iterdir()] == ["run.mcap"]
 
 

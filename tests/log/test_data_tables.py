@@ -16,6 +16,7 @@ from tests.log_editing import edited, opened, recorded
 from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
+from trilat_net.files import format_extra_install
 from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, build_arrivals_table, read_field_docs
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
@@ -209,7 +210,8 @@ def test_a_missing_frame_library_is_named_with_its_install(
     library: str, frame: Callable[[Log], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(UsageError, match=rf"data frames need {library}: pip install 'trilat-net\[frames\]'"):
+    hint = f"data frames need {library}: {format_extra_install('frames')}"
+    with pytest.raises(UsageError, match=re.escape(hint)):
         frame(opened(recorded("paper")))
 
 

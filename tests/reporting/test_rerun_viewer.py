@@ -13,6 +13,7 @@ import pytest
 from tests.log.programs import RERUN, printed
 from tests.log.standard_files import SCENARIO
 from trilat_net.errors import LogError, RunFailed, UsageError
+from trilat_net.files import format_extra_install
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.cdr import JOINT_STATE
 from trilat_net.log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
@@ -126,7 +127,7 @@ def test_what_fails_is_told(files: dict[str, Path], tmp_path: Path, monkeypatch:
     with pytest.raises(LogError, match="No such file"):
         shown([tmp_path / "none.mcap"], web)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(UsageError, match=r"pip install 'trilat-net\[view\]'"):
+    with pytest.raises(UsageError, match=re.escape(format_extra_install("view"))):
         shown([files["live"]], web)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import trilat_net
 from tests.cli.running import trilat
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
+from trilat_net.files import format_extra_install
 from trilat_net.studies import dask_cluster
 from trilat_net.studies.dask_cluster import WorkerRequirements, describe_worker, find_unfit
 from trilat_net.studies.executor import open_worker_pool
@@ -185,5 +187,5 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install 'trilat-net\[cluster\]'"):
+    with pytest.raises(UsageError, match=re.escape(format_extra_install("cluster"))):
         dask_cluster.DaskCluster("tcp://127.0.0.1:1")

@@ -155,13 +155,17 @@ def log_view_command(
     """Opens a log in Rerun: a column per site, a name for every curve.
 
     If a log lacks the standard channels (--views off), was not finished or has parts, they are first made in
-    a temporary file.
+    a temporary file. Where Rerun is not installed, the log's page opens in a browser instead.
     """
+    from importlib.util import find_spec
+
     from ..files import refuse_existing
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
     if save is not None:
         refuse_existing(save, force=force)
+    if not (full or web or save) and find_spec("rerun") is None:
+        return _open_page(files)
     open_rerun(
         files,
         lambda: terminal.open_with_progress(*files),
@@ -170,3 +174,25 @@ def log_view_command(
     )
     if save is not None:
         terminal.print_text(f"{save}: open it with: rerun {save}")
+    return None
+
+
+def _open_page(files: list[Path]) -> None:
+    """Opens the page of a log, which is made as by `trilat report` where there is none yet."""
+    import webbrowser
+    from contextlib import suppress
+
+    from ..files import format_extra_install, make_results_folder
+    from ..reporting.conclude import conclude
+
+    terminal.print_note(f"Rerun is not installed ({format_extra_install('view')}); this is the log's page")
+    folder = files[0].with_suffix("")
+    page = folder / "report.html"
+    if not page.is_file():
+        log = terminal.open_with_progress(*files)
+        results = make_results_folder(folder, "", force=None)
+        with terminal.progress_bar("drawing") as progress:
+            page = conclude(log, results, progress).page
+    terminal.print_text(f"{page}: open it in a browser")
+    with suppress(OSError, webbrowser.Error):
+        webbrowser.open(page.resolve().as_uri())

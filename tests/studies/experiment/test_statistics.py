@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 from trilat_net.errors import UsageError
+from trilat_net.files import format_extra_install
 from trilat_net.studies.experiment.condition_figures import draw_conditions
 from trilat_net.studies.experiment.statistics import (
     Row,
@@ -224,7 +225,8 @@ def test_mixed_model_refuses_rows_without_one_pair_each() -> None:
 
 def test_mixed_model_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "statsmodels.formula.api", None)
-    with pytest.raises(UsageError, match=r"mixed models need statsmodels: pip install 'trilat-net\[stats\]'"):
+    hint = f"mixed models need statsmodels: {format_extra_install('stats')}"
+    with pytest.raises(UsageError, match=re.escape(hint)):
         fit_mixed_model(tidy(SLEEP), "time_s")
 
 

@@ -179,7 +179,7 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
         (lambda text: text[:-60], "cannot be read"),
         (lambda text: text.replace("0,", "zero,", 1), "cannot be read"),
         (lambda text: text[: text.rindex("[")], "cannot be read"),
-        (lambda text: "PAR1 nothing PAR1\n\0", "holds no results"),
+        (lambda _: "PAR1 nothing PAR1\n\0", "holds no results"),
     ],
 )
 def test_a_damaged_table_is_refused(

@@ -4,8 +4,8 @@ Invariant:
 - Results are a function of the plan, and their bytes of the runs alone.
 - Reading the table gives every number back bit for bit.
 - Each row's scenario, run again, reproduces the row.
-- A grid point counts every run once; its stable share is taken over the decided runs and carries a 95 % Wilson
-  interval within [0, 1].
+- A grid point counts every run once; its stable share is taken over the decided runs and carries a 95 %
+  Wilson interval within [0, 1].
 - Every command shown works: a reproduced run has the scenario hash of its row; if the swept scenario has
   changed since, the row's own text is written out and named instead.
 """
