@@ -100,6 +100,59 @@ def open_regular(path: Path, **how: Any) -> Any:
     return stream
 
 
+_OTHER_KINDS = {
+    b"\x89MCAP": "an MCAP file",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet or document of an old Office program (.xls, .doc)",
+    b"\x1f\x8b": "a gzip file",
+    b"%PDF": "a PDF document",
+    b"SQLite": "an SQLite database",
+}
+"""Kinds of files by their first bytes."""
+_ZIPPED_KINDS = {
+    b"xl/workbook": "a spreadsheet (.xlsx)",
+    b"opendocument.spreadsheet": "a spreadsheet (.ods)",
+    b"Index/Tables": "a spreadsheet (.numbers)",
+    b"word/document": "a text document (.docx)",
+}
+"""Kinds of ZIP archives by what stands in them uncompressed."""
+
+
+def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
+    """Returns the text of a file in UTF-8, or in UTF-16 as Windows PowerShell writes it.
+
+    Args:
+        raw: the content of the file.
+        any_code_page: True: other texts are read as well, since programs on Windows print in the code page
+            of their country. Their letters beyond ASCII come out as those of Latin-1.
+
+    Raises:
+        ValueError: the content is not text; the message names a spreadsheet as a spreadsheet.
+    """
+    if raw[:4] == b"PK\x03\x04":
+        kind = next((kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw), "a ZIP archive")
+        raise ValueError(_say_not_text(kind))
+    for mark, kind in _OTHER_KINDS.items():
+        if raw.startswith(mark):
+            raise ValueError(_say_not_text(kind))
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16")
+    if raw[:2].count(0) == 1:  # UTF-16 without its mark: ASCII has a zero byte in each pair
+        return raw.decode("utf-16-be" if raw[0] == 0 else "utf-16-le")
+    if 0 in raw:
+        raise ValueError("is not text: it has zero bytes")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if not any_code_page:
+            raise
+        return raw.decode("latin-1")
+
+
+def _say_not_text(kind: str) -> str:
+    advice = "save its sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
+    return f"is {kind}, not text: {advice}"
+
+
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
     """Yields a file opened for reading.

@@ -152,3 +152,23 @@ def test_log_that_is_not_there_is_refused_with_keys_path(tmp_path: Path) -> None
     with pytest.raises(ScenarioError, match="No such file") as error:
         load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}})
     assert error.value.path == "links.m1->s.file"
+
+
+def test_losses_at_both_ends_of_a_log_count(data: bytes, path: Path) -> None:
+    """What its sender recorded and nobody received is lost; what it never sent is not."""
+    quiet = {*range(30), *range(300, TICKS)}
+
+    def cut(record: dict[str, Any]) -> dict[str, Any] | None:
+        if record["site"] == "m1" and record["tick"] < 10:
+            return None  # it came later
+        if record["site"] == "s":
+            record["rx"] = [entry for entry in record["rx"] if entry[0] != 0 or entry[1] not in quiet]
+        return record
+
+    path.write_bytes(edited(data, record=cut))
+    delay_ms = {round(t_s * 1000): ms for t_s, ms in read_link_delays(path, "m1->s")}
+    known = TICKS - 41
+    assert min(delay_ms) == 10
+    assert {t for t, ms in delay_ms.items() if math.isinf(ms) and t < known} == {
+        t for t in quiet | LOST if 10 <= t < known
+    }

@@ -122,14 +122,14 @@ def trace_import_command(
     out: Annotated[Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")] = None,
     way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
     column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
-    every_s: Annotated[float, value("--every", "S", "Interval of a ping without -D, s.")] = 1.0,
+    every_s: Annotated[float, value("--every", "S", "Interval of a ping without times, s.")] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
     """Makes a trace for links from what another program measured, and prints statistics of the network.
 
     Options:
-        file: JSON of irtt, lines of ping -D, or a table with a header.
+        file: JSON of irtt, lines of ping or fping, or a table with a header.
         way: Half a round trip, one way of irtt (send or receive), or delays as they are. Default: half of a
             round trip, a one-way delay as it is.
     """

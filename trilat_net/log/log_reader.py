@@ -550,7 +550,7 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
     These are the delays of the network that carried them, as the receiver's records have them in `rx`,
     without those that the session's scenario injected. A negative one comes of the clocks and counts as none;
-    of a sample that came twice the shorter one counts.
+    of a sample that came twice the shorter one counts. A tick of which the sender has a record was sent.
 
     Raises:
         OSError: the file cannot be opened.
@@ -584,10 +584,15 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
         for sender, tick, delay_us in state.rx:
             if sender == index and tick >= 0:
                 delays_us[tick] = min(delays_us.get(tick, MAX_DELAY_US), max(delay_us, 0))
-    longest_ns = 1000 * max(delays_us.values(), default=0)
+    if not delays_us:
+        return
+    longest_ns = 1000 * max(delays_us.values())
     gaps = _find_gaps_ns(states)
     rate_hz = log.scenario.sites[peer].rate_hz
-    for tick in range(max(delays_us, default=-1) + 1):
+    sent = log[peer].tick.tolist() if peer in log.sites else []
+    # what the peer sent before the first arrival and after the last one was lost as well
+    ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
+    for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz
         came = tick in delays_us
         if came or not any(stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps):

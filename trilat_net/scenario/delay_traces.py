@@ -12,6 +12,7 @@ measured and is asked for. Data of others is read where it is, never shipped.
 
 import csv
 import gzip
+import io
 import json
 import math
 import re
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,8 +29,9 @@ from ..core.channel import LOST
 from ..core.delay import MAX_DELAY_US
 from ..core.vectors import Array, Points
 from ..errors import ScenarioError, UsageError
-from ..files import open_regular
+from ..files import decode_text, open_regular
 from ..results import Result
+from .ping_output import read_ping
 
 MAX_TRACE_POINTS = 200_000
 """Most points of one trace: 200 s of a log at 1 kHz."""
@@ -46,19 +48,20 @@ _LOG_READER = "trilat_net.log.log_reader", "read_link_delays"
 def _read_csv(path: Path) -> list[TracePoint]:
     rows: list[TracePoint] = []
     first = True
-    with open_regular(path, newline="", encoding="utf-8-sig") as stream:
-        for number, cells in enumerate(csv.reader(stream), start=1):
-            if not any(cells) or cells[0].lstrip().startswith("#"):
-                continue
-            is_head = first and len(cells) == 2 and not any(map(_is_number, cells))
-            first = False
-            if is_head:
-                continue
-            try:
-                time_text, delay_text = (cell.strip() for cell in cells)
-                rows.append((float(time_text), math.inf if delay_text == _LOST else float(delay_text)))
-            except ValueError:
-                raise ValueError(f"line {number}: a line is t_s,delay_ms or t_s,{_LOST}") from None
+    with open_regular(path) as stream:
+        text = decode_text(stream.read())
+    for number, cells in enumerate(csv.reader(io.StringIO(text, newline="")), start=1):
+        if not any(cells) or cells[0].lstrip().startswith("#"):
+            continue
+        is_head = first and len(cells) == 2 and not any(map(_is_number, cells))
+        first = False
+        if is_head:
+            continue
+        try:
+            time_text, delay_text = (cell.strip() for cell in cells)
+            rows.append((float(time_text), math.inf if delay_text == _LOST else float(delay_text)))
+        except ValueError:
+            raise ValueError(f"line {number}: a line is t_s,delay_ms or t_s,{_LOST}") from None
     return rows
 
 
@@ -141,13 +144,10 @@ def parse_trace(text: str) -> Points:
 WAYS = ("half", "send", "receive", "whole")
 """Half of a round trip, one way of `irtt` there or back, or what stands there as it is."""
 _MOST_BYTES = 2**30
-_SEQUENCES = 2**16
-"""After so many `ping` counts from 0 again."""
-_PING = re.compile(
-    r"^(?:\[(?P<at>\d+\.\d+)\] )?.*icmp_seq[= ](?P<n>\d+)\b(?:.*\btime[=<](?P<ms>[\d.]+) ?ms)?"
-)
 _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_NO_ANSWER = ("lost", "-1", "", "nan", "inf")
+"""Delays of samples that were lost, in a table."""
 _TIMES, _DELAYS = ("t", "time", "timestamp", "pub_time"), ("delay", "rtt", "latency")
 
 
@@ -160,12 +160,16 @@ class MeasuredTrace(Result):
         too_long: samples that count as lost because they took longer than a link may.
         doubled: samples left out because another one has their time.
         cut: samples left out at the end because a trace has a most of points.
+        begin_known: False if the file does not tell what was sent before the first point.
+        end_known: False if the file does not tell what was sent after the last point.
     """
 
     points: tuple[TracePoint, ...]
     too_long: int
     doubled: int
     cut: int
+    begin_known: bool = True
+    end_known: bool = True
 
     @property
     def delay_ms(self) -> Array:
@@ -184,6 +188,8 @@ class MeasuredTrace(Result):
             "too_long": self.too_long,
             "doubled": self.doubled,
             "cut": self.cut,
+            "begin_known": self.begin_known,
+            "end_known": self.end_known,
         }
         if not len(delay_ms):
             return found
@@ -214,7 +220,12 @@ class MeasuredTrace(Result):
             "doubled": "have the time of another one and are left out",
             "cut": f"are left out at the end: a trace has at most {MAX_TRACE_POINTS} points",
         }
-        return lines + [f"{facts[key]} {words}" for key, words in said.items() if facts[key]]
+        lines += [f"{facts[key]} {words}" for key, words in said.items() if facts[key]]
+        unknown = {
+            "begin_known": "the file does not tell what was sent before its first sample",
+            "end_known": "the file does not tell how the measurement ended: later losses are missing",
+        }
+        return lines + [sentence for key, sentence in unknown.items() if not facts[key]]
 
     def write_rows(self) -> str:
         """Returns the table that a link of model "trace" reads: t_s,delay_ms."""
@@ -225,7 +236,7 @@ class MeasuredTrace(Result):
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Returns the trace of a file of `irtt client -o`, of `ping -D`, or of a table with a head.
+    """Returns the trace of a file of `irtt client -o`, of `ping` or `fping`, or of a table with a head.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
@@ -233,12 +244,12 @@ def import_trace(
     [10.0, 20.0]
 
     Args:
-        path: the file; JSON may be gzipped.
+        path: the file; it may be gzipped, and text may be UTF-16.
         form: "irtt", "ping" or "csv".
         way: one of `WAYS`; "send" and "receive" are those of irtt, whose clocks must agree then. "": half of
             what is a round trip, as irtt, ping and a column "rtt" have it.
         column: the column of delays in a table; "": the first one named like one.
-        every_s: the interval of a `ping` without -D, which does not print when it sent, s.
+        every_s: the interval of a `ping` that prints no times, as without -D or on Windows, s.
 
     Raises:
         UsageError: there is no such form, or it has no such way.
@@ -252,18 +263,30 @@ def import_trace(
     try:
         with open_regular(Path(path)) as stream:
             raw = stream.read(_MOST_BYTES)
-        text = (gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw).decode("utf-8-sig")
-        return _arrange(_READERS[form](text, way, column, every_s))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
+    try:
+        text = decode_text(gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw, any_code_page=True)
+    except (ValueError, EOFError, OSError) as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    try:
+        return _arrange(_READERS[form](text, way, column, every_s))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ScenarioError(f"{path}: is not of the form {form}: {error}") from None
 
 
-def _arrange(sent: list[TracePoint]) -> MeasuredTrace:
-    if not sent:
+class _Measured(NamedTuple):
+    """Samples of a file, and whether the file tells how the measurement began and ended."""
+
+    sent: list[TracePoint]
+    begin_known: bool = True
+    end_known: bool = True
+
+
+def _arrange(measured: _Measured) -> MeasuredTrace:
+    if not measured.sent:
         raise ValueError("it has no samples")
-    sent.sort(key=lambda one: one[0])
+    sent = sorted(measured.sent, key=lambda one: one[0])
     begin_s, points, too_long, doubled = sent[0][0], [], 0, 0
     last_us = -1
     for at_s, ms in sent:
@@ -279,70 +302,62 @@ def _arrange(sent: list[TracePoint]) -> MeasuredTrace:
         too_long += LONGEST_MS < ms < math.inf
         points.append((t_us * 1e-6, ms if ms <= LONGEST_MS else math.inf))
     found = MeasuredTrace(
-        tuple(points[:MAX_TRACE_POINTS]), too_long, doubled, max(0, len(points) - MAX_TRACE_POINTS)
+        tuple(points[:MAX_TRACE_POINTS]),
+        too_long,
+        doubled,
+        max(0, len(points) - MAX_TRACE_POINTS),
+        measured.begin_known,
+        measured.end_known,
     )
     format_trace(found.points)
     return found
 
 
-def _read_irtt(text: str, way: str, *_: object) -> list[TracePoint]:
-    """Reads `irtt client -o`: nanoseconds, and a status of loss in words."""
+def _read_irtt(text: str, way: str, *_: object) -> _Measured:
+    """Reads `irtt client -o`: nanoseconds, and a status of loss in words; its `stats` count the packets."""
     key, share = {"half": ("rtt", 0.5), "whole": ("rtt", 1.0)}.get(way or "half", (way, 1.0))
     sent: list[TracePoint] = []
-    for trip in json.loads(text)["round_trips"]:
+    measured = json.loads(text)
+    for trip in measured["round_trips"]:
         times = trip["timestamps"]["client"]["send"]
         answered = trip["lost"] == "false"
         ms = share * trip["delay"][key] * 1e-6 if answered else math.inf
         sent.append((times.get("monotonic", times.get("wall")) * 1e-9, ms))
-    return sent
+    packets = measured.get("stats", {}).get("packets_sent", len(sent))
+    return _Measured(sent, end_known=packets <= len(sent))
 
 
-def _read_ping(text: str, way: str, _: str, every_s: float) -> list[TracePoint]:
-    """Reads the lines of `ping`, best of `ping -D`; numbers that are missing are samples lost."""
-    share, seen = (1.0 if way == "whole" else 0.5), {}
-    number, stamped = -1, True
-    for line in text.splitlines():
-        found = _PING.match(line)
-        if found is None:
-            continue
-        n = int(found["n"])
-        number = n if number < 0 else number + (n - number + _SEQUENCES // 2) % _SEQUENCES - _SEQUENCES // 2
-        if found["ms"] is None or number in seen:  # no answer, or a second one
-            continue
-        stamped = stamped and found["at"] is not None
-        ms = float(found["ms"])
-        seen[number] = (float(found["at"] or 0.0) - ms * 1e-3, share * ms)
-    if not seen:
-        raise ValueError("no line tells of an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
-    numbers = np.arange(min(seen), max(seen) + 1)
-    at_s = numbers * every_s
-    if stamped:
-        at_s = np.interp(numbers, list(seen), [at for at, _ in seen.values()])
-    return [(float(t), seen.get(int(n), (0.0, math.inf))[1]) for n, t in zip(numbers, at_s, strict=True)]
+def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measured:
+    """Reads what `ping` printed, see `ping_output`."""
+    share = 1.0 if way == "whole" else 0.5
+    probes = read_ping(text, every_s)
+    sent = [(t_s, share * ms) for t_s, ms in zip(probes.sent_s, probes.rtt_ms, strict=True)]
+    return _Measured(sent, probes.begin_known, probes.end_known)
 
 
-def _read_table(text: str, way: str, column: str, _: float) -> list[TracePoint]:
+def _read_table(text: str, way: str, column: str, _: float) -> _Measured:
     """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or t_s,delay_ms."""
     numbered = enumerate(text.splitlines(), start=1)
     (_, head), *lines = [(n, line) for n, line in numbered if line.strip() and not line.startswith("#")]
-    cells = _split_cells(head)
+    mark = next((mark for mark in (";", "\t", ",") if mark in head), None)
+    cells = _split_cells(head, mark)
     time, time_s = _find_column(cells, _TIMES, "")
     delay, delay_s = _find_column(cells, _DELAYS, column)
     half = way == "half" or (not way and "rtt" in cells[delay].lower())
     unit_ms = delay_s * (500.0 if half else 1e3)
     sent: list[TracePoint] = []
     for number, line in lines:
-        row = _split_cells(line)
+        row = _split_cells(line if mark == "," else line.replace(",", "."), mark)  # else a decimal comma
         try:
-            ms = math.inf if row[delay] in ("lost", "-1", "") else unit_ms * float(row[delay])
+            ms = math.inf if row[delay].lower() in _NO_ANSWER else unit_ms * float(row[delay])
             sent.append((float(row[time]) * time_s, ms))
         except (IndexError, ValueError):
             raise ValueError(f"line {number} is not as its head says") from None
-    return sent
+    return _Measured(sent)
 
 
-def _split_cells(line: str) -> list[str]:
-    return [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
+def _split_cells(line: str, mark: str | None) -> list[str]:
+    return [cell.strip() for cell in line.split(mark)]
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
@@ -356,7 +371,7 @@ def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple
     raise ValueError(f"its head has no {wanted or f'column like {names[0]}_ms'}")
 
 
-_READERS: dict[str, Callable[[str, str, str, float], list[TracePoint]]] = {
+_READERS: dict[str, Callable[[str, str, str, float], _Measured]] = {
     "irtt": _read_irtt,
     "ping": _read_ping,
     "csv": _read_table,
