@@ -7,6 +7,8 @@ as one site knows the session shows of a peer nothing but its pose at one tick: 
 site has in use, or to which the picture of the site's user has come (`SessionView.find_shown`).
 """
 
+from collections import defaultdict
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -17,8 +19,10 @@ from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows, joint_positions_m, upright_axes
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
 from trilat_net.core.live_hand import HandInForce
+from trilat_net.core.task_space import PLACE
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.core.vectors import Array
+from trilat_net.log.orientations import QUATERNION_AXES, SteadyQuaternion
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
 
@@ -153,6 +157,20 @@ class ArmFrames:
         return total
 
 
+class BodyTurns:
+    """Poses of a plant's bodies in one stream of frames: of both signs of a quaternion the nearer one."""
+
+    def __init__(self) -> None:
+        self._signs: defaultdict[int, SteadyQuaternion] = defaultdict(lambda: SteadyQuaternion(w=0))
+
+    def align(self, bodies: Sequence[float]) -> list[Any]:
+        """Returns poses, seven numbers each: x, y, z, m, and the unit quaternion w, x, y, z."""
+        poses = np.reshape(bodies, (-1, PLACE + len(QUATERNION_AXES)))
+        for body, pose in enumerate(poses):
+            pose[PLACE:] = self._signs[body].follow(pose[PLACE:].tolist())
+        return _rounded(poses)
+
+
 class SessionFrames:
     """The frames of one session; `make` is called at the rate of the pages.
 
@@ -170,6 +188,7 @@ class SessionFrames:
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
         self._known: dict[tuple[str, str], Json] = {}
+        self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
         """Returns the session as a page needs it once: sites, links, columns of the plots."""
@@ -266,7 +285,7 @@ class SessionFrames:
         other = self._view.sites[peer]
         if tick != known["tick"] and other.window.knows(tick):
             q = other.window.rows(tick, tick).q[0]
-            bodies = _rounded(np.array(other.bodies.get(tick, [])))
+            bodies = self._turns[site, peer].align(other.bodies.get(tick, []))
             known = {**self._arms[peer].pose(q), "tick": tick, "bodies": bodies}
         self._known[site, peer] = known
         return known
@@ -289,7 +308,7 @@ class SessionFrames:
             "tick": record.tick,
             "used": record.used,
             "mode": record.mode,
-            "bodies": _rounded(np.array(record.bodies)),
+            "bodies": self._turns["", name].align(record.bodies),
             "alarm": None if alarm is None else alarm._asdict(),
             "silent": self._view.silent(site),
             "holder": site.holder if now.get("source") else "",

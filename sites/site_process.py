@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 
+import numpy as np
 from msgspec.structs import asdict
 
 from trilat_net.core.site_setup import StaleAction
@@ -26,6 +27,7 @@ from trilat_net.core.ticks import (
     tick_ns,
 )
 from trilat_net.errors import CodeFailed, PeerLeft, RunFailed, SessionError
+from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -347,7 +349,9 @@ class RunningSite:
 
     def _describe_status(self, output: TickRecord) -> str:
         shared = output.shared()[0]
-        apart = max(abs(a - b) for a, b in zip(shared, output.q_des, strict=True))
+        own, desired = (np.array([vector]) for vector in (shared, output.q_des))
+        axes = self._parts.scenario.arms[self._parts.name].axes
+        apart = np.abs(find_task_errors(own, desired, axes) if output.x else own - desired).max()
         unit = "m or rad" if output.x else "rad"
         torque_nm, stats = max(map(abs, output.tau)), self._parts.stats
         dropped = sum(stats.dropped.values())

@@ -88,7 +88,7 @@ def export(
         to: ros2, parquet, csv, npz, mat or lerobot.
         out: a file, or of parquet, csv and lerobot a folder.
         force: whether it may replace one.
-        settings: what the format lets one choose, as `fps=30` and `program="m2"` of lerobot.
+        settings: what the format lets one choose, as `fps=30`, `program="m2"` and `actions="tip"` of lerobot.
 
     Raises:
         UsageError: there is no such format or setting, a package is missing, or the place is taken.

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.safeguards import BLEND_S
+from ..core.task_space import PLACE, POSE
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
+from ..log.orientations import bring_nearer
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog, find_task_errors
 from ..net.messages import RESTING_MODES, TASK_VECTORS
@@ -247,7 +249,9 @@ class PeerTrajectory:
         low = np.clip(np.floor(place), 0, len(records.known) - 2).astype(np.int64)
         x = np.clip(place - low, 0.0, 1.0)[:, np.newaxis]
         at, rate = records.shared, records.shared_rate
-        qa, qb, va, vb = at[low], at[low + 1], rate[low], rate[low + 1]
+        qa, qb, va, vb = at[low], at[low + 1].copy(), rate[low], rate[low + 1]
+        if self.records.x.shape[1] == POSE:  # between two rotation vectors of different branches lies nothing
+            qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
         q = qa + x * (h * va + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb))))
         qd = va + x * (vb - va)
         sa, sb = va**2, vb**2

@@ -10,7 +10,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..core.exogenous import TorqueSource
+from ..core.task_space import PLACE, POSE
 from ..log.log_reader import Log
+from ..log.orientations import find_steady_vectors
 from ..scenario import Scenario
 from .aligned import AlignedRecords, align_records
 from .arm_rows import build_arm_rows
@@ -104,5 +106,8 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     )
     if script is not None:
         script = script @ (follows.inverse[0] @ follows.J[0]).T
-    places = records._replace(q=axes * records.x, qd=axes * records.xd, tau_x=axes * records.wrench)
+    x = records.x
+    if x.shape[1] == POSE:  # metrics compare poses of different times
+        x = np.hstack([x[:, :PLACE], find_steady_vectors(x[:, PLACE:])])
+    places = records._replace(q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench)
     return SiteRun(places, forces._replace(script=script), dominance)

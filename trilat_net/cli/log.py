@@ -106,6 +106,7 @@ def log_export_command(
     files: options.LogsArgument,
     form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
     settings: Annotated[list[str] | None, options.value("--set", "KEY=VALUE")] = None,
+    actions: Annotated[str, options.value("--actions", "tip|joints")] = "",
     output: Annotated[Path | None, options.value("-o --out", "OUT")] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -117,12 +118,15 @@ def log_export_command(
             site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
             episode for each log of the files and folders that are given.
         settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program).
+        actions: Actions of lerobot as its plugin takes them: places of end effectors, or angles of joints.
+            Default: what sites share.
         output: File or folder; default: next to FILE, named after it.
     """
     from ..log.log_reader import open_logs
     from ..reporting.export import Exporter
 
     given = {key: value for key, _, value in (one.partition("=") for one in settings or [])}
+    given |= {"actions": actions} if actions else {}
     exporter = Exporter(form, output, force=force, log=files[0], settings=given)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         logs = open_logs(*files, progress=progress)

@@ -1,10 +1,14 @@
 """A log as data tables: a row per record, arrival, statistics message or event.
 
-Invariant: every number is the record's own, or follows from it exactly (an age is a difference of
-stamps). A column's name ends in its unit; a missing value is null, never a number in its place. Units
-come from the schema, meanings from the docstrings of the message types, and of what a law sends from its
-declaration: there is no second list. A number out of range, or an arrival of a peer that a site does not
-have, is a `LogError` that names the file (`source`).
+Invariant:
+- Every number is the record's own, or follows from it exactly (an age is a difference of stamps), except that
+  an orientation is a unit quaternion whose sign continues from row to row: the record's rotation vector jumps
+  where it passes half a turn (see `orientations`). The column's meaning says so.
+- A column's name ends in its unit; a missing value is null, never a number in its place.
+- Units come from the schema, meanings from the docstrings of the message types, and of what a law sends from
+  its declaration: there is no second list.
+- A number out of range, or an arrival of a peer that a site does not have, is a `LogError` that names the
+  file (`source`).
 """
 
 import dataclasses
@@ -15,7 +19,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
@@ -23,13 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.chain import LINK_PARAMETERS
-from ..core.task_space import PLACE
+from ..core.task_space import PLACE, POSE
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES, ArmModel
+from .orientations import QUATERNION_AXES, align_signs, find_quaternions
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -62,6 +66,11 @@ _TASK_VECTORS = {
     "wrench": ("N", "N m"),
 }
 """Those with a number per coordinate of the task: units of places and of orientations."""
+
+
+_POSES = ("q_des", "x")
+"""Those of them that have an orientation; the others have angular velocities and torques."""
+_STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
 
 
 class Column(NamedTuple):
@@ -199,9 +208,12 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     task = _TASK_VECTORS if arm.shares_pose else {}
     for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
         if field in task:
-            for n, axis in enumerate(TASK_AXES[: arm.counts.shared]):
+            is_pose = field in _POSES and arm.counts.shared == POSE
+            for n, axis in enumerate(TASK_AXES[: PLACE if is_pose else arm.counts.shared]):
                 text = f"{docs[field].text}, along {axis}"
                 yield _make_number_column(site, field, n, f"{field}_{axis}", task[field][n >= PLACE], text)
+            if is_pose:
+                yield from _make_orientation_columns(site, field, docs[field].text)
             continue
         units = arm.joint_units(docs[field].unit)
         for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
@@ -214,6 +226,14 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
             stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
             text = f"estimate of {symbol} of link {link}, about the frame of its joint"
         yield _make_number_column(site, "theta_hat", n, stem, unit, text)
+
+
+def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
+    """Yields the orientation of a pose as a quaternion; its source is the record's rotation vector."""
+    quaternions = find_quaternions(getattr(site, field)[:, PLACE:])
+    for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
+        meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
+        yield Column(f"{field}_{name}", np.ascontiguousarray(values), "", meaning, f"{field}[{PLACE}:{POSE}]")
 
 
 def _make_number_column(
@@ -255,10 +275,16 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
-    axes = (*(("m", axis) for axis in "xyz"), *(("", f"q{axis}") for axis in "wxyz"))
-    for n, (body, (unit, axis)) in enumerate(product(bodies, axes)):
-        text = f"{axis} of the {'place' if unit else 'unit quaternion'} of {body}, a body of its plant"
-        yield _make_number_column(site, "bodies", n, f"{body}_{axis}", unit, text)
+    for number, body in enumerate(bodies):
+        first = (PLACE + len(QUATERNION_AXES)) * number
+        for n, axis in enumerate("xyz", first):
+            text = f"{axis} of the place of {body}, a body of its plant"
+            yield _make_number_column(site, "bodies", n, f"{body}_{axis}", "m", text)
+        first += PLACE
+        quaternions = align_signs(site.bodies[:, first : first + len(QUATERNION_AXES)])
+        for n, (name, values) in enumerate(zip(QUATERNION_AXES, quaternions.T, strict=True), first):
+            text = f"orientation of {body}, a body of its plant, {name[1]} of {_STEADY_QUATERNION}"
+            yield Column(f"{body}_{name}", np.ascontiguousarray(values), "", text, f"bodies[{n}]")
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:

@@ -14,7 +14,7 @@ import numpy as np
 from .. import process
 from ..core.law_channel import LawChannel
 from ..core.site_setup import Layout
-from ..core.task_space import PLACE
+from ..core.task_space import PLACE, POSE
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import LogError, WireError
@@ -22,6 +22,7 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..scenario.run_changes import count_skipped_ticks
 from . import record_columns
+from .orientations import align_signs, find_quaternions, split_quaternions
 from .record_columns import Ints
 
 M = TypeVar("M")
@@ -65,17 +66,12 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 def _find_turns(turn: Array, reference: Array) -> Array:
-    (a, u), (b, v) = map(_make_quaternions, (turn, reference))
+    (a, u), (b, v) = map(split_quaternions, (turn, reference))
     w, p = a * b + np.sum(u * v, axis=1, keepdims=True), b * u - a * v - np.cross(u, v)
     p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
     sine = np.linalg.norm(p, axis=1, keepdims=True)
     by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
     return np.asarray(by_sine * p)
-
-
-def _make_quaternions(turns: Array) -> tuple[Array, Array]:
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
 
 
 class LazyRecords(Sequence[State]):
@@ -321,12 +317,15 @@ class SiteLog:
     theta_hat = _RecordVector(
         "Estimate of the parameters, Eq. (15), shape (K, P), of two links as in Eq. (24)."
     )
-    x = _RecordVector("In task space the end effector's place and orientation, shape (K, m), m and rad.")
+    x = _RecordVector(
+        "In task space the end effector's place and rotation vector as recorded, shape (K, m), m and rad. "
+        "The vector jumps where it passes half a turn; `orientation` does not."
+    )
     xd = _RecordVector("Its derivative, shape (K, m).")
     wrench = _RecordVector("What tau_x amounts to there, shape (K, m), N and N m.")
     ch = _RecordVector("All that the site's law sends, shape (K, C); `sent` has it by name.")
     hand = _RecordVector("What somebody who holds the arm does, shape (K, h), see `HandInForce`.")
-    bodies = _RecordVector("Poses of the bodies of its plant, shape (K, 7 b), m and quaternions.")
+    bodies = _RecordVector("Poses of the bodies of its plant as recorded, shape (K, 7 b), m and quaternions.")
     mem = _RecordField(record_columns.decode_strings, "Further memory of the site, shape (K,), a list each.")
     t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
     late_us = _RecordField(
@@ -342,11 +341,41 @@ class SiteLog:
         """Nominal time since the epoch, shape (K,), s."""
         return freeze(self.t_ns / NS_PER_S)
 
+    @cached_property
+    def orientation(self) -> Array:
+        """Of sites that follow orientations that of the end effector, shape (K, 4); else shape (K, 0).
+
+        Unit quaternions w, x, y, z, each nearest to the one before.
+        """
+        return self._make_orientation(self.x)
+
+    @cached_property
+    def orientation_des(self) -> Array:
+        """The same of the reference, shape (K, 4)."""
+        return self._make_orientation(self.q_des)
+
+    def _make_orientation(self, poses: Array) -> Array:
+        if not self.layout.task or self.layout.shared != POSE:
+            return freeze(np.zeros((len(self), 0)))
+        return freeze(find_quaternions(poses[:, PLACE:]))
+
+    @cached_property
+    def body_poses(self) -> Array:
+        """Poses of the bodies of its plant, shape (K, b, 7): x, y, z, m, and the unit quaternion w, x, y, z.
+
+        Each quaternion is nearest to the one before, whichever sign the plant gave it.
+        """
+        poses = self.bodies.reshape(len(self), -1, PLACE + 4).copy()
+        for body in range(poses.shape[1]):
+            poses[:, body, PLACE:] = align_signs(poses[:, body, PLACE:])
+        return freeze(poses)
+
     @property
     def e(self) -> Array:
         """Position error q - q_des, Eq. (9), shape (K, n), rad; in task space x - x_des, shape (K, m), m.
 
-        The error of an orientation is the turn from the reference to the end effector, rad.
+        The error of an orientation is the turn from the reference to the end effector, rad, at most half a
+        turn long: that of the control law, which jumps where it passes half a turn.
         """
         return find_task_errors(self.x, self.q_des, self.axes) if self.layout.task else self.q - self.q_des
 

@@ -2,7 +2,8 @@
 
 Invariant: an episode is a run in virtual time, of which the scenario, the seed and the actions say all; saved
 as a log it verifies. A step is a fixed number of ticks. What is observed, and when an action acts, is as of a
-hand of one's own (`OwnHand`), so that what is trained here can hold an arm live, unchanged.
+hand of one's own (`OwnHand`), so that what is trained here can hold an arm live, unchanged; only orientations
+are observed as six numbers, which never jump (`expand_poses`).
 """
 
 import math
@@ -21,6 +22,7 @@ from ..errors import UsageError
 from ..execution.fused import FusedRun
 from ..execution.virtual import record_virtual
 from ..files import import_extra
+from ..log.orientations import expand_poses
 from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
@@ -236,6 +238,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         view = scene.view
         own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
         peers = {f"peer_{x}": np.array([getattr(one, x) for one in view.peers]) for x in ("q", "qd", "tau_x")}
+        if self._base.arms[self._user].shares_pose:  # a rotation vector jumps where it passes half a turn
+            own["q_des"], peers["peer_q"] = map(expand_poses, (own["q_des"], peers["peer_q"]))
         alpha, age_s = zip(*((one.alpha, one.age_s) for one in view.peers), strict=True)
         more = {"alpha": np.array(alpha), "age_s": np.array(age_s), "grip": np.array([view.grip])}
         return {**own, **peers, **more, "goal": np.array(self.task.goal, dtype=np.float64)}

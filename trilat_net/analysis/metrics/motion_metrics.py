@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.site_setup import Law
+from ...core.task_space import PLACE, POSE
 from ...core.vectors import Array
+from ...log.orientations import bring_nearer
 from ...log.site_log import find_task_errors
 from ...results import JsonObject
 from ...scenario import Scenario
@@ -93,7 +95,11 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     poses = [records.shared[row] for records, row in zip(sites, rows, strict=True)]
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
-    apart = np.ptp(np.stack(poses)[:, known], axis=0)
+    there = np.stack(poses)[:, known]
+    if sites[0].x.shape[1] == POSE:  # of vectors on both sides of half a turn the difference is a whole turn
+        for turns in there[1:, :, PLACE:]:
+            turns[:] = bring_nearer(turns, there[0, :, PLACE:])
+    apart = np.ptp(there, axis=0)
     axes = [records.axes for records in sites]
     if all(axes):
         apart = apart * np.prod(axes, axis=0)

@@ -1,8 +1,12 @@
 """A dataset of LeRobot, v3.0: what each user commands, who leads, and where a person intervened.
 
-Invariant: a frame has of every site the newest record at or before its time, as float32; nothing is
-interpolated. Where that record is older than a period of the site and of the frames an episode ends, and the
-next one begins behind the gap.
+Invariant:
+- A frame has of every site the newest record at or before its time, as float32; nothing is interpolated.
+- Where that record is older than a period of the site and of the frames an episode ends, and the next one
+  begins behind the gap.
+- An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
+- With `actions`, the names and units of actions are those of `action_features` of the plugin
+  `lerobot_robot_trilat` (a test compares them).
 """
 
 import json
@@ -14,13 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import find_user_shares, find_users, trace_dominance
+from ...core.task_space import PLACE
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import LogError, UsageError
 from ...files import import_extra
 from ...log.log_layout import collect_provenance
 from ...log.log_reader import Log
+from ...log.orientations import MATRIX_ENTRIES, expand_poses
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
@@ -29,7 +36,8 @@ _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
     "observation.state": "angles, rad, and velocities, rad/s, of the slave's joints",
-    "action": "command of the leading user, action.USER of each: angles, rad; in task space a place, m, rad",
+    "action": "command of the leading user, action.USER of each: angles, rad; or a place, m, and its turn",
+    "r11.rot": "a turn is six entries of the rotation matrix: its first column and its second one",
     "dominance": "share of each user in the slave's reference, Eq. (6); the largest one leads",
     "tau_x": "external torque of Eq. (8) at the slave, N m; tau_x.USER: what the hand of each user feels",
     "intervention": "true where another user than the program leads",
@@ -38,20 +46,32 @@ _MEANINGS = {
 _INDEX = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
 _PANDAS = {"pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})}
 """By this the reader of LeRobot, pandas, takes the texts of tasks for its index."""
+ACTIONS = ("tip", "joints")
+"""What actions may be besides what sites share: the modes of the plugin's hand that go to a place."""
 Names = dict[str, list[str]]
 Columns = dict[str, NDArray[Any]]
 """Columns of frames by the names of their features, shape (K, n) or (K,)."""
 
 
-def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30, program: str = "") -> str:
+def _write(
+    logs: Sequence[Log],
+    folder: Path,
+    written: Written,
+    *,
+    fps: int = 30,
+    program: str = "",
+    actions: str = "",
+) -> str:
     if fps < 1:
         raise UsageError(f"fps is a whole number of frames a second, not {fps}")
+    if actions not in ("", *ACTIONS):
+        raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
     tasks: dict[str, int] = {}
     names: Names = {}
     parts, sessions, lost = list[Columns](), [], 0
     for log in logs:
         rows, episode, left_out = _find_rows(log, fps)
-        columns, found = _read_columns(log, rows, program)
+        columns, found = _read_columns(log, rows, program, actions)
         if (names := names or found) != found:
             raise LogError(f"{log.source}: its users and joints are not those of {logs[0].source}")
         columns["episode_index"] = episode + (parts[-1]["episode_index"][-1] + 1 if parts else 0)
@@ -67,8 +87,12 @@ def _write(logs: Sequence[Log], folder: Path, written: Written, *, fps: int = 30
     whole |= {"timestamp": (frame / fps).astype(np.float32), "frame_index": frame, "index": index}
     texts = _store_tables(folder, whole, [*starts.tolist(), len(index)], list(tasks))
     texts["meta/info.json"] = _describe_set(fps, names, whole, len(starts), len(tasks))
-    about = {"exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}", "meanings": _MEANINGS}
-    texts[EXPORT_MANIFEST] = {**about, "program": program or "the last user", "sessions": sessions}
+    about: dict[str, Any] = {
+        "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
+        "meanings": _MEANINGS,
+    }
+    about |= {"actions": actions or "what sites share", "program": program or "the last user"}
+    texts[EXPORT_MANIFEST] = {**about, "sessions": sessions}
     for place, content in texts.items():
         (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n")
     return f"{len(index)} frames in {len(starts)} episodes; {lost} frames lie in gaps and are left out"
@@ -93,7 +117,7 @@ def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
     return {site: rows[frames] for site, rows in kept.items()}, episode, len(at_ns) - len(frames)
 
 
-def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Columns, Names]:
+def _read_columns(log: Log, rows: dict[str, Ints], program: str, actions: str) -> tuple[Columns, Names]:
     """Returns the columns of all frames, and the names of their numbers."""
     slave, users = find_users(log.scenario)
     if not slave or not users:
@@ -105,10 +129,7 @@ def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Column
     def read(site: str, field: str) -> Array:
         return np.asarray(getattr(log[site], field)[rows[site]])
 
-    task = log[slave].layout.task
-    commands = [read(user, "x" if task else "q") for user in users]
-    axes = TASK_AXES[: commands[0].shape[1]] if task else joints[users[0]]
-    commanded = [f"{one}.pos" for one in axes]
+    commands, commanded = _read_commands(log, users, rows, actions)
     state = [f"{slave}.{one}.{what}" for what in ("pos", "vel") for one in joints[slave]]
     found = [
         ("observation.state", np.hstack([read(slave, "q"), read(slave, "qd")]), state),
@@ -120,6 +141,32 @@ def _read_columns(log: Log, rows: dict[str, Ints], program: str) -> tuple[Column
     ]
     columns: Columns = {key: values.astype(np.float32) for key, values, _ in found}
     return {**columns, "intervention": shared.lead != shared.program}, {key: names for key, _, names in found}
+
+
+def _read_commands(
+    log: Log, users: Sequence[str], rows: dict[str, Ints], actions: str
+) -> tuple[list[Array], list[str]]:
+    """Returns what each user commands, shape (K, n) each, and the names of its numbers.
+
+    Raises:
+        LogError: the users' arms have other joints, so that no action is both's.
+    """
+    if actions == "tip":
+        tips = []
+        for user in users:
+            q, qd = log[user].q[rows[user]], log[user].qd[rows[user]]
+            tips.append(build_arm_rows(log.scenario, user).place_end_effector(q, qd).at)
+        return tips, [f"{axis}.pos" for axis in TASK_AXES[: tips[0].shape[1]]]
+    if not actions and log[users[0]].layout.task:
+        poses = [expand_poses(log[user].x[rows[user]]) for user in users]
+        places = [f"{axis}.pos" for axis in TASK_AXES[:PLACE]]
+        turned = [f"{entry}.rot" for entry in MATRIX_ENTRIES]
+        return poses, [*places, *turned][: poses[0].shape[1]]
+    joints = {user: [f"{name}.pos" for name in log.scenario.arms[user].joint_names] for user in users}
+    if other := next((user for user in users if joints[user] != joints[users[0]]), None):
+        text = f"the joints of {other} are not those of {users[0]}, so that no action is of either"
+        raise LogError(f"{log.source}: {text}: export --actions tip")
+    return [log[user].q[rows[user]] for user in users], joints[users[0]]
 
 
 def _store_tables(folder: Path, whole: Columns, edges: list[int], tasks: list[str]) -> dict[str, Any]:

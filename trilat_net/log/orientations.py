@@ -1,0 +1,115 @@
+"""Orientations as time series without jumps: unit quaternions of consistent sign, or six numbers.
+
+A record has an orientation as a rotation vector, axis times angle, at most half a turn long. That
+vector jumps by a whole turn where the angle passes half a turn, as for a tool that points down,
+although nothing jumps. Near half a turn its steps are up to pi / 2 times those of the motion, and no
+choice of branches is continuous for every motion of several turns. Series that leave the program are
+therefore made of one of these:
+
+- unit quaternions w, x, y, z. Each is nearest to the one before; the first has w >= 0. A turn by a
+  small angle moves the quaternion by half of that angle.
+- six numbers, the first and the second column of the rotation matrix. They depend on the orientation
+  alone and not on the past, as observations and actions of a policy must (Y. Zhou et al., "On the
+  continuity of rotation representations in neural networks", CVPR 2019). A turn by a small angle
+  moves them by at most sqrt(2) times that angle.
+
+Invariant:
+- The rotation is that of the record, to rounding; only its numbers differ.
+- Rotation vectors of any length are taken.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.task_space import PLACE, POSE
+from ..core.vectors import Array
+from ..scenario.arms import TASK_AXES
+
+QUATERNION_AXES = ("qw", "qx", "qy", "qz")
+"""Names of the four numbers of an orientation in a table."""
+MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
+"""Names of the six numbers of an orientation: row and column of the rotation matrix."""
+SIX_AXES = (*TASK_AXES[:PLACE], *MATRIX_ENTRIES)
+"""Names of the numbers of a pose with six numbers for its orientation."""
+
+
+def split_quaternions(turns: Array) -> tuple[Array, Array]:
+    """Returns w, shape (K, 1), and x, y, z, shape (K, 3), of rotation vectors, shape (K, 3), rad."""
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
+
+
+def find_quaternions(turns: Array) -> Array:
+    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4), of rotation vectors, rad."""
+    return align_signs(np.hstack(split_quaternions(turns)))
+
+
+def align_signs(quaternions: Array) -> Array:
+    """Returns quaternions, shape (K, 4), with signs such that each is nearest to the one before."""
+    dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
+    signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
+    aligned = quaternions.copy()
+    aligned[1:] *= signs[:, np.newaxis]
+    return aligned
+
+
+def find_six_numbers(turns: Array) -> Array:
+    """Returns the first two columns of the matrices of rotation vectors, shape (..., 6), of (..., 3), rad."""
+    rows = np.reshape(turns, (-1, 3))
+    w, v = split_quaternions(rows)
+    two = 2.0 * v
+    wx, wy, wz = (w * two).T
+    xx, yy, zz = (v * two).T
+    xy, xz, yz = 2.0 * v[:, 0] * v[:, 1], 2.0 * v[:, 0] * v[:, 2], 2.0 * v[:, 1] * v[:, 2]
+    columns = np.stack([1.0 - yy - zz, xy + wz, xz - wy, xy - wz, 1.0 - xx - zz, yz + wx], axis=1)
+    return columns.reshape(*np.shape(turns)[:-1], len(MATRIX_ENTRIES))
+
+
+def expand_poses(x: Array) -> Array:
+    """Returns what sites share with six numbers for an orientation: shape (..., 9) of poses (..., 6).
+
+    Joint angles and places without an orientation are returned as they are; use it for task space alone.
+    """
+    if x.shape[-1] != POSE:
+        return x
+    return np.concatenate([x[..., :PLACE], find_six_numbers(x[..., PLACE:])], axis=-1)
+
+
+def bring_nearer(turns: Array, references: Array) -> Array:
+    """Returns rotation vectors of the same rotations that are nearest to other ones, shape (K, 3), rad.
+
+    They may be longer than half a turn.
+    """
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
+    along = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
+    return np.asarray(turns + 2.0 * np.pi * np.round((along - angle) / (2.0 * np.pi)) * axis)
+
+
+def find_steady_vectors(turns: Array) -> Array:
+    """Returns rotation vectors, shape (K, 3), rad, that pass half a turn without a jump, up to a whole turn."""
+    quaternions = find_quaternions(turns)
+    w, v = quaternions[:, :1], quaternions[:, 1:]
+    sine = np.linalg.norm(v, axis=1, keepdims=True)
+    by_sine = np.divide(2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
+    return np.asarray(by_sine * v)
+
+
+class SteadyQuaternion:
+    """Sign of the quaternions of one stream: each is nearest to the one before; the first has w >= 0.
+
+    The order of the four numbers is free; `w` says where w stands.
+    """
+
+    def __init__(self, w: int = 3) -> None:
+        self._w = w
+        self._last: tuple[float, ...] = ()
+
+    def follow(self, quaternion: Sequence[float]) -> tuple[float, ...]:
+        """Returns a quaternion or its negative, which is the same rotation."""
+        last = self._last
+        dot = math.sumprod(quaternion, last) if last else quaternion[self._w]
+        self._last = tuple(-one for one in quaternion) if dot < 0.0 else tuple(quaternion)
+        return self._last
