@@ -9,10 +9,10 @@ millisecond, so that the numbers are the same on every machine.
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
+import msgspec
 import numpy as np
-from msgspec import Meta
 
 from .. import fields
 from ..core.chain import (
@@ -30,12 +30,15 @@ from ..core.site_setup import ChainSetup, Gains, Law, RestGains, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError
+from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
-ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
 TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
 STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
+START_MARGIN_RAD, START_MARGIN_M = 0.15, 0.02
+"""So far beyond a stop or a limit of position an arm may start: 8.6 degrees, or 2 cm of a sliding joint.
+Encoders are set to zero by hand, and arms are parked on stops that lie beyond those of their files."""
 STOP_EFFORT_NM = 100.0
 """The effort that stops are made for where a file states none."""
 PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
@@ -74,6 +77,8 @@ class Arm(fields.Frozen, frozen=True):
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass.
         armature_kg_m2: inertia of each drive as its joint has it; kg of a prismatic joint.
         stops: true: joint limits of the file are springs that an arm may run into.
+        balance_inertia: true: inertias of the file that no body has are replaced by the nearest that one has.
+        links: masses and inertias of links in place of the file's, by the link's name.
     """
 
     l1_m: fields.Positive = 1.0
@@ -95,9 +100,16 @@ class Arm(fields.Frozen, frozen=True):
     down: ThreeReals = (0.0, 0.0, -1.0)
     payload_kg: fields.NotNegative = 0.0
     payload_com_m: ThreeReals = (0.0, 0.0, 0.0)
-    payload_inertia_kg_m2: Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length=6)] = (0.0,) * 6
+    payload_inertia_kg_m2: TensorEntries = (0.0,) * 6
     armature_kg_m2: fields.NotNegativeJoints = (0.0,)
     stops: bool = True
+    balance_inertia: bool = False
+    links: dict[str, LinkInertia] = msgspec.field(default_factory=dict)
+
+
+def start_margin(joint: ChainJoint) -> float:
+    """Returns how far beyond its stops and limits a joint may start, rad or m."""
+    return START_MARGIN_M if joint.prismatic else START_MARGIN_RAD
 
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
@@ -181,6 +193,26 @@ class ArmModel(NamedTuple):
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
         return [(f"{link}.{name}", unit) for link in self.link_names for name, unit in BODY_UNITS.items()]
+
+    def widen_stops(self, q0: Vector) -> "ArmModel":
+        """Returns the arm with each stop moved to the start pose that lies at most the margin beyond it.
+
+        An arm that stands at rest beyond a nominal stop does not touch its real one, so that no spring
+        pushes there. Stops farther away from the start pose than that stay where they are.
+
+        Args:
+            q0: start pose, shape (n,).
+        """
+        if self.chain is None:
+            return self
+        joints = tuple(
+            joint._replace(lower=min(lower, start), upper=max(upper, start))
+            if lower - margin <= start <= upper + margin
+            else joint
+            for joint, start in zip(self.chain.joints, q0, strict=True)
+            for lower, upper, margin in [(joint.lower, joint.upper, start_margin(joint))]
+        )
+        return self._replace(chain=self.chain._replace(joints=joints))
 
     def joint_units(self, unit: str) -> list[str]:
         """Returns the unit of each joint's number, of what is in `unit` for a joint that turns."""
@@ -295,8 +327,17 @@ def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
             raise ScenarioError("is of a payload without mass: give payload_kg", path=key)
     payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
     try:
-        return _read_cached(urdf[arm.urdf], arm.base, arm.tip, payload if arm.payload_kg else None)
+        return _read_cached(
+            urdf[arm.urdf],
+            arm.base,
+            arm.tip,
+            payload if arm.payload_kg else None,
+            tuple(arm.links.items()),
+            balance=arm.balance_inertia,
+        )
     except ScenarioError as error:
+        if error.path:
+            raise
         place, _, problem = error.problem.partition(": ")
         if place in _OWN_KEYS:
             raise ScenarioError(problem, path=_OWN_KEYS[place]) from None
@@ -307,7 +348,17 @@ _OWN_KEYS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
 """Places of a problem that are keys of the arm and not of its file."""
 
 
-_read_cached = lru_cache(maxsize=64)(read_urdf)
+@lru_cache(maxsize=64)
+def _read_cached(
+    text: str,
+    base: str,
+    tip: str,
+    payload: UrdfPayload | None,
+    links: tuple[tuple[str, LinkInertia], ...],
+    *,
+    balance: bool,
+) -> UrdfChain:
+    return read_urdf(text, base, tip, payload, dict(links), balance=balance)
 
 
 def _place_base(

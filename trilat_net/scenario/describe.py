@@ -19,7 +19,7 @@ from ..core.philox import link_key
 from ..core.vectors import Array
 from ..laws.conditions import LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
-from .arms import TASK_AXES, read_arm
+from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .sample_uses import count_silences, draw_uses
 from .scenario_reader import load_scenario
@@ -133,8 +133,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 def _describe_arms(scenario: Scenario) -> list[str]:
     lines: list[str] = []
-    for arm in dict.fromkeys(spec.arm for spec in scenario.sites.values() if spec.arm.urdf):
-        owners = [name for name, spec in scenario.sites.items() if spec.arm == arm]
+    for arm, owners in _group_chains(scenario):
         chain, model = read_arm(arm, scenario.urdf), scenario.arms[owners[0]]
         mass = sum(joint.inertia[0] for joint in chain.joints)
         lines.append(
@@ -153,7 +152,61 @@ def _describe_arms(scenario: Scenario) -> list[str]:
             moved = f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"
             lines.append("; ".join([moved, *filter(None, facts)]))
         lines += [f"  note: {note}" for note in chain.notes]
-    return lines
+    return lines + [f"note: {note}" for note in _list_start_notes(scenario)]
+
+
+def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
+    """Returns every different arm of a URDF, with the sites that have it."""
+    grouped: list[tuple[Arm, list[str]]] = []
+    for name, spec in scenario.sites.items():
+        if not spec.arm.urdf:
+            continue
+        owners = next((owners for arm, owners in grouped if arm == spec.arm), None)
+        if owners is None:
+            grouped.append((spec.arm, [name]))
+        else:
+            owners.append(name)
+    return grouped
+
+
+def list_arm_notes(scenario: Scenario) -> list[str]:
+    """Returns how the arms of a run differ from what their files state, a sentence each, with the sites."""
+    notes = [
+        f"arm of {', '.join(owners)}: {note}"
+        for arm, owners in _group_chains(scenario)
+        for note in read_arm(arm, scenario.urdf).notes
+    ]
+    return notes + _list_start_notes(scenario)
+
+
+def _list_start_notes(scenario: Scenario) -> list[str]:
+    """Returns which joints start beyond a stop or a limit of position, and what follows, a sentence each."""
+    notes: list[str] = []
+    for name, spec in scenario.sites.items():
+        model = scenario.arms[name]
+        units = model.joint_units("rad")
+        if spec.arm.urdf and spec.arm.stops:
+            for n, joint in enumerate(read_arm(spec.arm, scenario.urdf).joints):
+                start = spec.q0_rad[n]
+                beyond = max(joint.lower - start, start - joint.upper)
+                if beyond > 0.0:
+                    notes.append(
+                        f"{name} starts {beyond:.3g} {units[n]} beyond a stop of joint {joint.name}: the stop "
+                        "lies where the arm starts"
+                    )
+        given, in_force = spec.limits.motion, scenario.motion_limits(name)
+        for key, before, after in (
+            ("q_min_rad", given.q_min, in_force.q_min),
+            ("q_max_rad", given.q_max, in_force.q_max),
+        ):
+            shape = (len(spec.q0_rad),)
+            for n in np.flatnonzero(np.broadcast_to(before, shape) != np.broadcast_to(after, shape)):
+                limit = float(np.broadcast_to(after, shape)[n])
+                notes.append(
+                    f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "
+                    f"{limit:.4g} {units[n]} in this run"
+                )
+    return notes
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:

@@ -44,7 +44,7 @@ def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str,
         if key == "rate_hz":
             every |= {f"sites.{site}.rate_hz": value for site in scenario.names}
         elif group in SITE_GROUPS and name:
-            check_keys({_split_entry(name)[0]: value}, field_names(SITE_GROUPS[group]), group)
+            check_keys({_split_entry(name)[0].split(".")[0]: value}, field_names(SITE_GROUPS[group]), group)
             every |= {f"sites.{site}.{key}": value for site in scenario.names}
         elif group in _KIND_KEYS and name:
             every |= dict.fromkeys(_expand_group(scenario, group, name, given), value)

@@ -43,6 +43,7 @@ from .distributions import Draws
 from .expect import Expect, number_window_joints
 from .imported_code import CLASS_PATTERN, read_code
 from .laws import LAWS
+from .link_inertia import LinkInertia
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .own_plant import resolve_plant
 from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, Scenario, SiteSpec
@@ -212,7 +213,7 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
         groups[name] = {}
         for group, kind in SITE_GROUPS.items():
             own = check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}")
-            groups[name][group] = own if "urdf" in own else {**tables.get(group, {}), **own}
+            groups[name][group] = own if "urdf" in own else _join_group(tables.get(group, {}), own)
     if len(written) > MAX_SITES:
         raise ScenarioError(f"has {len(written)} sites, at most {MAX_SITES} are taken", path="sites")
     if len(written) < 2:
@@ -227,6 +228,18 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
         name: _resolve_site(name, {**table, **groups[name]}, tables, draws, urdf, chains)
         for name, table in written.items()
     }
+
+
+def _join_group(shared: TomlTable, own: TomlTable) -> TomlTable:
+    """Returns a site's table of a group upon the one of all sites; of `links` link by link, key by key."""
+    joined = {**shared, **own}
+    links = [table.get("links") for table in (shared, own)]
+    if all(isinstance(table, dict) for table in links):
+        joined["links"] = {**links[0], **links[1]}
+        for name in links[0].keys() & links[1].keys():
+            if isinstance(links[0][name], dict) and isinstance(links[1][name], dict):
+                joined["links"][name] = {**links[0][name], **links[1][name]}
+    return joined
 
 
 def _resolve_site(
@@ -276,7 +289,8 @@ def _resolve_arm(
 ) -> tuple[TomlTable, ArmModel | None]:
     table, task = dict(site["arm"]), site["task"]
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
-    table = draws.draw_numbers(table, path)
+    links = _resolve_link_inertias(table.pop("links", {}), draws, f"{path}.links")
+    table = draws.draw_numbers(table, path) | ({"links": links} if links else {})
     model = _model_arm(table, task, urdf, chains, path)
     if not armature or model is None:
         return {**table, **armature}, model
@@ -284,6 +298,24 @@ def _resolve_arm(
         raise ScenarioError(_OF_A_CHAIN, path=f"{path}.armature_kg_m2")
     table |= draws.draw_numbers(expand_vectors(armature, Arm, model.counts), path)
     return table, _model_arm(table, task, urdf, chains, path)
+
+
+def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
+    """Returns the masses and inertias that an arm gives its links, drawn and checked one by one."""
+    links: TomlTable = {}
+    for name, entry in check_keys(written, list(written), path).items():
+        place = f"{path}.{name}"
+        check_keys(entry, field_names(LinkInertia), place)
+        links[name] = draws.draw_numbers(entry, place)
+        try:
+            given = msgspec.convert(links[name], LinkInertia)
+        except msgspec.ValidationError as error:
+            problem, key = split_refusal(error)
+            raise ScenarioError(reword_problem(problem), path=f"{place}.{key.strip('.')}") from None
+        if not given.list_keys():
+            keys = ", ".join(field_names(LinkInertia))
+            raise ScenarioError(f"is empty: give {keys}", path=place)
+    return links
 
 
 def _name_joints(table: TomlTable, urdf: dict[str, str]) -> tuple[str, ...]:

@@ -28,7 +28,16 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel
-from .arms import Arm, ArmModel, Task, add_credible_box, build_arm, find_rest_gains
+from .arms import (
+    START_MARGIN_RAD,
+    Arm,
+    ArmModel,
+    Task,
+    add_credible_box,
+    build_arm,
+    find_rest_gains,
+    start_margin,
+)
 from .delay_models import Link, LinkBase
 from .distributions import Distribution
 from .expect import Expect
@@ -287,10 +296,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         models = {}
         for name, spec in self.sites.items():
             try:
-                models[name] = build_arm(spec.arm, spec.task, self.urdf, chains)
+                model = build_arm(spec.arm, spec.task, self.urdf, chains)
             except ScenarioError as error:
                 path = f"sites.{name}.arm" + (f".{error.path}" if error.path else "")
                 raise ScenarioError(error.problem, path=path) from None
+            models[name] = model.widen_stops(spec.q0_rad)
         return models
 
     @cached_property
@@ -442,9 +452,29 @@ class Scenario(Frozen, frozen=True, dict=True):
             chain=arm.chain,
             channel=self.channel(site),
             bodies=len(self.bodies_m(site)),
-            limits=spec.limits.motion,
+            limits=self.motion_limits(site),
             rest=self._rest_gains(site) if spec.on_stale.action == "glide" else site_setup.RestGains(),
             bit=1 << self.names.index(site),
+        )
+
+    def motion_limits(self, site: str) -> site_setup.MotionLimits:
+        """Returns the limits of a site's motion, with room for a start pose a little beyond a limit.
+
+        A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be there during
+        the whole run: its limit on that side lies the margin further out.
+        """
+        spec, arm = self.sites[site], self.arms[site]
+        motion = spec.limits.motion
+        start = np.array(spec.q0_rad)
+        low, high = (np.broadcast_to(limit, start.shape) for limit in (motion.q_min, motion.q_max))
+        margin = np.full(start.shape, START_MARGIN_RAD)
+        if arm.chain is not None:
+            margin = np.array([start_margin(joint) for joint in arm.chain.joints])
+        if not np.any((start < low) | (start > high)):
+            return motion
+        return motion._replace(
+            q_min=tuple(np.where((start < low) & (start >= low - margin), low - margin, low).tolist()),
+            q_max=tuple(np.where((start > high) & (start <= high + margin), high + margin, high).tolist()),
         )
 
     def gains(self, site: str) -> site_setup.Gains:

@@ -38,7 +38,7 @@ class SimulatedArm:
     def __init__(self, scenario: Scenario, site: str, heavier: float = 1.0) -> None:
         find_site(scenario, site)
         spec = scenario.sites[site]
-        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True)
+        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True).widen_stops(spec.q0_rad)
         assert arm.chain is not None
         self.q, self.qd = np.array(spec.q0_rad), np.array(spec.qd0_rad_s)
         self.chain, self.theta = arm.chain, heavier * arm.theta

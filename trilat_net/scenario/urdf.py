@@ -1,10 +1,15 @@
 """Arms from URDF: the moving bodies between a base and an end link, with their joints.
 
-Invariant: a chain that is read is physical (every moving body has mass, positive principal moments of inertia
-and their triangle inequality), and nothing that a moving link carries is left out: what hangs on it is
-lumped, or the file is refused with the link or joint named. The text is not trusted: no file that it names
-is opened, no entity is expanded, and its angles are turned into matrices by `core.sincos` and sums in a
-fixed order, so that the numbers of a chain have the same bits on every machine.
+Invariant:
+    - A chain that is read is physical: every moving body has mass, positive principal moments of inertia and
+      their triangle inequality.
+    - What hangs on a moving link is part of its body. A link that does not lead to the end link never makes
+      an arm unusable: if its inertia is that of no body, a note says how it counts.
+    - A link on the way to the end link whose inertia is that of no body is refused by name, unless the caller
+      balances inertias or gives that link others.
+    - The text is not trusted: no file that it names is opened, no entity is expanded, and its angles are
+      turned into matrices by `core.sincos` and sums in a fixed order, so that the numbers of a chain have the
+      same bits on every machine.
 
 Units are those of URDF: kg, m, rad, N m; N along a prismatic joint. Frames: the frame of a link lies on the
 joint that moves it.
@@ -12,7 +17,7 @@ joint that moves it.
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple, NoReturn
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -23,6 +28,7 @@ from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
 from ..core.elementary import sincos
 from ..errors import ScenarioError
 from ..fields import MAX_QUANTITY, suggest_nearest
+from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000
 MOST_DIGITS = 100
@@ -150,7 +156,43 @@ class _Robot(NamedTuple):
     below: Mapping[str, Sequence[_Edge]]
 
 
-def read_urdf(text: str, base: str = "", tip: str = "", payload: UrdfPayload | None = None) -> UrdfChain:
+class _Inertias(NamedTuple):
+    """What a scenario says about the inertias of a file.
+
+    Attributes:
+        links: masses and inertias by the link's name, in place of the file's.
+        balance: true: a tensor that no body has is balanced; false: it is refused, or noted.
+    """
+
+    links: Mapping[str, LinkInertia]
+    balance: bool
+
+
+class _LinkBody(NamedTuple):
+    """The body of a link that a joint of the path moves, about the frame of the moving link.
+
+    Attributes:
+        link: the link that states it.
+        body: its parameters as they are stated, or balanced.
+        point: its parameters as a point of mass, where its moments are those of no body; else None.
+        problem: why its moments are those of no body; "" if they are those of one.
+    """
+
+    link: str
+    body: BodyParameters
+    point: BodyParameters | None = None
+    problem: str = ""
+
+
+def read_urdf(
+    text: str,
+    base: str = "",
+    tip: str = "",
+    payload: UrdfPayload | None = None,
+    links: Mapping[str, LinkInertia] | None = None,
+    *,
+    balance: bool = False,
+) -> UrdfChain:
     """Returns the arm between two links of a robot.
 
     Links behind fixed joints are part of the moving link before. A branch that a moving link carries on
@@ -161,27 +203,52 @@ def read_urdf(text: str, base: str = "", tip: str = "", payload: UrdfPayload | N
         base: the link that does not move; "": the robot's root.
         tip: the end link; "": the only leaf that moves.
         payload: a body that the end link carries.
+        links: masses and inertias in place of the file's, by the link's name.
+        balance: true: a stated inertia that no body has is replaced by the nearest that a body has.
 
     Raises:
-        ScenarioError: the problem, with the line, link or joint.
+        ScenarioError: the problem, with the line, link or joint; of a key of `links` with its path, as in
+            links.NAME.mass_kg.
     """
     robot = _read_tree(_parse_xml(text))
     base = _check_end(robot, "base", base) or _find_base(robot)
     tip = _check_end(robot, "tip", tip) or _find_tip(robot, base)
     path = _find_path(robot, base, tip)
+    inertias = _Inertias(links or {}, balance)
     joints: list[UrdfJoint] = []
     notes: list[str] = []
+    moved: set[str] = set()
     pose = _Pose()
     last = max(n for n, edge in enumerate(path) if edge.moves)
     for n, edge in enumerate(path):
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
         if edge.moves:
-            bodies = _gather_bodies(robot, edge, path, notes)
+            carried = list(_walk_carried(robot, edge, path, notes))
+            moved |= {name for name, _ in carried}
+            bodies = list(_read_bodies(robot, carried, path, inertias, notes))
             if payload is not None and n == last:
-                bodies.append(_read_payload(payload, path[n + 1 :]))
-            joints.append(_read_joint(edge, pose, _lump_bodies(edge, bodies), notes))
+                bodies.append(_LinkBody("payload", _read_payload(payload, path[n + 1 :])))
+            joints.append(_read_joint(edge, pose, _lump_bodies(edge, bodies, notes), notes))
             pose = _Pose()
+    _check_mended(robot, inertias.links, moved)
     return UrdfChain(base, tip, tuple(joints), *pose, tuple(notes))
+
+
+def _check_mended(robot: _Robot, links: Mapping[str, LinkInertia], moved: Collection[str]) -> None:
+    """Refuses inertias of links that the robot lacks, or that no joint of the arm moves."""
+    for name in links:
+        if name not in robot.links:
+            problem = f"there is no {_link(name)}{suggest_nearest(name, list(robot.links))}"
+        elif name not in moved:
+            problem = f"{_link(name)} is moved by no joint between base and tip: its inertia has no effect"
+        else:
+            continue
+        raise ScenarioError(problem, path=_key(name))
+
+
+def _key(link: str) -> str:
+    """Returns the key path of a link's inertia, as an author writes it."""
+    return f"links.{link}" if re.fullmatch(r"[A-Za-z0-9_-]+", link) else f'links."{link}"'
 
 
 def _refuse(place: str, problem: str) -> NoReturn:
@@ -347,33 +414,106 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
     return path[::-1]
 
 
-def _gather_bodies(
+def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
-) -> list[BodyParameters]:
-    """Returns all that a joint of the path moves, up to the next one, in the frame of its link."""
+) -> Iterator[tuple[str, _Pose]]:
+    """Yields every link that a joint of the path moves, up to the next one, with its frame in its link's."""
     on_path = {edge.name for edge in path}
-    bodies: list[BodyParameters] = []
     waiting = [(moving.child, _Pose())]
     while waiting:
         name, pose = waiting.pop()
-        body = _read_inertial(robot.links[name], name)
-        if body is not None:
-            bodies.append(_move_body(*body, pose))
+        yield name, pose
         for edge in robot.below[name]:
             if edge.moves and edge.name in on_path:
                 continue
-            if edge.kind in ("floating", "planar"):
-                _refuse(
-                    _joint(edge.name),
-                    f"is {edge.kind} and hangs on {_link(name)}, which moves: make it fixed, or leave it out",
-                )
-            if edge.moves:
+            if edge.kind != "fixed":
                 notes.append(
                     f"{_joint(edge.name)} does not lead to the end link: held at zero, "
                     f"{_link(edge.child)} is part of {_link(moving.child)}"
                 )
             waiting.append((edge.child, pose @ _read_origin(edge.element, _joint(edge.name))))
-    return bodies
+
+
+def _read_bodies(
+    robot: _Robot,
+    carried: Sequence[tuple[str, _Pose]],
+    path: Sequence[_Edge],
+    inertias: _Inertias,
+    notes: list[str],
+) -> Iterator[_LinkBody]:
+    """Yields the bodies of links, about the frame of the link that moves them."""
+    leading = {edge.child for edge in path}
+    for name, pose in carried:
+        given = inertias.links.get(name)
+        if given is not None:
+            notes.append(_note_given(name, given))
+        inertial = _read_inertial(robot.links[name], name, given)
+        if inertial is None:
+            continue
+        problem = _find_mass_problem(inertial)
+        if problem and given is not None:
+            key = "mass_kg" if given.inertia_kg_m2 is None else "inertia_kg_m2"
+            raise ScenarioError(problem, path=f"{_key(name)}.{key}")
+        if name in leading and problem:
+            _refuse(_link(name), f"{problem}; {_advise_key(name, 'mass_kg')}")
+        if name in leading and inertial.lacks_tensor and given is None:
+            _refuse(
+                _link(name), f"its <inertial> has no <inertia>; {_advise_key(name, 'inertia_kg_m2')}"
+            )
+        if problem:
+            notes.append(f"{_link(name)} does not lead to the end link and is left out: {problem}")
+            continue
+        if inertial.lacks_tensor:
+            notes.append(f"{_link(name)} states a mass and no inertia: a point of {inertial.mass:g} kg")
+        yield _read_body(name, pose, inertial, path, inertias, notes)
+
+
+def _read_body(
+    name: str,
+    pose: _Pose,
+    inertial: "_Inertial",
+    path: Sequence[_Edge],
+    inertias: _Inertias,
+    notes: list[str],
+) -> _LinkBody:
+    """Returns the body of a link, balanced where that is asked for; refused if it leads to the end link."""
+    mass, centre, tensor, _ = inertial
+    moments = _principal_moments(tensor)
+    slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
+    problem = _find_moments_problem(moments, -slack, slack)
+    if not problem:
+        return _LinkBody(name, _move_body(mass, centre, tensor, pose))
+    if inertias.balance:
+        tensor = balance_tensor(tensor)
+        least, middle, most = _principal_moments(tensor)
+        notes.append(f"{_link(name)}: {problem}; balanced to {least:.4g}, {middle:.4g} and {most:.4g}")
+        return _LinkBody(name, _move_body(mass, centre, tensor, pose))
+    given = inertias.links.get(name)
+    if given is not None and given.inertia_kg_m2 is not None:
+        raise ScenarioError(problem, path=f"{_key(name)}.inertia_kg_m2")
+    if any(edge.child == name for edge in path):
+        _refuse(_link(name), f"{problem}; {_advise_balance(name, path)}")
+    point = _move_body(mass, centre, fill_tensor((0.0,) * 6), pose)
+    return _LinkBody(name, _move_body(mass, centre, tensor, pose), point, problem)
+
+
+def _advise_key(name: str, key: str) -> str:
+    return f"give {key} in [arm.{_key(name)}]"
+
+
+def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
+    """Returns what an author can do about moments of a link on the path that no body has."""
+    ways = ["set arm.balance_inertia = true", _advise_key(name, "inertia_kg_m2")]
+    moving = [edge for edge in path if edge.moves]
+    if len(moving) > 1 and moving[-1].child == name:
+        ways.append(f"end the arm before it with arm.tip = {_quote(moving[-1].parent)}")
+    return ", or ".join(ways)
+
+
+def _note_given(name: str, given: LinkInertia) -> str:
+    if given.mass_kg == 0.0:
+        return f"{_link(name)}: the scenario leaves its mass out"
+    return f"{_link(name)}: {', '.join(given.list_keys())} of the scenario, in place of the file's"
 
 
 def _read_joint(edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]) -> UrdfJoint:
@@ -482,20 +622,71 @@ def _read_origin(parent: Element, place: str) -> _Pose:
 # Inertia
 
 
-def _read_inertial(link: Element, name: str) -> tuple[float, _Pose, Matrix] | None:
-    """Returns the mass of a link, its frame of inertia and the tensor there; None if it states none."""
-    place = _link(name)
-    inertial = _child(link, "inertial", place)
-    if inertial is None:
+class _Inertial(NamedTuple):
+    """The mass of a link, its frame of inertia in the link's frame, and the tensor there.
+
+    `lacks_tensor`: neither the file nor the scenario states a tensor, so that it is zero.
+    """
+
+    mass: float
+    centre: _Pose
+    tensor: Matrix
+    lacks_tensor: bool
+
+
+_TENSOR_KEYS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
+_POINT = fill_tensor((0.0,) * 6)
+
+
+def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Inertial | None:
+    """Returns the inertia of a link by the scenario, and otherwise by the file; None if none is stated."""
+    given = given or LinkInertia()
+    inertial = _child(link, "inertial", _link(name))
+    if given.mass_kg == 0.0:
+        for key in given.list_keys()[1:]:
+            raise ScenarioError("is of a link without mass: leave it out", path=f"{_key(name)}.{key}")
         return None
-    mass_element, tensor_element = _child(inertial, "mass", place), _child(inertial, "inertia", place)
-    if mass_element is None or tensor_element is None:
-        _refuse(place, f"its <inertial> has no <{'mass' if mass_element is None else 'inertia'}>")
-    mass = _read_number(mass_element, "value", place)
-    keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-    tensor = _fill_tensor([_read_number(tensor_element, key, place) for key in keys])
-    _check_stated(place, mass, tensor)
-    return mass, _read_origin(inertial, place), tensor
+    if inertial is None and given.mass_kg is None:
+        if given.list_keys():
+            problem = f"is missing: the file states no mass of {_link(name)}"
+            raise ScenarioError(problem, path=f"{_key(name)}.mass_kg")
+        return None
+    mass, centre, tensor = given.mass_kg, _Pose(), None
+    if inertial is not None:
+        mass, centre, tensor = _read_stated_inertial(inertial, name, given)
+    if given.inertia_kg_m2 is not None:  # in the axes of the link, and not in those of the <origin>
+        centre = _Pose(_UNIT, centre.origin_m)
+        tensor = fill_tensor(given.inertia_kg_m2)
+    if given.com_m is not None:
+        x, y, z = given.com_m
+        centre = _Pose(centre.rotation, (x, y, z))
+    return _Inertial(mass or 0.0, centre, _POINT if tensor is None else tensor, tensor is None)
+
+
+def _read_stated_inertial(
+    inertial: Element, name: str, given: LinkInertia
+) -> tuple[float | None, _Pose, Matrix | None]:
+    """Returns mass, frame and tensor of an <inertial>; what the scenario gives is not read."""
+    place = _link(name)
+    mass, tensor = given.mass_kg, None
+    mass_element = _child(inertial, "mass", place)
+    tensor_element = _child(inertial, "inertia", place)
+    if mass is None and mass_element is not None:
+        mass = _read_number(mass_element, "value", place)
+    if given.inertia_kg_m2 is None and tensor_element is not None:
+        tensor = fill_tensor([_read_number(tensor_element, key, place) for key in _TENSOR_KEYS])
+    replaced = given.com_m is not None and given.inertia_kg_m2 is not None
+    centre = _Pose() if replaced else _read_origin(inertial, place)
+    return mass, centre, tensor
+
+
+def _find_mass_problem(inertial: _Inertial) -> str:
+    """Returns why a mass cannot be, or ""."""
+    if inertial.mass < 0.0:
+        return f"its mass is {inertial.mass:g} kg, must not be negative"
+    if inertial.mass == 0.0 and any(map(any, inertial.tensor)):
+        return "has moments of inertia and no mass: give both, or neither"
+    return ""
 
 
 def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameters:
@@ -503,38 +694,28 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
     pose = _Pose()
     for edge in fixed:
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
-    tensor = _fill_tensor(payload.inertia_kg_m2)
-    _check_stated("payload", payload.mass_kg, tensor)
+    tensor = fill_tensor(payload.inertia_kg_m2)
+    moments = _principal_moments(tensor)
+    slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
+    if problem := _find_moments_problem(moments, -slack, slack):
+        _refuse("payload", problem)
     x, y, z = payload.com_m
     return _move_body(payload.mass_kg, _Pose(_UNIT, (x, y, z)), tensor, pose)
-
-
-def _fill_tensor(entries: Sequence[float]) -> Matrix:
-    xx, xy, yy, xz, yz, zz = entries
-    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
 def _principal_moments(tensor: Matrix) -> list[float]:
     return [float(moment) for moment in np.linalg.eigvalsh(np.array(tensor))]
 
 
-def _check_stated(place: str, mass: float, tensor: Matrix) -> None:
-    if mass < 0.0:
-        _refuse(place, f"its mass is {mass:g} kg, must not be negative")
-    if mass == 0.0 and any(map(any, tensor)):
-        _refuse(place, "has moments of inertia and no mass: give both, or neither")
-    moments = _principal_moments(tensor)
-    slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
-    _check_moments(place, moments, -slack, slack)
-
-
-def _check_moments(place: str, moments: Sequence[float], bound: float, slack: float) -> None:
+def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) -> str:
+    """Returns why principal moments of inertia, in ascending order, are those of no body, or ""."""
     least, middle, most = moments
     stated = f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
     if least < bound:
-        _refuse(place, f"{stated}: all must be positive")
+        return f"{stated}, and all must be positive"
     if most - least - middle > slack:
-        _refuse(place, f"{stated}: of a body, no one is more than the two others together")
+        return f"{stated}, and of a body, no one is more than the two others together"
+    return ""
 
 
 def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyParameters:
@@ -559,20 +740,48 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
     )
 
 
-def _lump_bodies(edge: _Edge, bodies: Sequence[BodyParameters]) -> BodyParameters:
-    """Returns the sum of bodies that one joint moves; refused unless it is a body with mass and extent."""
+def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
+    """Returns the sum of bodies that one joint moves; refused unless it is a body with mass and extent.
+
+    Links off the path whose moments no body has count as stated if the sum is a body, else as points.
+    """
     place = f"{_link(edge.child)}, which {_joint(edge.name)} moves"
     if not bodies:
-        _refuse(place, "has no <inertial>, and nothing fixed to it has one: give it a mass")
+        advice = f"give mass_kg and inertia_kg_m2 in [arm.{_key(edge.child)}]"
+        _refuse(place, f"has no <inertial>, and nothing fixed to it has one; {advice}")
+    total = _add_bodies([one.body for one in bodies])
+    problem = _find_sum_problem(total)
+    doubtful = [one for one in bodies if one.point is not None]
+    as_points = bool(problem and doubtful)
+    if as_points:
+        total = _add_bodies([one.point or one.body for one in bodies])
+        problem = _find_sum_problem(total)
+    if problem:
+        key = "mass_kg" if total[0] < LEAST_MASS_KG else "inertia_kg_m2"
+        _refuse(place, f"{problem}; {_advise_key(edge.child, key)}")
+    for one in doubtful:
+        counts = f"as a point of {one.body[0]:g} kg" if as_points else "as stated"
+        notes.append(
+            f"{_link(one.link)} does not lead to the end link and counts {counts}, although {one.problem}; "
+            "arm.balance_inertia = true balances them"
+        )
+    return total
+
+
+def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
     total = bodies[0]
     for body in bodies[1:]:  # one by one: the built-in sum rounds otherwise from Python 3.12 on
         total = tuple(a + b for a, b in zip(total, body, strict=True))
+    return total
+
+
+def _find_sum_problem(total: BodyParameters) -> str:
+    """Returns why the parameters of all that a joint moves are those of no body with extent, or ""."""
     mass = total[0]
     if mass < LEAST_MASS_KG:
-        _refuse(place, f"has {mass:g} kg with all that is fixed to it: a body that moves needs mass")
+        return f"has {mass:g} kg with all that is fixed to it, and a body that moves needs mass"
     x, y, z = (moment / mass for moment in total[1:4])
-    back = _move_body(-mass, _Pose(_UNIT, (x, y, z)), _fill_tensor(total[4:]), _Pose())
-    moments = _principal_moments(_fill_tensor(back[4:]))
+    back = _move_body(-mass, _Pose(_UNIT, (x, y, z)), fill_tensor(total[4:]), _Pose())
+    moments = _principal_moments(fill_tensor(back[4:]))
     slack = CONSISTENCY * moments[2]
-    _check_moments(place, moments, max(LEAST_MOMENT_KG_M2, slack), slack)
-    return total
+    return _find_moments_problem(moments, max(LEAST_MOMENT_KG_M2, slack), slack)

@@ -19,7 +19,7 @@ from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
 from ..laws.sent_vectors import check_sends
 from . import operators
-from .arms import TASK_AXES
+from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase
 from .delay_models.kernel_delays import ConstantDelay, TraceDelay
 from .distributions import dotted_key
@@ -323,7 +323,8 @@ def _check_start_poses(scenario: Scenario) -> None:
                 drawn = f", drawn with seed {scenario.seed}" if dotted_key(path) in scenario.drawn else ""
                 raise ScenarioError(
                     f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, which moves "
-                    f"from {joint.lower:g} to {joint.upper:g} {unit}: start within, or set stops = false",
+                    f"from {joint.lower:g} to {joint.upper:g} {unit}: start at most "
+                    f"{start_margin(joint):g} {unit} beyond, or set stops = false",
                     path=path,
                 )
 
@@ -331,7 +332,8 @@ def _check_start_poses(scenario: Scenario) -> None:
 def _check_limits(scenario: Scenario, name: str) -> None:
     """Refuses limits that leave no room, that nothing keeps, or that a start pose breaks."""
     site, path = scenario.sites[name], f"sites.{name}.limits"
-    low, high = site.limits.motion.q_min, site.limits.motion.q_max
+    limits = scenario.motion_limits(name)
+    low, high = limits.q_min, limits.q_max
     stated = next((key for key in ("q_min_rad", "q_max_rad") if getattr(site.limits, key) is not None), "")
     if stated and site.on_stale.action != "glide":
         raise ScenarioError(
@@ -344,7 +346,8 @@ def _check_limits(scenario: Scenario, name: str) -> None:
     if np.any((start < low) | (start > high)):
         joint = int(np.argmax((start < low) | (start > high)))
         raise ScenarioError(
-            f"is {start[joint]:g} rad, beyond q_min_rad or q_max_rad: start within",
+            f"is {start[joint]:g} rad, beyond q_min_rad or q_max_rad: start at most {START_MARGIN_RAD:g} rad "
+            f"({START_MARGIN_M:g} m of a sliding joint) beyond",
             path=f"sites.{name}.q0_rad[{joint}]",
         )
 
