@@ -1,10 +1,14 @@
 """A device at the arm of a site: its motion leads the arm, and it renders what the arm gives back.
 
-Invariant: only changes of the device's place move the target, and only while its clutch is pressed: a state
-that is not finite, or a jump, moves nothing, and neither does a device that comes back. Whoever has let go,
-by the device's silence too, takes hold again by pressing the clutch anew. The force is that of the newest
-record, turned, scaled and limited as the scenario says; it is zero while the clutch is open, or the record is
-old. The hand has no heartbeat but the device's: a loop that hangs is a silent hand.
+Invariant:
+    - Only changes of the device's place move the target, and only while its clutch is pressed: a state that is
+      not finite, or a jump, moves nothing, and neither does a device that comes back.
+    - The target stays within the arm's reach, however often the clutch is pressed: a motion of the device
+      that leads out of it is lost, and one that leads back in acts at once.
+    - Whoever has let go, by the device's silence too, takes hold again by pressing the clutch anew.
+    - The force is that of the newest record, turned, scaled and limited as the scenario says; it is zero while
+      the clutch is open, or the record is old.
+    - The hand has no heartbeat but the device's: a loop that hangs is a silent hand.
 """
 
 import math
@@ -14,7 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS
+from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, Reach
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.clock import Clock
 from trilat_net.scenario.operators.kernel_operators import DeviceSettings
@@ -30,13 +34,23 @@ TRIPS_KEPT = 60_000
 class DeviceHand:
     """A device that leads the arm of a live hand.
 
+    Args:
+        hand: the connection to the site.
+        device: what is held.
+        how: how the device leads the arm, and what it renders.
+        clock: the clock of this machine.
+        reach: where the target may be.
+
     Attributes:
         states, jumps, unreadable: how many states came, and how many of them moved nothing for that reason.
         trips_ns: from the place of the device to the force that it has caused.
     """
 
-    def __init__(self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock) -> None:
+    def __init__(
+        self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: Reach
+    ) -> None:
         self._hand, self._device, self._how, self._clock = hand, device, how, clock
+        self._reach = reach
         self._rows = how.rows(len(hand.pose))
         self.states = self.jumps = self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
@@ -88,7 +102,8 @@ class DeviceHand:
                 self.jumps += 1
             else:
                 steps = (how.scale * sum(map(operator.mul, row, moved)) for row in self._rows)
-                self._target = list(map(operator.add, self._target, steps))
+                moved_target = list(map(operator.add, self._target, steps))
+                self._target = list(self._reach.find_nearest(moved_target))
 
     def _find_force(self) -> Vector:
         """Returns the reaction of the arm; of a clutch that has just been closed it grows."""

@@ -58,7 +58,7 @@ class HandServer:
         self, site: Site, hand: LiveHand, arm: ArmModel, inbox: Inbox, dropped: Counter[str]
     ) -> None:
         self._site, self._hand, self._inbox, self._dropped = site.name, hand, inbox, dropped
-        self._rules = hand.rules(site.rate_hz, arm.counts)
+        self._rules = hand.rules(site.rate_hz, arm)
         self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)

@@ -142,7 +142,8 @@ class RunningSession:
                     raise UsageError(
                         f"a device leads an end effector: the hand of {site} is not of mode 'tip'"
                     )
-                led = DeviceHand(held, device, live.device, self._clock)
+                reach = scenario.arms[site].reach
+                led = DeviceHand(held, device, live.device, self._clock, reach)
                 led.run(stopped, lambda text: say(f"{site}: {text}"))
                 say(f"{site}: {led.describe()}")
 

@@ -31,6 +31,7 @@ from ..log.site_log import SiteLog
 from ..net import topics
 from ..net.topics import count_messages, number_message
 from ..results import JsonObject, Result, finite_or_none
+from ..scenario.describe import list_arm_notes
 from ..scenario.expect import END_WINDOW_S
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
@@ -238,6 +239,7 @@ def describe_session(log: Log) -> JsonObject:
             "duration_s": scenario.duration_s,
             "seed": scenario.seed,
             "sites": list(log.sites),
+            "arms": list_arm_notes(scenario),
         },
         **{key: session.get(key) for key in _PROVENANCE},
         "versions": {key[8:]: value for key, value in session.items() if key.startswith("version_")},
@@ -325,6 +327,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "delay_ms": delays_ms,
             "dominance": scenario.dominance,
             "assumed": list(scenario.assumed),
+            "arms": list_arm_notes(scenario),
         },
         "session": {**log.session, "complete": log.complete},
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),

@@ -37,7 +37,12 @@ def scenario_show_command(
     overrides: options.SetOption = None,
 ) -> None:
     """Prints the resolved text of a scenario: every value of every site and link."""
-    sys.stdout.write(options.load_chosen_scenario(name, overrides, duration, seed).text)
+    from ..scenario.describe import list_arm_notes
+
+    scenario = options.load_chosen_scenario(name, overrides, duration, seed)
+    sys.stdout.write(scenario.text)
+    for note in list_arm_notes(scenario):
+        terminal.print_note(note)
 
 
 @options.command("mine.toml")

@@ -5,10 +5,22 @@ messages that came in before a tick. What is in force in a tick is an input of t
 record, so a log repeats people without their messages.
 
 Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`; while
-a grip still fades, from that grip and its target. A target glides to its newest goal in a straight line, over
-a quarter more than the time between the last two messages, so that it does not stop where one is a little
-late. A hand that is silent for `SILENCE_NS` lets go: the target stays where it is and the grip fades within
-`GRIP_NS`.
+a grip still fades, from that grip, its target and the target's velocity. A target glides to its newest goal in
+a straight line, over a quarter more than the time between the last two messages, so that it does not stop
+where one is a little late. A hand that is silent for `SILENCE_NS` lets go: the target comes to rest and the
+grip fades within `GRIP_NS`.
+
+Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to tick the velocity
+of a target changes by at most its acceleration limit times the period, whatever messages come and however
+unevenly, and its speed never exceeds the largest one from which it can stop at its goal, Eq. (L1):
+
+    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)        (L1)
+
+with d the distance to the goal, a the acceleration limit and h the period. A target at that speed needs n more
+ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d exactly. A target that begins at rest
+therefore moves in a straight line and comes to rest at a still goal without overshoot. If the goal comes nearer
+while the target moves, it passes the goal by no more than the way in which it can stop, at most
+V^2 / (2 a) + V h / 2 at the speed limit V.
 """
 
 import math
@@ -16,7 +28,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from .jit import leaf
-from .vectors import Array
+from .vectors import Array, Vector
 
 SILENCE_NS = 200_000_000
 """A longer silence of who holds an arm lets it go."""
@@ -31,6 +43,42 @@ TAKEN, RELEASED, SILENT = "takes hold", "lets go", "is silent: let go"
 """What a tick changed in who holds an arm."""
 
 
+class Reach(NamedTuple):
+    """The goals that an arm can get to, or a bound of them: a shell around a centre, and a box.
+
+    Attributes:
+        centre: of the shell, m; (): there is no shell.
+        inner_m: its least radius.
+        outer_m: its largest radius.
+        low: least coordinates, rad or m; (): there is no box.
+        high: largest coordinates.
+    """
+
+    centre: Vector = ()
+    inner_m: float = 0.0
+    outer_m: float = math.inf
+    low: Vector = ()
+    high: Vector = ()
+
+    def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
+        """Returns the nearest goal within reach; a goal within reach is not changed."""
+        nearest = tuple(goal)
+        if self.low:
+            nearest = tuple(
+                min(max(x, low), high) for x, low, high in zip(goal, self.low, self.high, strict=True)
+            )
+        if not self.centre:
+            return nearest
+        way = [x - middle for x, middle in zip(nearest, self.centre, strict=True)]
+        radius = math.sqrt(sum(x * x for x in way))
+        if self.inner_m <= radius <= self.outer_m:
+            return nearest
+        if radius == 0.0:  # every direction is as near
+            way[0] = radius = 1.0
+        share = min(max(radius, self.inner_m), self.outer_m) / radius
+        return tuple(middle + share * x for x, middle in zip(way, self.centre, strict=True))
+
+
 class HandRules(NamedTuple):
     """What a live hand may do.
 
@@ -40,6 +88,8 @@ class HandRules(NamedTuple):
         speed_limit: largest speed of the target, m/s or rad/s.
         from_arm: true: the target begins where the arm is; false: it is a force, which begins at 0.
         farthest: largest norm of a goal that is taken, m, rad or N.
+        acceleration_limit: largest change of the target's velocity in a second, m/s^2 or rad/s^2; inf: none.
+        reach: where goals may lie.
     """
 
     size: int
@@ -47,6 +97,8 @@ class HandRules(NamedTuple):
     speed_limit: float = math.inf
     from_arm: bool = True
     farthest: float = math.inf
+    acceleration_limit: float = math.inf
+    reach: "Reach" = Reach()
 
 
 class HandCommand(NamedTuple):
@@ -181,10 +233,28 @@ def advance_hand(
         now = _let_go(now, now.number - 1)
     if not now.target:
         return HandStep(now, free_hand(rules.size), tuple(refused), tuple(changes))
-    if now.source:
-        now = now._replace(rate=_find_rate(rules, now, t_ns))
+    now = now._replace(rate=_find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now))
     vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
     return HandStep(now, vector, tuple(refused), tuple(changes))
+
+
+@leaf
+def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
+    """Returns the largest speed from which a target can stop at a distance, Eq. (L1).
+
+    Args:
+        distance: to the goal, m or rad.
+        acceleration: the largest change of speed in a second, m/s^2 or rad/s^2.
+        h_s: period of the ticks, s.
+    """
+    step = acceleration * h_s
+    ways = distance / (step * h_s)
+    ticks = math.floor(0.5 * (math.sqrt(1.0 + 8.0 * ways) - 1.0))
+    return step * (ways / (ticks + 1.0) + 0.5 * ticks)
+
+
+_plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
+"""Without compilation: a call from Python into compiled code takes longer than its few operations."""
 
 
 @leaf
@@ -194,6 +264,7 @@ def glide(
     grip: float,
     arrives_ns: int,
     speed_limit: float,
+    acceleration: float,
     goal: Array,
     target: Array,
     rate: Array,
@@ -208,18 +279,54 @@ def glide(
         t_ns = (first + n) * 1_000_000_000 // rate_hz
         grip = min(grip + firmer, 1.0)
         left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
-        square = 0.0
-        for i in range(size):
-            target[i] += rate[i] * h_s
-            rate[i] = (goal[i] - target[i]) / left_s
-            square += rate[i] * rate[i]
-        speed = math.sqrt(square)
-        share = speed_limit / speed if speed > speed_limit else 1.0
+        if acceleration < math.inf:
+            _glide_tick(left_s, h_s, speed_limit, acceleration, goal, target, rate)
+        else:
+            square = 0.0
+            for i in range(size):
+                target[i] += rate[i] * h_s
+                rate[i] = (goal[i] - target[i]) / left_s
+                square += rate[i] * rate[i]
+            speed = math.sqrt(square)
+            share = speed_limit / speed if speed > speed_limit else 1.0
+            for i in range(size):
+                rate[i] *= share
         rows[n, 0] = grip
         for i in range(size):
-            rate[i] *= share
             rows[n, 3 + i], rows[n, 3 + size + i] = target[i], rate[i]
     return grip
+
+
+@leaf
+def _glide_tick(
+    left_s: float,
+    h_s: float,
+    speed_limit: float,
+    acceleration: float,
+    goal: Array,
+    target: Array,
+    rate: Array,
+) -> None:
+    """Moves a target on by a tick and changes its rate within both limits, as `_find_limited_rate`."""
+    size = target.shape[0]
+    square = 0.0
+    for i in range(size):
+        target[i] += rate[i] * h_s
+        way = goal[i] - target[i]
+        square += way * way
+    distance = math.sqrt(square)
+    stopping = find_stopping_speed(distance, acceleration, h_s)
+    speed = min(speed_limit, min(distance / left_s, stopping))
+    per_way = speed / distance if distance > 0.0 else 0.0
+    square = 0.0
+    for i in range(size):
+        change = per_way * (goal[i] - target[i]) - rate[i]
+        square += change * change
+    size_of_change = math.sqrt(square)
+    most = acceleration * h_s
+    share = most / size_of_change if size_of_change > most else 1.0
+    for i in range(size):
+        rate[i] += share * (per_way * (goal[i] - target[i]) - rate[i])
 
 
 def _take_command(
@@ -241,32 +348,69 @@ def _take_command(
     if not memory.source:
         still = (0.0,) * rules.size
         start = memory.target or (tuple(map(float, place())) if rules.from_arm else still)
-        held = HandMemory(command.source, command.number, memory.grip, start, still)
+        held = HandMemory(command.source, command.number, memory.grip, start, memory.rate or still)
         held = held._replace(heard_ns=t_ns, before=memory.before)
-        return _aim(held, command, t_ns + GLIDE_NS), TAKEN
+        return _aim(rules, held, command, t_ns + GLIDE_NS), TAKEN
     memory = memory._replace(heard_ns=t_ns)
     if command.number == memory.number:
         return memory, ""
     period_ns = 1_000_000_000 // rules.rate_hz
     between_ns = min(max((command.sent_ns - memory.sent_ns) * 5 // 4, period_ns), GLIDE_NS)
-    return _aim(memory, command, t_ns + between_ns), ""
+    return _aim(rules, memory, command, t_ns + between_ns), ""
 
 
-def _aim(memory: HandMemory, command: HandCommand, arrives_ns: int) -> HandMemory:
+def _aim(rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int) -> HandMemory:
+    goal = rules.reach.find_nearest(command.target)
     return memory._replace(
-        number=command.number, goal=command.target, arrives_ns=arrives_ns, sent_ns=command.sent_ns
+        number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
     )
 
 
 def _let_go(memory: HandMemory, number: int) -> HandMemory:
     """Returns the memory of a grip that fades; messages of its source up to `number` are over."""
-    still = (0.0,) * len(memory.rate)
-    return HandMemory(grip=memory.grip, target=memory.target, rate=still, before=(memory.source, number))
+    before = (memory.source, number)
+    return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
+
+
+def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
+    """Returns the velocity of a target that comes to rest while its grip fades."""
+    speed = math.sqrt(sum(v * v for v in memory.rate))
+    slower = speed - rules.acceleration_limit / rules.rate_hz
+    if slower <= 0.0:
+        return (0.0,) * len(memory.rate)
+    return tuple(slower / speed * v for v in memory.rate)
+
+
+def _find_limited_rate(rules: HandRules, memory: HandMemory, left_s: float) -> tuple[float, ...]:
+    """Returns the velocity of a target whose acceleration is limited, see Eq. (L1).
+
+    Both limits are balls around a velocity within them, so that a velocity between the last one and the
+    wanted one keeps them too.
+    """
+    h_s = 1.0 / rules.rate_hz
+    way = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]
+    square = 0.0
+    for x in way:
+        square += x * x
+    distance = math.sqrt(square)
+    stopping = _plain_stopping_speed(distance, rules.acceleration_limit, h_s)
+    speed = min(rules.speed_limit, distance / left_s, stopping)
+    per_way = speed / distance if distance > 0.0 else 0.0
+    changes = [per_way * x - v for x, v in zip(way, memory.rate, strict=True)]
+    square = 0.0
+    for change in changes:
+        square += change * change
+    size = math.sqrt(square)
+    most = rules.acceleration_limit * h_s
+    share = most / size if size > most else 1.0
+    return tuple(v + share * change for v, change in zip(memory.rate, changes, strict=True))
 
 
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
-    """Returns the velocity at which a target goes to its goal, within its limit."""
+    """Returns the velocity at which a target goes to its goal, within its limits."""
     left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
+    if rules.acceleration_limit < math.inf:
+        return _find_limited_rate(rules, memory, left_s)
     rate = [(goal - x) / left_s for goal, x in zip(memory.goal, memory.target, strict=True)]
     speed = math.sqrt(sum(v * v for v in rate))
     share = rules.speed_limit / speed if speed > rules.speed_limit else 1.0

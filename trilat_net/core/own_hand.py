@@ -201,8 +201,18 @@ class OwnHand:
         held = self._memory
         if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.heard_ns <= SILENCE_NS:
             goal, target, rate = (np.array(one) for one in (held.goal, held.target, held.rate))
-            limit = self._rules.speed_limit
-            grip = glide(k + 1, rate_hz, held.grip, held.arrives_ns, limit, goal, target, rate, rows[1:])
+            grip = glide(
+                k + 1,
+                rate_hz,
+                held.grip,
+                held.arrives_ns,
+                self._rules.speed_limit,
+                self._rules.acceleration_limit,
+                goal,
+                target,
+                rate,
+                rows[1:],
+            )
             rows[1:, 1], rows[1:, 2] = held.number, held.source
             ends = tuple(target.tolist()), tuple(rate.tolist())
             self._memory = held._replace(grip=grip, target=ends[0], rate=ends[1])

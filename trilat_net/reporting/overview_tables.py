@@ -68,6 +68,7 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
         ("session", f"{session['session']}, {session['driver']}{began}"),
         ("scenario", scenario["name"] + title),
         ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
+        *(("", f"note: {note}") for note in scenario.get("arms", ())),
         ("duration", f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"),
         ("records", f"{records}, {missing or 'none'} missing; {finished}{places}"),
     )

@@ -27,6 +27,7 @@ from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
+from ..scenario.describe import list_arm_notes
 from .appearance import DARK_SITE_COLOURS, SITE_COLOURS, list_site_colours
 from .certificate_text import describe_certificate, list_energies
 from .charts import Charts
@@ -375,7 +376,8 @@ def _render_certificate(certificate: Certificate) -> str:
 
 
 def _render_assumptions(scenario: Scenario) -> str:
-    items = "".join(f"<li>{escape(text)}</li>" for text in scenario.assumed)
+    texts = [*scenario.assumed, *list_arm_notes(scenario)]
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
     return f"<ul>{items}</ul>" if items else "<p>Nothing is declared as assumed.</p>"
 
 

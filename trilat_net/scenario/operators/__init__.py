@@ -128,6 +128,8 @@ WORDS = {
     "torque_limit_nm": "a torque above 0 N m",
     "speed_limit_m_s": "a speed above 0 m/s",
     "speed_limit_rad_s": "a speed above 0 rad/s",
+    "acceleration_limit_m_s2": "an acceleration above 0 m/s^2",
+    "acceleration_limit_rad_s2": "an acceleration above 0 rad/s^2",
 }
 """The values that a key takes, for an author who gave it another or none."""
 IN_WORDS = {

@@ -16,8 +16,9 @@ from msgspec import Meta
 from ... import fields
 from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
-from ...core.live_hand import HandRules
+from ...core.live_hand import HandRules, Reach
 from ...errors import ScenarioError
+from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
@@ -253,6 +254,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         damping_nm_s_rad: of "joint", per joint, N m s/rad.
         torque_limit_nm: of "joint", the largest norm of its torques, N m.
         speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
+        acceleration_limit_m_s2: of "tip", the largest acceleration of the target, m/s^2.
+        acceleration_limit_rad_s2: of "joint", the largest acceleration of the target, rad/s^2.
         device: of "tip", how a device leads it (`trilat hand --device`, a controller in virtual reality).
     """
 
@@ -272,6 +275,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     damping_nm_s_rad: fields.NotNegativeJoints = (3.0,)
     torque_limit_nm: fields.Positive = 20.0
     speed_limit_rad_s: fields.Positive = 4.0
+    acceleration_limit_m_s2: fields.Positive = 20.0
+    acceleration_limit_rad_s2: fields.Positive = 50.0
     device: DeviceSettings = DeviceSettings()
 
     @classmethod
@@ -295,14 +300,25 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 words = f"one of {', '.join(DIRECTIONS)} for each of {axes} axes, and no two of one line"
                 raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
-    def rules(self, rate_hz: int, counts: fields.VectorCounts) -> HandRules:
-        """Returns what somebody who holds an arm of such vectors may do."""
-        if self.mode == "joint":
-            return HandRules(counts.joints, rate_hz, self.speed_limit_rad_s, farthest=FARTHEST)
+    def rules(self, rate_hz: int, arm: ArmModel) -> HandRules:
+        """Returns what somebody who holds an arm may do."""
         if self.mode == "force":
             strongest = STRONGEST * self.force_limit_n
-            return HandRules(counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest)
-        return HandRules(counts.axes, rate_hz, self.speed_limit_m_s, farthest=FARTHEST)
+            return HandRules(arm.counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest)
+        if self.mode == "joint":
+            limits, size = self.speed_limit_rad_s, arm.counts.joints
+            acceleration, reach = self.acceleration_limit_rad_s2, arm.joint_reach
+        else:
+            limits, size = self.speed_limit_m_s, arm.counts.axes
+            acceleration, reach = self.acceleration_limit_m_s2, arm.reach
+        return HandRules(
+            size,
+            rate_hz,
+            limits,
+            farthest=FARTHEST,
+            acceleration_limit=acceleration if acceleration < fields.MAX_QUANTITY else math.inf,
+            reach=reach if self.is_open else Reach(),
+        )
 
     def _source(self) -> TorqueSource:
         stiffness, damping, limit = self.stiffness_n_m, self.damping_n_s_m, self.force_limit_n
@@ -313,8 +329,21 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 LIVE_KEYS = {
-    "tip": ("stiffness_n_m", "damping_n_s_m", "force_limit_n", "speed_limit_m_s", "device"),
-    "joint": ("stiffness_nm_rad", "damping_nm_s_rad", "torque_limit_nm", "speed_limit_rad_s"),
+    "tip": (
+        "stiffness_n_m",
+        "damping_n_s_m",
+        "force_limit_n",
+        "speed_limit_m_s",
+        "acceleration_limit_m_s2",
+        "device",
+    ),
+    "joint": (
+        "stiffness_nm_rad",
+        "damping_nm_s_rad",
+        "torque_limit_nm",
+        "speed_limit_rad_s",
+        "acceleration_limit_rad_s2",
+    ),
     "force": ("force_limit_n",),
 }
 """The keys of a live hand by its mode."""

@@ -39,6 +39,8 @@ class ProgramHand(
         rate_hz: how often it is asked, Hz; the tick rate of the site is a multiple of it.
         delay_ms: time from what it sees to what it does: it may think for so long.
         process: true: live it runs in a process of its own (`trilat hand`), else in that of the site.
+        acceleration_limit_m_s2: as of a live hand; left out, there is none.
+        acceleration_limit_rad_s2: likewise.
         source_sha256: hash of the file of its class.
         settings: the arguments of its class, by name.
     """
@@ -60,6 +62,8 @@ class ProgramHand(
     rate_hz: Annotated[int, Meta(ge=10, le=1000)] = 50
     delay_ms: Annotated[float, Meta(ge=0.0, le=1000.0)] = 20.0
     process: bool = False
+    acceleration_limit_m_s2: fields.Positive = fields.MAX_QUANTITY
+    acceleration_limit_rad_s2: fields.Positive = fields.MAX_QUANTITY
     settings: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -104,7 +108,7 @@ class HandSite(NamedTuple):
     def describe(self) -> HandContext:
         """Returns what its program knows before it begins."""
         scenario, name, spec = self.scenario, self.name, self.spec
-        rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name].counts)
+        rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name])
         limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
         own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, scenario.draw_seed(name))
         return HandContext(name, scenario.peers(name), spec.mode, rules.size, *own)
@@ -114,7 +118,7 @@ class HandSite(NamedTuple):
         tick_rate_hz, arm = self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
         place: Any = list if self.spec.mode == "joint" else arm.end_effector
         delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
-        return OwnHand(self.spec.rules(tick_rate_hz, arm.counts), tick_rate_hz // self.rate_hz, delay, place)
+        return OwnHand(self.spec.rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place)
 
 
 class HandPlayer:
