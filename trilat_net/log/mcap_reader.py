@@ -249,6 +249,13 @@ class McapReader:
         """Returns whether the file, once it was read, agrees with its digest chain."""
         return self._chain.judge(self.metadata, finished=self.complete, damaged=bool(self.damaged))
 
+    @property
+    def agrees_on_messages(self) -> bool:
+        """True if the messages that were read are all that the digest chain states, in its order."""
+        stated = self.metadata.get(DIGESTS, {})
+        found = self._chain.facts()
+        return all(stated.get(key) == found[key] for key in ("messages", "records"))
+
     def _define(self, opcode: int, content: bytes) -> None:
         self._chain.add_entry(opcode, content)
         record = mcap_records.parse_record(opcode, content)

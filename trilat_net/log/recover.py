@@ -1,41 +1,56 @@
 """Recovery: makes a finished MCAP file of one that is cut off or damaged.
 
-Invariant: what can be read is copied byte for byte: messages with their times and numbers, metadata,
-attachments. What cannot be read is left out and reported, never invented. The source file is not
-modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebuilt. Of two definitions of
-a number, the one covered by a valid checksum wins, else the first.
+Invariant:
+- What can be read is copied byte for byte: messages with their times and numbers, metadata, attachments.
+- What cannot be read is left out and reported. Nothing is invented: of a trilat-net log a message is
+  copied only if a valid checksum covers it or if its content proves it (`content_check`), and only from a
+  chunk that stands where it was written (`recovery_survey`).
+- The source file is not modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebuilt.
 """
 
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator
+import hashlib
+import json
+from collections import Counter, deque
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import lz4.frame
-import zstandard
 from mcap.opcode import Opcode
 
 from ..errors import LogError, NothingSaved, UsageError
 from ..files import describe_write_error, open_regular
 from ..net import topics
+from ..net.messages import VERSION, json_schema
 from ..results import Result
+from ..scenario import parse_embedded
 from . import mcap_records
-from .accounting import Coverage, open_session_accounts, parse_counts
+from .accounting import Coverage, SessionAccounts, open_session_accounts, parse_counts
+from .content_check import ContentCheck
 from .log_file import LogFile
-from .log_layout import ACCOUNTS, ACTIVE_SUFFIX, PART, SESSION, collect_provenance, describe_unfinished
+from .log_layout import (
+    ACCOUNTS,
+    ACTIVE_SUFFIX,
+    CHANNEL_TYPES,
+    PART,
+    SCENARIO,
+    SESSION,
+    collect_provenance,
+    describe_unfinished,
+)
 from .mcap_reader import McapReader, Progress
 from .mcap_records import UnreadableRecord
 from .mcap_writer import McapWriter
+from .recovery_survey import RecoverySurvey
 from .running_digest import DIGESTS, RECOVERED, DigestState
+from .torn_chunk import TornChunk
 
 MAX_LISTED_LOSSES = 20
 """Losses that are listed there one by one."""
-MAX_SALVAGE_BYTES = 64 << 20
-"""No more of a cut chunk is read."""
-_PIECE_BYTES = 1 << 16
+DAMAGED_SUFFIX = ".damaged"
+"""What is added to the name of an attachment whose checksum does not agree."""
+_MAX_SCENARIO_BYTES = 64 << 20
 _MAX_NUMBERS = 65_535
 """Channels, and schemas, that a file can have."""
 _MADE_AGAIN = frozenset(
@@ -171,14 +186,15 @@ def recover(
 
 def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None) -> Recovery:
     reader = McapReader(stream, str(result.path), progress, kept=False)
-    survey = _Survey(reader.scanner)
+    survey = RecoverySurvey(reader.scanner)
     if survey.why_empty:
         raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
+    restored = _restore_scenario(survey, result.path)
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
     file = LogFile(result.output, force=force, working=working)
     try:
-        _FileCopy(reader, file, survey, result).run()
+        _FileCopy(reader, file, survey, result).run(restored)
         file.close()
     except BaseException:
         file.discard()
@@ -188,87 +204,55 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
     return result
 
 
-class _Survey:
-    """Contents of a file besides messages, wherever they are.
-
-    Attributes:
-        profile, library: the MCAP profile, and what made the file.
-        definitions: schemas and channels outside of chunks, opcode and content.
-        metadata: the last of each name.
-        attachments: the first of each name.
-        count: how many messages the file states; None if no checksum covers that.
-        why_empty: the reason if there is nothing to save; else "".
-    """
-
-    def __init__(self, scanner: mcap_records.RecordScanner) -> None:
-        self.profile = self.library = ""
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, bytes] = {}
-        self.count: int | None = None
-        footer = scanner.footer()
-        is_covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
-        summary_offset = (footer.summary_start if footer is not None and is_covered else 0) or scanner.size
-        found: dict[tuple[bool, int], list[tuple[int, bytes]]] = defaultdict(list)  # in the summary or not
-        content = False
-        for frame in scanner.frames():
-            content |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
-            if frame.opcode in mcap_records.DEFINITIONS:
-                entry = frame.opcode, scanner.content(frame)
-                found[frame.offset >= summary_offset, frame.opcode].append(entry)
-            elif frame.opcode in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.STATISTICS):
-                with suppress(UnreadableRecord):
-                    self._take(frame.opcode, mcap_records.parse_record(frame.opcode, scanner.content(frame)))
-        if summary_offset == scanner.size:
-            self.count = None
-        self.definitions = [
-            entry for kind in mcap_records.DEFINITIONS for entry in found[True, kind] or found[False, kind]
-        ]
-        content |= scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == bytes([Opcode.CHUNK])
-        self.why_empty = ""
-        if not (content or self.metadata or self.attachments):
-            self.why_empty = "it holds no messages"
-            if not scanner.begins:
-                self.why_empty = "it does not begin as an MCAP file does" if scanner.size else "it is empty"
-
-    def _take(self, opcode: int, record: Any) -> None:
-        match opcode:
-            case Opcode.HEADER:
-                self.profile, self.library = record.profile, record.library
-            case Opcode.METADATA:
-                self.metadata[record.name] = record.metadata
-            case Opcode.STATISTICS:
-                self.count = record.message_count
-            case _:
-                self.attachments.setdefault(record.name, record.data)
+def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
+    """Returns the scenario of a log that lost it, if the file that was run is beside it; else b""."""
+    digest = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
+    kept = survey.attachments.get(SCENARIO)
+    if not digest or kept is not None:
+        return b""
+    with suppress(OSError, LogError), open_regular(path.with_name(SCENARIO)) as stream:
+        text = stream.read(_MAX_SCENARIO_BYTES)
+        if hashlib.sha256(text).hexdigest() == digest:
+            survey.attachments[SCENARIO] = text
+            return text
+    return b""
 
 
 class _FileCopy:
     """Copy of one file into another; of a number's definitions the first one holds."""
 
-    def __init__(self, reader: McapReader, file: LogFile, survey: _Survey, result: Recovery) -> None:
+    def __init__(self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery) -> None:
         reader.watch = self._copy
         self._reader, self._scanner, self._survey, self._result = reader, reader.scanner, survey, result
         by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
         self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
+        self._content = _make_content_check(survey, self._accounts)
         self._data_end = reader.size + 1
         self._reported = 0  # damaged parts that are among the losses
         self._defined: dict[tuple[int, int], Any] = {}  # schemas and channels, by opcode and number
         self._contradicted: set[int] = set()  # numbers that have two definitions
         self._new_schemas: dict[int, int] = {}
+        self._released_schemas: dict[str, int] = {}  # written anew, by the kind of their messages
         self._new_channels: dict[int, tuple[int, str]] = {}  # number in the new file, and topic
+        self._new_topics: dict[str, tuple[int, str]] = {}  # the same by topic, of the session's own channels
         self._bare: list[str] = []  # topics of channels whose schema no record names
+        self._misnamed: list[str] = []  # topics of channels whose messages prove another or no definition
         self._unnamed: Counter[int] = Counter()  # messages of channels that no record names
+        self._identified: set[int] = set()  # channels whose first message was looked at
         for opcode, content in survey.definitions:
             try:
                 self._define(opcode, content)
             except UnreadableRecord as error:
                 result.lose(f"a definition: {error}", len(content))
         for kind, number in sorted(self._defined):
-            if kind == Opcode.CHANNEL:  # with or without messages
-                self._open_channel(number)
+            if kind == Opcode.CHANNEL and self._is_plausible(self._defined[kind, number].topic):
+                self._open_channel(number)  # with or without messages
 
-    def run(self) -> None:
+    def run(self, restored: bytes) -> None:
+        """Copies everything; a scenario that was `restored` from elsewhere comes first."""
+        if restored:
+            self._out.add_attachment(0, 0, SCENARIO, "application/toml", restored)
         deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
         self._report_damaged()
         if self._scanner.torn is not None:
@@ -298,23 +282,36 @@ class _FileCopy:
         if opcode in _MADE_AGAIN:
             self._pass_over(frame, content)
         elif opcode == Opcode.CHUNK:
-            data = data or mcap_records.unpack_chunk(content)
-            for inner, begin, end in mcap_records.iterate_records(data):
-                self._take_inner(inner, data[begin:end])
+            self._take_chunk(frame, data or mcap_records.unpack_chunk(content))
         elif opcode == mcap_records.OP_MESSAGE:
-            self._take_inner(opcode, content)
+            self._take_single(content)
         elif opcode == Opcode.METADATA:
-            entry = mcap_records.parse_record(opcode, content)
-            ours = self._accounts is not None
-            if entry.name != RECOVERED and not (ours and entry.name in (ACCOUNTS, DIGESTS)):
-                self._out.add_metadata(entry.name, entry.metadata)
+            self._take_metadata(content)
         elif opcode == Opcode.ATTACHMENT:
-            one = mcap_records.parse_record(opcode, content)
-            if not mcap_records.has_right_crc(content):
-                self._result.lose(f"attachment {one.name}: its CRC differs; it is kept as it is")
-            self._out.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
+            self._take_attachment(content)
         else:
             raise UnreadableRecord(f"a record of kind {opcode} is unknown here")
+
+    def _take_metadata(self, content: bytes) -> None:
+        entry = mcap_records.parse_record(Opcode.METADATA, content)
+        is_made_again = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
+        if entry.name == RECOVERED or is_made_again:
+            return
+        if entry.name == SESSION and entry.metadata != self._survey.metadata[SESSION]:
+            raise UnreadableRecord("metadata of another session")
+        self._out.add_metadata(entry.name, entry.metadata)
+
+    def _take_attachment(self, content: bytes) -> None:
+        """Copies an attachment; one that is damaged must not get a valid checksum under its own name."""
+        entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
+        name = entry.name
+        is_right = mcap_records.has_right_crc(content)
+        if name == SCENARIO:
+            is_right = is_right and entry.data == self._survey.attachments.get(SCENARIO)
+        if not is_right:
+            name = f"{name}{DAMAGED_SUFFIX}"
+            self._result.lose(f"attachment {entry.name}: its CRC differs; it is kept as {name}")
+        self._out.add_attachment(entry.create_time, entry.log_time, name, entry.media_type, entry.data)
 
     def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Leaves out what is made again; raises if it is something else whose kind was damaged."""
@@ -327,31 +324,109 @@ class _FileCopy:
         elif frame.offset < self._data_end:
             raise UnreadableRecord(f"a record of kind {frame.opcode} stands among the data")
 
+    def _take_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
+        """Copies a chunk that was unpacked, and agrees with its checksum if it has one."""
+        if problem := self._survey.misplaced.get(frame.offset):
+            raise UnreadableRecord(problem)
+        head = self._scanner.head(frame)
+        inner = [(opcode, data[begin:end]) for opcode, begin, end in mcap_records.iterate_records(data)]
+        if self._content is not None and not head.crc:
+            self._take_unproven(inner, (head.start_ns, head.end_ns))
+            return
+        for opcode, content in inner:
+            self._take_inner(opcode, content)
+
+    def _take_single(self, content: bytes) -> None:
+        """Copies a message outside of chunks, which has no checksum."""
+        if self._content is not None:
+            self._take_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
+        elif self._survey.is_chunked:
+            raise UnreadableRecord("a message stands outside of the chunks")
+        else:
+            self._take_inner(mcap_records.OP_MESSAGE, content)
+
     def _take_inner(self, opcode: int, content: bytes) -> None:
         if opcode in mcap_records.DEFINITIONS:
             self._define(opcode, content)
         elif opcode == mcap_records.OP_MESSAGE:
-            if len(content) < mcap_records.MESSAGE_HEAD.size:
-                raise UnreadableRecord("a message is too short")
-            number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
-            new = self._new_channels.get(number) or self._open_channel(number)
+            number, sequence, log_ns, publish_ns = _split_head(content)
+            payload = content[mcap_records.MESSAGE_HEAD.size :]
+            new = self._find_channel(number, payload)
             if new is None:
                 self._unnamed[number] += 1
                 return
-            payload = content[mcap_records.MESSAGE_HEAD.size :]
             self._out.add_message(new[0], log_ns, payload, publish_ns, sequence)
+            if self._content is not None:
+                self._content.follow(new[1], sequence, log_ns, payload)
             if self._accounts is not None:
                 self._accounts.take(new[1], sequence, payload)
+
+    def _take_unproven(self, inner: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]) -> None:
+        """Copies the messages of which no checksum proves anything, if all of them prove themselves.
+
+        Args:
+            inner: records of a chunk.
+            span_ns: first and last log time of the chunk, Unix ns.
+
+        Raises:
+            UnreadableRecord: a record fails; nothing was copied.
+        """
+        inner = list(inner)
+        for opcode, content in inner:
+            self._check_unproven(opcode, content, span_ns)
+        for opcode, content in inner:
+            self._take_inner(opcode, content)
+
+    def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
+        if opcode in mcap_records.DEFINITIONS:
+            entry = mcap_records.parse_record(opcode, content)
+            if opcode == Opcode.CHANNEL and not self._is_plausible(entry.topic):
+                raise UnreadableRecord("a channel is none of this session")
+            self._define(opcode, content)
+            return
+        if opcode != mcap_records.OP_MESSAGE:
+            raise UnreadableRecord(f"a chunk holds a record of kind {opcode}")
+        number, sequence, log_ns, publish_ns = _split_head(content)
+        payload = content[mcap_records.MESSAGE_HEAD.size :]
+        channel = self._find_channel(number, payload)
+        if channel is None:
+            raise UnreadableRecord(f"a message is of channel {number}, which no record names")
+        if self._content is not None:
+            self._content.check(channel[1], sequence, log_ns, publish_ns, payload, span_ns)
+        elif not span_ns[0] <= log_ns <= span_ns[1]:
+            raise UnreadableRecord("a message was logged outside of its chunk")
 
     def _define(self, opcode: int, content: bytes) -> None:
         entry = mcap_records.parse_record(opcode, content)
         if self._defined.setdefault((opcode, entry.id), entry) != entry:
             self._contradicted.add(entry.id)
 
+    def _is_plausible(self, topic: str) -> bool:
+        """True for a topic that the file can have: of a session's log none of another session's members."""
+        is_own = topic.startswith(f"/{topics.ROOT}/")
+        return self._content is None or not is_own or self._content.owns(topic)
+
+    def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
+        """Returns the number of a channel in the new file, and its topic; None if nothing tells what it is.
+
+        The first message of a channel of the session decides: it names its member and its kind, where the
+        definition of a channel has no checksum in a file that was not finished.
+        """
+        known = self._new_channels.get(number)
+        if known is not None and (self._content is None or number in self._identified):
+            return known
+        self._identified.add(number)
+        topic = self._content.identify(payload) if self._content is not None else ""
+        if not topic or (known is not None and known[1] == topic):
+            return known or self._open_channel(number)
+        self._misnamed.append(topic)
+        self._new_channels[number] = self._new_topics.get(topic) or self._open_again(topic)
+        return self._new_channels[number]
+
     def _open_channel(self, number: int) -> tuple[int, str] | None:
         """Returns the number of a channel in the new file, and its topic; None if no record names it."""
         known = self._defined.get((Opcode.CHANNEL, number))
-        if known is None or len(self._new_channels) >= _MAX_NUMBERS:
+        if known is None or len(self._new_channels) >= _MAX_NUMBERS or not self._is_plausible(known.topic):
             return None
         schema = self._defined.get((Opcode.SCHEMA, known.schema_id))
         if schema is not None and schema.id not in self._new_schemas:
@@ -361,10 +436,28 @@ class _FileCopy:
             self._bare.append(known.topic)
         new_schema = self._new_schemas.get(known.schema_id, 0)
         channel = self._out.register_channel(known.topic, known.message_encoding, new_schema, known.metadata)
-        self._new_channels[number] = channel, known.topic
+        return self._keep_channel(number, channel, known.topic)
+
+    def _open_again(self, topic: str) -> tuple[int, str]:
+        """Returns a channel of the session that is defined anew, as the log's writer defines it."""
+        assert self._content is not None
+        kind = CHANNEL_TYPES[topic.rpartition("/")[2]]
+        name = f"trilat.{kind.__name__}.v{VERSION}"
+        if name not in self._released_schemas:
+            data = json.dumps(json_schema(kind)).encode()
+            self._released_schemas[name] = self._out.register_schema(name, "jsonschema", data)
+        about = self._content.describe_channel(topic)
+        channel = self._out.register_channel(topic, "msgpack", self._released_schemas[name], about)
+        return self._keep_channel(None, channel, topic)
+
+    def _keep_channel(self, number: int | None, channel: int, topic: str) -> tuple[int, str]:
+        if number is not None:
+            self._new_channels[number] = channel, topic
+        if self._content is not None and self._content.owns(topic):
+            self._new_topics.setdefault(topic, (channel, topic))
         if self._accounts is not None:
-            self._accounts.open(known.topic)
-        return channel, known.topic
+            self._accounts.open(topic)
+        return channel, topic
 
     def _take_torn(self, torn: mcap_records.Damage) -> None:
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
@@ -374,16 +467,26 @@ class _FileCopy:
             self._result.lose(str(torn), torn.length)
             return
         before = self._out.messages
-        content = self._scanner.read(torn.offset + mcap_records.RECORD_HEAD_BYTES, MAX_SALVAGE_BYTES)
-        with suppress(UnreadableRecord):  # what follows makes no sense, and is lost with the rest
-            for entry in _salvage_records(content):
-                self._take_inner(*entry)
+        problem = self._salvage(torn.offset)
         self._result.salvaged = self._out.messages - before
+        why = f" before {problem}" if problem else ""
         self._result.lose(
             f"the end of a chunk that was cut off at byte {torn.offset}; of its {torn.length} bytes "
-            f"{self._result.salvaged} messages could be saved",
+            f"{self._result.salvaged} messages could be saved{why}",
             torn.length,
         )
+
+    def _salvage(self, offset: int) -> str:
+        """Copies the records of a chunk that was cut off, block by block; returns what ended that, or ""."""
+        if self._content is None and self._survey.names_members:
+            return "its scenario, without which no message can be checked"
+        try:
+            torn = TornChunk.read(self._scanner, offset)
+            for records in torn.iterate_blocks():
+                self._take_unproven(records, (torn.head.start_ns, torn.head.end_ns))
+        except UnreadableRecord as error:
+            return str(error)
+        return ""
 
     def _report_unnamed(self) -> None:
         result, stated = self._result, self._survey.count
@@ -391,8 +494,16 @@ class _FileCopy:
             result.lose(f"{count} messages of channel {number}, which no record names")
         for topic in self._bare:
             result.lose(f"the schema of {topic}")
+        for topic in self._misnamed:
+            result.lose(f"the definition of {topic}; its messages name it, and it was made again")
         for number in self._contradicted:
             result.lose(f"what channel or schema {number} is: the file says it in two ways")
+        if self._content is None and self._survey.names_members:
+            lacks = "the session's metadata" if SESSION not in self._survey.metadata else "the scenario"
+            result.lose(
+                f"{lacks}; other MCAP programs open the new file, commands of trilat-net do not. If the file "
+                f"that was run stands beside the log as {SCENARIO}, recover puts it in"
+            )
         if stated is not None and self._out.messages < stated and result.lossless:
             result.lose(f"{stated - self._out.messages} of the {stated} messages that it says it has")
 
@@ -401,7 +512,7 @@ class _FileCopy:
         result.finished = self._scanner.finished
         result.messages, result.duration_s = self._out.messages, self._out.duration_s
         if SESSION in self._survey.metadata:
-            result.chain = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
+            result.chain = self._judge_source()
         if accounts is not None:
             result.missing = list(accounts.missing())
             result.coverage = accounts.coverage()
@@ -420,36 +531,31 @@ class _FileCopy:
             self._out.close_digest()
         self._out.finish()
 
+    def _judge_source(self) -> DigestState:
+        """Returns the agreement of the source with its digest chain.
 
-def _salvage_records(content: bytes) -> Iterator[tuple[int, bytes]]:
-    limit = max(mcap_records.MAX_UNPACKED_BYTES, mcap_records.MAX_UNPACKED_RATIO * len(content))
-    waiting = bytearray()
-    for piece in _unpack_pieces(content):
-        waiting += piece
-        limit -= len(piece)
-        done = 0
-        with suppress(UnreadableRecord):  # the rest of the last record comes with the next pieces
-            for opcode, begin, end in mcap_records.iterate_records(waiting):
-                if not opcode:
-                    return
-                yield opcode, bytes(waiting[begin:end])
-                done = end
-        del waiting[:done]
-        if limit <= 0:
-            return
+        A definition that is damaged among the data, and stands in the index with a checksum, changes no message.
+        """
+        state = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
+        is_repaired = self._survey.is_redefined and self._reader.agrees_on_messages
+        return DigestState.OPEN if state is DigestState.CHANGED and is_repaired else state
 
 
-def _unpack_pieces(content: bytes) -> Iterator[bytes]:
-    name_offset = mcap_records.COMPRESSION_NAME_OFFSET + 4
-    letters = int.from_bytes(content[mcap_records.COMPRESSION_NAME_OFFSET : name_offset], "little")
-    data = BytesIO(content[name_offset + letters + 8 :])
-    openers: dict[bytes, Callable[[BytesIO], Any]] = {
-        b"": lambda data: data,
-        b"zstd": zstandard.ZstdDecompressor(max_window_size=mcap_records.MAX_WINDOW_BYTES).stream_reader,
-        b"lz4": lz4.frame.open,
-    }
-    opener = openers.get(content[name_offset : name_offset + letters])
-    with suppress(zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError):
-        stream = opener(data) if opener is not None else BytesIO()
-        while piece := stream.read1(_PIECE_BYTES):
-            yield piece
+_LAST_NS = (1 << 64) - 1
+
+
+def _split_head(content: bytes) -> tuple[int, int, int, int]:
+    """Returns channel, sequence, log time and publish time of a message."""
+    if len(content) < mcap_records.MESSAGE_HEAD.size:
+        raise UnreadableRecord("a message is too short")
+    number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
+    return number, sequence, log_ns, publish_ns
+
+
+def _make_content_check(survey: RecoverySurvey, accounts: SessionAccounts | None) -> ContentCheck | None:
+    """Returns the check of a log's messages; None of a file of another program, and without a scenario."""
+    if accounts is None:
+        return None
+    scenario = parse_embedded(survey.attachments[SCENARIO].decode(), SCENARIO)
+    is_continued = survey.metadata.get(PART, {}).get("index", "1") != "1"
+    return ContentCheck(scenario, survey.metadata[SESSION], is_continued=is_continued)

@@ -20,7 +20,6 @@ from ..core.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import messages, topics
-from ..net.topics import number_message
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
@@ -30,10 +29,10 @@ from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SE
 from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
+from .message_identity import AnyMessage, identify_message
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 
-AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
 MAX_AHEAD_NS = 10 * NS_PER_S
 """No message is sent more than this after it came, whatever the clocks."""
 MAX_BOOTS = 64
@@ -175,43 +174,25 @@ class ChannelCheck:
         except WireError as error:
             self._add("schema", offset, str(error))
             return
-        sender, number, sequence, sent_ns = self._identify(message)
+        identity = identify_message(message, self.rate_hz)
+        number, sequence = identity.number, identity.sequence
+        if self.kind == topics.STATS:  # these state no number: the file counts them
+            number = sequence = self._in_file[message.boot].expected
         if message.v != self._version:
             text = f"a message of version {message.v} in a log of version {self._version}"
             self._add("schema", offset, text)
-        if sender != self.member:
-            self._add("schema", offset, f"a message says that it is of {sender[:40]!r}")
+        if identity.sender != self.member:
+            self._add("schema", offset, f"a message says that it is of {identity.sender[:40]!r}")
         if number >= 0:  # events have numbers from version 3 on
             if stored.sequence != sequence & 0xFFFFFFFF:
                 self._add("sequence", offset, f"number {sequence} is stored as {stored.sequence}")
             self._count(message, number, stored.publish_time_ns, offset)
         elif isinstance(message, messages.Event):
             self._accounts.hear(message)
-        self._check_times(stored, number, sent_ns, offset)
+        self._check_times(stored, number, identity.sent_ns, offset)
 
     def _add(self, check: str, offset: int | None, text: str) -> None:
         self._findings[check].add(self._file, offset, f"{self.name}: {text}")
-
-    def _identify(self, message: AnyMessage) -> tuple[str, int, int, int | None]:
-        """Returns what a message says that it is.
-
-        That is its sender, its number in its channel (-1 for none), the number that the file should state,
-        and when it was sent, ns since the epoch; None if it does not state that.
-        """
-        match message:
-            case messages.State():
-                sent_ns = message.sent_ns if message.v >= messages.SENT_TIME_SINCE else message.t_ns
-                return message.site, message.tick, message.tick, sent_ns
-            case messages.LinkStats():
-                number = number_message(self.kind, message.tick, self.rate_hz)
-                return message.site, number, message.tick, message.t_ns
-            case messages.Event():
-                # a recorder's own events are stamped as it hears them; before the epoch there is no time
-                stamped = message.t_ns >= 0 and message.member != topics.RECORDER
-                event_ns = message.t_ns if stamped else None
-                return message.member, message.n, max(0, message.n), event_ns
-        number = self._in_file[message.boot].expected
-        return topics.RECORDER, number, number, None
 
     def _count(self, message: AnyMessage, number: int, publish_ns: int, offset: int) -> None:
         if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:

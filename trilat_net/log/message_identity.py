@@ -1,0 +1,55 @@
+"""What a message of a log says that it is: its sender, its number, and when it was sent.
+
+Invariant: the answer depends on the content of the message alone, never on where it is stored, so that a
+place in a file can be compared with it.
+"""
+
+from typing import NamedTuple
+
+from ..net import messages, topics
+from ..net.topics import number_message
+
+AnyMessage = messages.State | messages.LinkStats | messages.Event | messages.RecorderStats
+"""A message of one of the numbered channels, or of the recorder's statistics."""
+
+
+class MessageIdentity(NamedTuple):
+    """The identity of one message.
+
+    Attributes:
+        sender: the member that published it.
+        channel: the kind of its channel: "state", "link", "event" or "stats".
+        number: its number in its channel; -1 if the message states none.
+        sequence: the number under which a file stores it; -1 if the message states none.
+        sent_ns: when it was sent, ns since the epoch; None if the message does not state that.
+    """
+
+    sender: str
+    channel: str
+    number: int
+    sequence: int
+    sent_ns: int | None
+
+
+def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
+    """Returns the identity of a message.
+
+    Args:
+        message: the message.
+        rate_hz: tick rate of its sender, which numbers its statistics; any number for other messages.
+    """
+    match message:
+        case messages.State():
+            sent_ns = message.sent_ns if message.v >= messages.SENT_TIME_SINCE else message.t_ns
+            return MessageIdentity(message.site, topics.STATE, message.tick, message.tick, sent_ns)
+        case messages.LinkStats():
+            number = number_message(topics.LINK, message.tick, rate_hz)
+            return MessageIdentity(message.site, topics.LINK, number, message.tick, message.t_ns)
+        case messages.Event():
+            # The recorder stamps its own events when it hears them; before the epoch there is no time.
+            is_stamped = message.t_ns >= 0 and message.member != topics.RECORDER
+            event_ns = message.t_ns if is_stamped else None
+            sequence = max(0, message.n)
+            return MessageIdentity(message.member, topics.EVENT, message.n, sequence, event_ns)
+        case messages.RecorderStats():
+            return MessageIdentity(topics.RECORDER, topics.STATS, -1, -1, None)

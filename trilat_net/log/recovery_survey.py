@@ -1,0 +1,185 @@
+"""First look at a damaged file: what describes it, and which of its chunks stand where they were written.
+
+Invariant:
+- Of two definitions of a number, the one covered by a valid checksum wins, else the first.
+- Of several sessions and scenarios in a file those count that name each other.
+- A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a finished file
+  the index tells, which has a checksum of its own; in a log that was not finished the times of the chunks do,
+  which never go back.
+"""
+
+import hashlib
+from bisect import bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from mcap.opcode import Opcode
+
+from . import mcap_records
+from .log_layout import SCENARIO, SESSION
+from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
+
+Definition = tuple[int, bytes]
+"""A schema or a channel: opcode and content."""
+_TOPIC_ROOT = b"/trilat/"
+
+
+class RecoverySurvey:
+    """Contents of a file besides messages, wherever they are.
+
+    Args:
+        scanner: finds its records.
+
+    Attributes:
+        profile, library: the MCAP profile, and what made the file.
+        definitions: schemas and channels outside of chunks.
+        metadata: the last of each name; of sessions the one that names the scenario.
+        attachments: the first of each name; of scenarios the one that the session names.
+        count: how many messages the file states; None if no checksum covers that.
+        is_redefined: True if a definition among the data is not what the index says, which has a checksum.
+        misplaced: what is wrong with chunks that are not where they were written, by offset.
+        is_chunked: True if the file has chunks.
+        names_members: True if channels are named as those of a session.
+        why_empty: the reason if there is nothing to save; else "".
+    """
+
+    def __init__(self, scanner: mcap_records.RecordScanner) -> None:
+        self.profile = self.library = ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.count: int | None = None
+        self._scanner = scanner
+        self._sessions: list[dict[str, str]] = []
+        self._scenarios: list[bytes] = []
+        self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
+        self._indexes: dict[int, Any] = {}  # of chunks, by offset
+        footer = scanner.footer()
+        is_covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
+        summary_offset = (footer.summary_start if footer is not None and is_covered else 0) or scanner.size
+        found: dict[tuple[bool, int], list[Definition]] = defaultdict(list)  # in the summary or not
+        has_messages = False
+        for frame in scanner.frames():
+            has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
+            if frame.opcode in mcap_records.DEFINITIONS:
+                entry = frame.opcode, scanner.content(frame)
+                found[frame.offset >= summary_offset, frame.opcode].append(entry)
+            elif frame.opcode == Opcode.CHUNK:
+                self._chunks.append((frame, scanner.head(frame)))
+            elif frame.opcode in _DESCRIBING:
+                with suppress(UnreadableRecord):
+                    self._take(frame, scanner.content(frame))
+        if summary_offset == scanner.size:
+            self.count = None
+            self._indexes = {}
+        self.definitions = [
+            entry for kind in mcap_records.DEFINITIONS for entry in found[True, kind] or found[False, kind]
+        ]
+        self.is_redefined = any(
+            found[True, kind] and not set(found[False, kind]) <= set(found[True, kind])
+            for kind in mcap_records.DEFINITIONS
+        )
+        self.names_members = any(_TOPIC_ROOT in content for _, content in self.definitions)
+        self.is_chunked = bool(self._chunks)
+        self._choose_session()
+        self.misplaced = self._find_misplaced_chunks()
+        is_torn_chunk = scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
+        self.is_chunked |= is_torn_chunk
+        self.why_empty = ""
+        if not (has_messages or is_torn_chunk or self.metadata or self.attachments):
+            self.why_empty = "it holds no messages"
+            if not scanner.begins:
+                self.why_empty = "it does not begin as an MCAP file does" if scanner.size else "it is empty"
+
+    def _take(self, frame: RecordFrame, content: bytes) -> None:
+        record = mcap_records.parse_record(frame.opcode, content)
+        match frame.opcode:
+            case Opcode.HEADER:
+                self.profile, self.library = record.profile, record.library
+            case Opcode.METADATA:
+                self.metadata[record.name] = record.metadata
+                if record.name == SESSION:
+                    self._sessions.append(record.metadata)
+            case Opcode.STATISTICS:
+                self.count = record.message_count
+            case Opcode.CHUNK_INDEX:
+                self._indexes[record.chunk_start_offset] = record
+            case _:
+                if record.name == SCENARIO and mcap_records.has_right_crc(content):
+                    self._scenarios.append(record.data)
+                self.attachments.setdefault(record.name, record.data)
+
+    def _choose_session(self) -> None:
+        """Chooses the session and the scenario that belong together; a checksum of 0 covers nothing."""
+        self.attachments.pop(SCENARIO, None)
+        if self._scenarios:
+            self.attachments[SCENARIO] = self._scenarios[0]
+        digests = {hashlib.sha256(text).hexdigest(): text for text in self._scenarios}
+        for session in self._sessions:
+            if session.get("scenario_sha256") in digests:
+                self.metadata[SESSION] = session
+                self.attachments[SCENARIO] = digests[session["scenario_sha256"]]
+                return
+        if self._sessions:
+            self.metadata[SESSION] = self._sessions[0]
+
+    def _find_misplaced_chunks(self) -> dict[int, str]:
+        if self._indexes:
+            return self._find_unnamed_chunks()
+        misplaced = {}
+        if SESSION in self.metadata:  # files of other programs may be in any order
+            ordered = _find_longest_ordered([head.start_ns for _, head in self._chunks])
+            for place, (frame, _) in enumerate(self._chunks):
+                if place not in ordered:
+                    misplaced[frame.offset] = "a chunk that is older or newer than those around it"
+        return misplaced
+
+    def _find_unnamed_chunks(self) -> dict[int, str]:
+        """Returns the chunks that the index does not name; in a file that was shifted places do not count."""
+        unnamed = []
+        left = Counter(_chunk_measures(index) for index in self._indexes.values())
+        for frame, head in self._chunks:
+            index = self._indexes.get(frame.offset)
+            sizes = frame.size, head.size
+            if index is not None and sizes == (index.chunk_length, index.uncompressed_size):
+                left[_chunk_measures(index)] -= 1
+            else:
+                unnamed.append((frame, head))
+        misplaced = {}
+        for frame, head in unnamed:
+            measures = frame.size, head.size, head.start_ns, head.end_ns
+            if left[measures] > 0:
+                left[measures] -= 1
+            else:
+                misplaced[frame.offset] = "a chunk that the index of the file does not name"
+        return misplaced
+
+
+_CHUNK_BYTE = bytes([Opcode.CHUNK])
+_DESCRIBING = frozenset(
+    {Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.STATISTICS, Opcode.CHUNK_INDEX}
+)
+
+
+def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
+    times = index.message_start_time, index.message_end_time
+    return index.chunk_length, index.uncompressed_size, *times
+
+
+def _find_longest_ordered(times_ns: Sequence[int]) -> set[int]:
+    """Returns the places of the longest sequence of times that never go back (patience sorting)."""
+    ends: list[int] = []  # the earliest end of a sequence, by its length
+    places: list[int] = []  # where that sequence ends
+    before: list[int] = []  # of each place the place before it in its sequence, -1 for none
+    for place, time_ns in enumerate(times_ns):
+        length = bisect_right(ends, time_ns)
+        before.append(places[length - 1] if length else -1)
+        ends[length : length + 1] = [time_ns]
+        places[length : length + 1] = [place]
+    ordered = set()
+    place = places[-1] if places else -1
+    while place >= 0:
+        ordered.add(place)
+        place = before[place]
+    return ordered
