@@ -1,6 +1,7 @@
 """Code from a log: none is imported unless somebody names its file (docs/code-that-runs.md)."""
 
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -8,13 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, trilat
 from tests.log_editing import edited, opened
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
-from trilat_net.scenario.imported_code import allowed_code
+from trilat_net.scenario.code_consent import list_imported_code
+from trilat_net.scenario.imported_code import CodeKey, allowed_code, import_class, remembered_settings
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
 """A module that begins so tells that it was imported."""
@@ -103,6 +106,7 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     monkeypatch.chdir(tmp_path)
     before = dict(allowed_code)
     allowed_code.clear()
+    remembered_settings.clear()
     yield tmp_path
     allowed_code.update(before)  # logs that other tests keep name laws
 
@@ -237,6 +241,115 @@ def test_a_remembered_file_runs_for_its_hash_alone(place: Path) -> None:
     assert trilat("verify", "run.mcap", cwd=place).code == 0
     file.write_text(f"{LAW}# a word\n")
     assert trilat("verify", "run.mcap", cwd=place).code == 4
+
+
+READER = """import os
+class Spring:
+    remembers = ()
+    def __init__(self, facts, K=60.0, table="gains.csv"):
+        self.K = K
+        with open(table) as opened, open(os.environ["WITNESS"], "a") as told:
+            told.write(opened.name + ";")
+    def torque(self, now):
+        return [now.gravity[i] - self.K * (now.q[i] - now.q_des[i]) for i in range(now.joints)]
+
+class Other(Spring):
+    pass
+"""
+"""A harmless law that reads the file which its scenario names."""
+
+
+def save_log_of_reader(place: Path, name: str, settings: dict[str, Any], kind: str = "Spring") -> None:
+    """Saves a log whose author ran the same file with settings of their choice."""
+    written = {f"control.{key}": value for key, value in settings.items()}
+    log = tn.simulate("two_sites", {"control.law": f"mylaws:{kind}", **written}, duration_s=0.05)
+    log.save(name)
+    allowed_code.clear()
+    (place / "witness").unlink()
+
+
+@pytest.fixture
+def reader(place: Path) -> Path:
+    """A law that reads a file, a log of its user, and logs of strangers with the same hash."""
+    (place / "mylaws.py").write_text(READER)
+    for name in ("gains.csv", "secret.txt"):
+        (place / name).write_text("1")
+    save_log_of_reader(place, "own.mcap", {"K": 50.0})
+    save_log_of_reader(place, "stranger.mcap", {"K": 50.0, "table": str(place / "secret.txt")})
+    save_log_of_reader(place, "class.mcap", {"K": 50.0}, "Other")
+    return place
+
+
+def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> None:
+    remembered = trilat("verify", "own.mcap", "--law", "mylaws.py", "--remember", cwd=reader)
+    assert remembered.code == 0, remembered.err
+    assert trilat("verify", "own.mcap", cwd=reader).code == 0
+    (reader / "witness").unlink()
+    refused = trilat("verify", "stranger.mcap", cwd=reader)
+    assert refused.code == 4
+    assert not imports(reader)
+    for fact in ("it was allowed with other settings", 'secret.txt" (was its default)'):
+        assert fact in refused.err
+    assert trilat("verify", "class.mcap", cwd=reader).code == 4
+    assert not imports(reader)
+    named = trilat("verify", "stranger.mcap", "--law", "mylaws.py", "--remember", cwd=reader)
+    assert named.code == 0
+    assert 'secret.txt"' in named.err  # what it ran with is said
+    assert [trilat("verify", name, cwd=reader).code for name in ("own.mcap", "stranger.mcap")] == [0, 0]
+
+
+def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
+    """A notebook in which somebody ran a law opens a stranger's log of the same law."""
+    tn.simulate("two_sites", {"control.law": "mylaws:Spring", "control.K": 50.0}, duration_s=0.05)
+    assert tn.verify("own.mcap").passed
+    (reader / "witness").unlink(missing_ok=True)
+    log = tn.open_log("stranger.mcap")
+    assert tn.verify(log).result.withheld == ["m", "s"]
+    for run in (
+        lambda: tn.rerun(log, ["s"]),
+        lambda: tn.rerun(log, ["s"], {"sites.s.control.K": 60.0}),
+        lambda: tn.certify(log, own_laws=True),
+        lambda: tn.simulate(log.scenario),
+    ):
+        with pytest.raises(CodeWithheld, match="secret.txt"):
+            run()
+    assert not imports(reader)
+
+
+def test_settings_that_a_person_changes_may_run(reader: Path) -> None:
+    log = tn.open_log("own.mcap", law="mylaws.py")
+    again = tn.rerun(log, ["s"], {"sites.s.control.K": 60.0})
+    assert again.sites["s"].executed == 50
+    tn.simulate(log.scenario, {"control.K": 55.0}, duration_s=0.01)
+
+
+def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
+    store = Path(os.environ["XDG_CONFIG_HOME"], "trilat-net", "laws.json")
+    store.parent.mkdir(parents=True)
+    sha256 = hashlib.sha256(READER.encode()).hexdigest()
+    store.write_text(json.dumps({sha256: str(reader / "mylaws.py")}))
+    assert trilat("verify", "own.mcap", cwd=reader).code == 4
+    assert not imports(reader)
+    assert trilat("verify", "own.mcap", "--law", "mylaws.py", "--remember", cwd=reader).code == 0
+    assert trilat("verify", "own.mcap", cwd=reader).code == 0
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"sites.s.plant": {"class": "tests.own_code:Carousel", "how": "few"}},
+        {"sites.m2.hands": [{"kind": "own", "class": "tests.own_code:Circle", "settings": {"radius_m": 0.1}}]},
+        {"sites.s.control.law": "tests.own_laws:PD"},
+    ],
+    ids=["plant", "hand", "law"],
+)
+def test_code_with_other_settings_is_withheld(keys: dict[str, Any], place: Path) -> None:
+    allowed = tn.load_scenario("paper", keys)
+    (named,) = list_imported_code([allowed])
+    others = {**named.settings, "table": "/etc/passwd"}
+    other = msgspec.structs.replace(named, settings=others)
+    with pytest.raises(CodeWithheld, match=r'table = "/etc/passwd" \(was its default\)'):
+        import_class(CodeKey.of(other), "sites.s", named.method)
 
 
 def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:

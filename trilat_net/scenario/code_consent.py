@@ -1,7 +1,10 @@
 """Which code from outside may run: that of one's own scenario, and for a log that whose file one names.
 
-Invariant: what a log or a member of a session names may run if a person names its file, and that has the hash
-that the log names, unless another version is asked for.
+Invariant:
+- What a log or a member of a session names may run if a person names its file, and that file has the hash that the
+  log names, unless another version is asked for.
+- A permission, remembered or not, covers one class of that file with the settings of that log: a log with other
+  settings needs a permission of its own, and is told which settings differ.
 """
 
 import json
@@ -16,7 +19,18 @@ import msgspec
 
 from ..errors import ScenarioError, UsageError
 from ..files import make_folder, write_whole
-from .imported_code import CodeConsent, ImportedLaw, allowed_code, check_class, read_code
+from .imported_code import (
+    CodeConsent,
+    CodeKey,
+    ImportedLaw,
+    allowed_code,
+    check_class,
+    describe_new_settings,
+    describe_setting,
+    find_consent,
+    read_code,
+    remembered_settings,
+)
 from .operators.program_hand import ProgramHand
 from .own_plant import OwnPlant
 
@@ -38,12 +52,37 @@ def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
     return [one for one in found if isinstance(one, ImportedCode)]
 
 
-def allow_own_code(scenario: "Scenario", codes: Container[Any] | None = None) -> "Scenario":
-    """Returns a scenario of which code may run: all, of one that a person names, or that which they name."""
-    for one in list_imported_code([scenario]):
-        if codes is None or one.code in codes:
-            allowed_code[one.code, one.source_sha256] = CodeConsent(None, one.source_sha256)
+def allow_own_code(
+    scenario: "Scenario", codes: Container[Any] | None = None, changed_from: "Scenario | None" = None
+) -> "Scenario":
+    """Returns a scenario after its code was allowed to run.
+
+    Args:
+        scenario: the scenario.
+        codes: the places of the classes that a person names; None: a person wrote the whole scenario.
+        changed_from: the scenario that a person changed into this one. Code that may run there may also run
+            here, with the settings that the person has given it.
+    """
+    sources = [] if changed_from is None else map(CodeKey.of, list_imported_code([changed_from]))
+    consents = {key[:2]: consent for key in sources if (consent := find_consent(key)) is not None}
+    for key in map(CodeKey.of, list_imported_code([scenario])):
+        if codes is None or key.code in codes:
+            allowed_code[key] = CodeConsent(None, key.sha256)
+        elif key[:2] in consents:
+            allowed_code[key] = consents[key[:2]]
     return scenario
+
+
+class RememberedFile(msgspec.Struct):
+    """A file that a person has remembered.
+
+    Attributes:
+        file: where the file is.
+        classes: by the name of a class, the settings with which it may run.
+    """
+
+    file: str
+    classes: dict[str, list[dict[str, Any]]] = {}
 
 
 def allow_logged_code(
@@ -58,39 +97,65 @@ def allow_logged_code(
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember are about a file: give --law FILE too")
-    named = {(one.code, one.source_sha256): one.method for one in list_imported_code([scenario])}
-    known: dict[str, str] = {}
-    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
-        known = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, str]) if named else {}
-    for code, sha256 in named:
-        if sha256 in known:
-            allowed_code.setdefault((code, sha256), CodeConsent(Path(known[sha256]), sha256))
+    named = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
+    known = _read_store() if named else {}
+    remembered_settings.clear()
+    for sha256, entry in known.items():
+        for name, settings in entry.classes.items():
+            texts = [json.dumps(one, sort_keys=True, default=str) for one in settings]
+            remembered_settings[sha256, name] = texts
+    for key in named:
+        texts = remembered_settings.get((key.sha256, _class_of(key)), [])
+        if key.sha256 in known and key.settings in texts:
+            allowed_code.setdefault(key, CodeConsent(Path(known[key.sha256].file), key.sha256))
     for file in files:
-        sha256 = _allow_file(file, named, other_version=other_version)
+        sha256, meant = _allow_file(file, named, other_version=other_version)
         if remember:
+            entry = known.setdefault(sha256, RememberedFile(""))
+            entry.file = str(file.resolve())
+            for key in meant:
+                settings = entry.classes.setdefault(_class_of(key), [])
+                if named[key].settings not in settings:
+                    settings.append(named[key].settings)
             make_folder(_find_store().parent)
-            known[sha256] = str(file.resolve())
-            write_whole(_find_store(), json.dumps(known, indent=1))
+            write_whole(_find_store(), msgspec.json.format(msgspec.json.encode(known), indent=1))
 
 
-def _allow_file(file: Path, named: Mapping[tuple[str, str], str], *, other_version: bool) -> str:
-    """Lets a file run as the code that has its hash, or else its name; returns its hash."""
+def _class_of(key: CodeKey) -> str:
+    return key.code.partition(":")[2]
+
+
+def _read_store() -> dict[str, RememberedFile]:
+    """Returns the remembered files by their hash; a file of an earlier version, without settings, allows nothing."""
+    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
+        entries = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, RememberedFile | str])
+        return {
+            sha256: RememberedFile(entry) if isinstance(entry, str) else entry
+            for sha256, entry in entries.items()
+        }
+    return {}
+
+
+def _allow_file(
+    file: Path, named: Mapping[CodeKey, ImportedCode], *, other_version: bool
+) -> tuple[str, list[CodeKey]]:
+    """Lets a file run as the code that has its hash, or else its name; returns its hash, and that code."""
     source = read_code("", "--law", file.resolve())
     now = source.sha256
     stem = (source.file.parent if file.stem == "__init__" else file).stem
-    alike = [key for key in named if re.split(r"[.:]", key[0])[-2] == stem]
-    meant = [key for key in named if key[1] == now] or alike
+    alike = [key for key in named if re.split(r"[.:]", key.code)[-2] == stem]
+    meant = [key for key in named if key.sha256 == now] or alike
     if not meant:
-        names = ", ".join(sorted({code for code, _ in named})) or "none from outside"
+        names = ", ".join(sorted({key.code for key in named})) or "none from outside"
         raise UsageError(f"--law {file}: is no law that the log names: these are {names}")
-    for code, sha256 in meant:
-        if sha256 != now and not other_version:
-            versions = f"its sha256 is {now[:16]}, and was {sha256[:16]}"
-            problem = f"is not the file that ran as {code}: {versions}"
+    for key in meant:
+        if key.sha256 != now and not other_version:
+            versions = f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
+            problem = f"is not the file that ran as {key.code}: {versions}"
             raise UsageError(f"--law {file}: {problem}; --other-version takes it all the same")
-        check_class(source, code, "--law", named[code, sha256])
-        allowed_code[code, sha256] = CodeConsent(source.file, now)
-    return now
+        check_class(source, key.code, "--law", named[key].method)
+        allowed_code[key] = CodeConsent(source.file, now)
+    return now, meant
 
 
 def _find_store() -> Path:
@@ -101,41 +166,55 @@ class LoggedUserLaw(NamedTuple):
     """A user law that a log names, and its sites.
 
     Attributes:
-        allowed: whether its file may run.
+        code: the place of its class.
+        sites: the sites that it controls.
+        settings: the arguments of its class, as text.
+        allowed: whether its file may run with these settings.
         file: that file, else what Python finds by the name of its module; None: nothing.
         changed: how the file differs from the one that ran, or "".
+        other_settings: how its settings differ from those that are allowed, or "".
     """
 
     code: str
     sites: tuple[str, ...]
+    settings: str
     allowed: bool
     file: Path | None
     changed: str
+    other_settings: str = ""
 
     def __str__(self) -> str:
-        of = f"{self.code} of {', '.join(self.sites)}"
+        named = f"{self.code} of {', '.join(self.sites)}"
+        settings = f" with {self.settings}" if self.settings else ""
         state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
         if self.allowed:
-            return f"{of}; its file {state}"
+            return f"{named}{settings}; its file {state}"
         hint = f"{self.file}{' --other-version' * bool(self.changed)} (it {state})" if self.file else "FILE"
-        return f"{of} is code from outside, which may not run; if you trust it: --law {hint}"
+        problem = f"{named} is code from outside, which may not run{settings}"
+        problem = f"{problem} ({self.other_settings})" if self.other_settings else problem
+        return f"{problem}; if you trust it: --law {hint}"
 
 
 def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
     """Returns the user laws of a scenario without running any code of theirs."""
-    sites: dict[tuple[str, str], tuple[str, ...]] = {}
+    sites: dict[CodeKey, tuple[str, ...]] = {}
+    settings: dict[CodeKey, str] = {}
     for name, spec in scenario.sites.items():
         if isinstance(law := spec.control, ImportedLaw):
-            key = law.code, law.source_sha256
+            key = CodeKey.of(law)
             sites[key] = (*sites.get(key, ()), name)
-    found = []
-    for (code, sha256), owners in sites.items():
-        consent, now, file = allowed_code.get((code, sha256)), "", None
+            settings[key] = ", ".join(
+                f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
+            )
+    laws = []
+    for key, owners in sites.items():
+        consent, now, file = find_consent(key), "", None
         with suppress(ScenarioError):
-            source = read_code(code, "", consent and consent.file)
-            check_class(source, code, "")
+            source = read_code(key.code, "", consent and consent.file)
+            check_class(source, key.code, "")
             now, file = source.sha256, source.file
         allowed = consent is not None and consent.sha256 == now
-        changed = "" if now in ("", sha256) else f"its sha256 is {now[:16]}, and was {sha256[:16]}"
-        found.append(LoggedUserLaw(code, owners, allowed, file, changed))
-    return found
+        changed = "" if now in ("", key.sha256) else f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
+        other = "" if allowed else describe_new_settings(key)
+        laws.append(LoggedUserLaw(key.code, owners, settings[key], allowed, file, changed, other))
+    return laws

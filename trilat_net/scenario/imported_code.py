@@ -3,19 +3,21 @@
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
 the package that contains it. `import_class` is the one door to code from outside: it opens for
-`allowed_code`, if the file is still that one and defines a law of that name.
+`allowed_code`, if the file is still that one and defines a law of that name. A permission covers the arguments
+of the class as well: harmless code with other arguments may open another file.
 """
 
 import ast
 import hashlib
 import importlib
+import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
 
 from msgspec import Meta, field
 
@@ -41,6 +43,45 @@ def call_plainly(_k: int, call: Callable[[], Any]) -> Any:
     return call()
 
 
+class NamedCode(Protocol):
+    """A class from outside as a scenario names it: a law, a hand or a plant."""
+
+    @property
+    def code(self) -> str:
+        """The place of the class, as in "package.module:Law"."""
+
+    @property
+    def source_sha256(self) -> str:
+        """The hash of the file of that module."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments of the class, by name."""
+
+
+ANY_SETTINGS = "*"
+"""In place of settings: whatever they are. Only the workers of a study may be given such a permission."""
+
+
+class CodeKey(NamedTuple):
+    """What a permission covers.
+
+    Attributes:
+        code: the place of the class, as in "package.module:Law".
+        sha256: the hash of its file, as the scenario names it.
+        settings: the arguments of the class, as JSON with sorted keys; or `ANY_SETTINGS`.
+    """
+
+    code: str
+    sha256: str
+    settings: str
+
+    @classmethod
+    def of(cls, named: NamedCode) -> "CodeKey":
+        """Returns the key of a law, hand or plant of a scenario."""
+        return cls(named.code, named.source_sha256, json.dumps(named.settings, sort_keys=True, default=str))
+
+
 class CodeConsent(NamedTuple):
     """A file that may run: where it is, None for where Python finds its module; and its SHA-256."""
 
@@ -48,9 +89,56 @@ class CodeConsent(NamedTuple):
     sha256: str
 
 
-CodeConsents = dict[tuple[str, str], CodeConsent]
+CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
-"""What may run in this process, by the code and the hash that a scenario names; workers are given it."""
+"""The code that may run in this process; workers are given it."""
+remembered_settings: dict[tuple[str, str], list[str]] = {}
+"""The settings that a person has remembered, by the hash of a file and the name of its class, as in a `CodeKey`."""
+
+
+def find_consent(key: CodeKey) -> CodeConsent | None:
+    """Returns the permission for code with its settings; None if it may not run."""
+    return allowed_code.get(key) or allowed_code.get(key._replace(settings=ANY_SETTINGS))
+
+
+@contextmanager
+def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
+    """Lets the code of a study run with any settings inside the block: a study chooses them by itself."""
+    widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
+    added = {key: consent for key, consent in widened.items() if key not in allowed_code}
+    allowed_code.update(added)
+    try:
+        yield
+    finally:
+        for key in added:
+            allowed_code.pop(key, None)
+
+
+def describe_new_settings(key: CodeKey) -> str:
+    """Returns how the settings of withheld code differ from the nearest that may run; "" if none may."""
+    alike = {one.settings for one in allowed_code if one[:2] == key[:2] and one.settings != ANY_SETTINGS}
+    alike |= set(remembered_settings.get((key.sha256, key.code.partition(":")[2]), ()))
+    differences = [_list_differences(json.loads(text), json.loads(key.settings)) for text in sorted(alike)]
+    nearest = min(differences, key=len, default=[])
+    return f"it was allowed with other settings, and here {', '.join(nearest)}" if nearest else ""
+
+
+def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    texts = [{key: describe_setting(value) for key, value in side.items()} for side in (before, now)]
+    old, new = texts
+    changed = (key for key in sorted({*old, *new}) if old.get(key) != new.get(key))
+    return [f"{key} = {new.get(key, 'its default')} (was {old.get(key, 'its default')})" for key in changed]
+
+
+LONGEST_SETTING = 80
+
+
+def describe_setting(value: Any) -> str:
+    """Returns the value of a setting as a short text without control characters."""
+    text = json.dumps(value, default=str)
+    return text if len(text) <= LONGEST_SETTING else f"{text[: LONGEST_SETTING - 3]}..."
+
+
 _executed: dict["CodeSource", Any] = {}
 """Modules of the files that were executed."""
 
@@ -77,7 +165,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
-            kind = import_class(self.code, self.source_sha256, f"{path}.law")
+            kind = import_class(CodeKey.of(self), f"{path}.law")
             check_law_class_at(kind, self.code, context, sites, scheme)  # before anything of it is called
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
@@ -150,7 +238,7 @@ def _find_spec(module: str) -> ModuleSpec | None:
     return spec
 
 
-def import_class(code: str, sha256: str, path: str, method: str = "torque") -> Any:
+def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
     """Returns the class that a scenario names by a hash, from the file that may run for it.
 
     Raises:
@@ -158,10 +246,13 @@ def import_class(code: str, sha256: str, path: str, method: str = "torque") -> A
         ScenarioError: it is not as it was when it was let, or defines no such class: nothing has run; or
             it cannot be imported.
     """
+    code = key.code
     module, _, name = code.partition(":")
-    if (consent := allowed_code.get((code, sha256))) is None:
-        problem = f"{code} is code from outside, which may not run: --law FILE lets its file (in Python"
-        raise CodeWithheld(f"{problem} tn.open_log(..., law=FILE))", path=path)
+    if (consent := find_consent(key)) is None:
+        problem = f"{code} is code from outside, which may not run"
+        problem = f"{problem} ({difference})" if (difference := describe_new_settings(key)) else problem
+        remedy = "--law FILE lets its file (in Python tn.open_log(..., law=FILE))"
+        raise CodeWithheld(f"{problem}: {remedy}", path=path)
     source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
         problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"

@@ -20,7 +20,7 @@ from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError
 from ..fields import Frozen, is_number
 from ..laws.interface import make_instance
-from .imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
+from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -136,7 +136,7 @@ class PlantPlayer:
     def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
         spec, path = scenario.sites[site], f"sites.{site}.plant"
         self._site, self._code, self._watch, self.rate_hz = site, plant.code, watch, spec.rate_hz
-        kind = import_class(plant.code, plant.source_sha256, path, plant.method)
+        kind = import_class(CodeKey.of(plant), path, plant.method)
         if plant.bodies and not hasattr(kind, "poses"):
             raise ScenarioError(
                 f"{plant.code} has no poses(), which says where they are", path=f"{path}.bodies"

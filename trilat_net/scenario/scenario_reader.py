@@ -93,7 +93,7 @@ def load_scenario(
             expanded = expand_overrides(source, parse_overrides(overrides))
             changed = parse_scenario(source.text, source.name, expanded) if overrides else source
             named = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))  # of laws, hands and plants
-            return allow_own_code(changed, named)
+            return allow_own_code(changed, named, source)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)

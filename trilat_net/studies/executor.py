@@ -20,7 +20,7 @@ from ..errors import RunFailed, UsageError
 from ..files import require_libraries
 from ..net.clock import SystemClock
 from ..process import count_cores, worker_pool
-from ..scenario.imported_code import CodeConsents, allowed_code
+from ..scenario.imported_code import CodeConsents, allowed_code, allowing_any_settings
 from .dask_cluster import DaskCluster, WorkerRequirements, check_this_worker
 
 T = TypeVar("T")
@@ -70,17 +70,17 @@ def run_batch(
     """
     if required is not None:
         check_this_worker(required)
-    allowed_code.update(allowed)
     clock = SystemClock()
     began_ns = clock.monotonic_ns()
     results: list[Any] = []
     error = None
-    for item in items:
-        try:
-            results.append(function(item))
-        except Exception as raised:  # raised again where the results are collected
-            error = raised
-            break
+    with allowing_any_settings(allowed):
+        for item in items:
+            try:
+                results.append(function(item))
+            except Exception as raised:  # raised again where the results are collected
+                error = raised
+                break
     return _BatchResult(results, (clock.monotonic_ns() - began_ns) * 1e-9, error)
 
 
@@ -178,7 +178,10 @@ class WorkerPool:
             UsageError: a worker has not what it must have.
         """
         if self._executor is None:
-            yield from enumerate(map(function, items))
+            for number, item in enumerate(items):
+                with allowing_any_settings(allowed_code):
+                    result = function(item)
+                yield number, result
             return
         feed = _Feed(items, count, self.workers, BATCH_S if self._cluster is None else CLUSTER_BATCH_S)
         pending: dict[Future[_BatchResult], _Batch] = {}

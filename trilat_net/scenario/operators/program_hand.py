@@ -17,7 +17,7 @@ from ...core.site_step import Site
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
 from ...laws.interface import make_instance
-from ..imported_code import CLASS_PATTERN, Watch, call_plainly, import_class, read_code
+from ..imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
 from ..operators import Holding
 from .kernel_operators import LiveHand
 
@@ -191,7 +191,7 @@ def make_program(at: HandSite) -> HandProgram:
     """
     path, spec = f"sites.{at.name}.hands", at.spec
     assert isinstance(spec, ProgramHand)
-    kind = import_class(spec.code, spec.source_sha256, f"{path}.class", spec.method)
+    kind = import_class(CodeKey.of(spec), f"{path}.class", spec.method)
     made: HandProgram = make_instance(kind, spec.code, at.describe(), spec.settings, path=path)
     return made
 

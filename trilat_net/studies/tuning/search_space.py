@@ -19,7 +19,7 @@ from ...errors import ScenarioError, UsageError
 from ...fields import MAX_QUANTITY, is_number, suggest_nearest
 from ...laws.interface import DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 from ...scenario import Scenario
-from ...scenario.imported_code import CodeConsent, allowed_code, import_class, read_code
+from ...scenario.imported_code import CodeConsent, CodeKey, allowed_code, import_class, read_code
 from ...scenario.laws import BUILT_IN
 
 MIN_BOX = 0.1
@@ -217,8 +217,9 @@ def build_own_search_space(code: str) -> SearchSpace:
         UsageError: it has no ranges, or one of them is none.
     """
     sha256 = read_code(code, "--law").sha256
-    allowed_code[code, sha256] = CodeConsent(None, sha256)
-    kind = import_class(code, sha256, "--law")
+    key = CodeKey(code, sha256, "{}")
+    allowed_code[key] = CodeConsent(None, sha256)
+    kind = import_class(key, "--law")
     ranges = getattr(kind, "tune", None)
     if not isinstance(ranges, Mapping) or not ranges:
         raise UsageError(f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}')
