@@ -311,12 +311,13 @@ def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
         lambda: tn.certify(log, own_laws=True),
         lambda: tn.simulate(log.scenario),
     ):
-        with pytest.raises(CodeWithheld, match="secret.txt"):
+        with pytest.raises(CodeWithheld, match=r"secret\.txt"):
             run()
     assert not imports(reader)
 
 
-def test_settings_that_a_person_changes_may_run(reader: Path) -> None:
+@pytest.mark.usefixtures("reader")
+def test_settings_that_a_person_changes_may_run() -> None:
     log = tn.open_log("own.mcap", law="mylaws.py")
     again = tn.rerun(log, ["s"], {"sites.s.control.K": 60.0})
     assert again.sites["s"].executed == 50
@@ -338,12 +339,13 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
     "keys",
     [
         {"sites.s.plant": {"class": "tests.own_code:Carousel", "how": "few"}},
-        {"sites.m2.hands": [{"kind": "own", "class": "tests.own_code:Circle", "settings": {"radius_m": 0.1}}]},
+        {"sites.m2.hands": [{"kind": "own", "class": "tests.own_code:Circle", "settings": {"turn_s": 1.0}}]},
         {"sites.s.control.law": "tests.own_laws:PD"},
     ],
     ids=["plant", "hand", "law"],
 )
-def test_code_with_other_settings_is_withheld(keys: dict[str, Any], place: Path) -> None:
+@pytest.mark.usefixtures("place")
+def test_code_with_other_settings_is_withheld(keys: dict[str, Any]) -> None:
     allowed = tn.load_scenario("paper", keys)
     (named,) = list_imported_code([allowed])
     others = {**named.settings, "table": "/etc/passwd"}

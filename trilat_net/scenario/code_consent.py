@@ -1,10 +1,10 @@
 """Which code from outside may run: that of one's own scenario, and for a log that whose file one names.
 
 Invariant:
-- What a log or a member of a session names may run if a person names its file, and that file has the hash that the
-  log names, unless another version is asked for.
-- A permission, remembered or not, covers one class of that file with the settings of that log: a log with other
-  settings needs a permission of its own, and is told which settings differ.
+- What a log or a member of a session names may run if a person names its file, and that file has the hash
+  that the log names, unless another version is asked for.
+- A permission, remembered or not, covers one class of that file with the settings of that log. A log with
+  other settings needs a permission of its own, and the refusal says which settings differ.
 """
 
 import json
@@ -126,7 +126,10 @@ def _class_of(key: CodeKey) -> str:
 
 
 def _read_store() -> dict[str, RememberedFile]:
-    """Returns the remembered files by their hash; a file of an earlier version, without settings, allows nothing."""
+    """Returns the remembered files by their hash.
+
+    An entry without settings, which earlier versions wrote, allows nothing.
+    """
     with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
         entries = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, RememberedFile | str])
         return {

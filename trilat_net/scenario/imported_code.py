@@ -3,8 +3,8 @@
 Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
 defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
 the package that contains it. `import_class` is the one door to code from outside: it opens for
-`allowed_code`, if the file is still that one and defines a law of that name. A permission covers the arguments
-of the class as well: harmless code with other arguments may open another file.
+`allowed_code`, if the file is still that one and defines a law of that name. A permission covers the
+arguments of the class as well: harmless code with other arguments may open another file.
 """
 
 import ast
@@ -93,7 +93,7 @@ CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
 """The code that may run in this process; workers are given it."""
 remembered_settings: dict[tuple[str, str], list[str]] = {}
-"""The settings that a person has remembered, by the hash of a file and the name of its class, as in a `CodeKey`."""
+"""The remembered settings, as in a `CodeKey`, by the hash of a file and the name of a class."""
 
 
 def find_consent(key: CodeKey) -> CodeConsent | None:
