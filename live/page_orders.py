@@ -33,6 +33,8 @@ MAX_MESSAGE_BYTES = 4_096
 REPLY_TIMEOUT_NS = 3_000_000_000
 MOST_WAITING = 256
 TOKEN_BYTES = 16
+RELEASE = "release"
+"""The subject of waiting orders that let an arm follow again or end its fault."""
 LEAST_RAMP_S = 0.25
 """The time in which shares change that somebody drags, s."""
 
@@ -65,6 +67,18 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
     """Every arm is to stop, while the session goes on."""
+
+
+class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
+    """Arms that were stopped are to follow again, or the fault of arms is to end.
+
+    Attributes:
+        order: "enable" for arms that were stopped, "reset" for arms in fault.
+        sites: which arms.
+    """
+
+    order: Literal["enable", "reset"]
+    sites: Annotated[list[Name], Meta(min_length=1, max_length=16)]
 
 
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
@@ -137,6 +151,7 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
     TakePart: (1.0, 5),
     AnswerPage: (1.0, 5),
     StopArms: (5.0, 10),
+    ReleaseArms: (5.0, 10),
     DoStep: (2.0, 5),
     AbortTrial: (1.0, 3),
 }
@@ -191,6 +206,13 @@ class Role:
             return True
         own = isinstance(message, MoveHand) and message.site == self.site
         return self.kind == "user" and (own or isinstance(message, StageMessage))
+
+    @property
+    def noun(self) -> str:
+        """Who this is, in a sentence of an event."""
+        return {"experimenter": "the experimenter", "user": f"the user of {self.site}"}.get(
+            self.kind, "a watcher"
+        )
 
     @property
     def query(self) -> str:
@@ -277,12 +299,19 @@ class OrderDesk:
     def __init__(self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None) -> None:
         self._bus, self._clock, self._session = bus, clock, session
         self._waiting: dict[tuple[str, str], ChangeRequest] = {}
-        self._open: dict[tuple[str, str], tuple[Inbox, int]] = {}
+        self._open: dict[tuple[str, str], tuple[Inbox, int, ChangeRequest]] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
         self.refused: Counter[str] = Counter() if refused is None else refused
 
-    def order(self, order: Order, sites: Collection[str], links: Collection[str]) -> None:
-        """Takes an order, if the session has the site or the link; it replaces one that waits for that."""
+    def order(self, order: Order, sites: Collection[str], links: Collection[str], source: str = "") -> None:
+        """Takes an order, if the session has the site or the link; it replaces one that waits for that.
+
+        Args:
+            order: the new values of a link, or a new row of shares.
+            sites: the sites of the session.
+            links: its links.
+            source: who orders it, for the site's event.
+        """
         if isinstance(order, SetLink):
             what, site, known = "link", order.link.partition("->")[2], order.link in links
             request = _link_request(order)
@@ -291,32 +320,56 @@ class OrderDesk:
             request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=LEAST_RAMP_S)
         if not known:
             self.refused[f"no such {what}"] += 1
-        elif len(self._waiting) < MOST_WAITING:
-            self._waiting[site, request.link] = request
+        else:
+            self._wait(site, request.link, _name_source(request, source))
 
-    def stop(self, sites: Iterable[str]) -> None:
-        """Orders sites to stop, at once, whatever they have been asked before."""
+    def stop(self, sites: Iterable[str], source: str = "") -> None:
+        """Orders sites to stop, at once, whatever they have been asked before.
+
+        Args:
+            sites: which sites.
+            source: who orders it, for the sites' events.
+        """
         for site in sites:
-            self._ask(site, topics.STOP, ChangeRequest(order="stop"))
+            # An order that is not carried out yet would let the arm go again right after the stop.
+            self._waiting.pop((site, RELEASE), None)
+            self._ask(site, topics.STOP, _name_source(ChangeRequest(order="stop"), source))
+
+    def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
+        """Orders arms to follow again, or their faults to end.
+
+        Args:
+            order: which order, and of which arms.
+            sites: the sites of the session.
+            source: who orders it, for the sites' events.
+        """
+        for site in order.sites:
+            if site not in sites:
+                self.refused["no such site"] += 1
+            else:
+                self._wait(site, RELEASE, _name_source(ChangeRequest(order=order.order), source))
+
+    def _wait(self, site: str, subject: str, request: ChangeRequest) -> None:
+        """Keeps a request until the site is asked; a newer one of the same subject replaces it."""
+        if (site, subject) in self._waiting or len(self._waiting) < MOST_WAITING:
+            self._waiting[site, subject] = request
 
     def _ask(self, site: str, channel: str, request: ChangeRequest) -> None:
         inbox = self._bus.ask(topics.key(self._session, site, channel), encode(request))
-        self._open[site, channel] = inbox, self._clock.monotonic_ns()
+        self._open[site, channel] = inbox, self._clock.monotonic_ns(), request
 
     def mark(self, site: str, text: str) -> None:
         """Asks a site to mark this moment in the log."""
-        if len(self._waiting) < MOST_WAITING:
-            self._waiting[site, f"mark {text}"] = ChangeRequest(mark=text)
+        self._wait(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:
         """Asks the sites, one question each at a time, and reads their answers."""
         now_ns = self._clock.monotonic_ns()
-        for (site, channel), (inbox, asked_ns) in list(self._open.items()):
+        for (site, channel), (inbox, asked_ns, request) in list(self._open.items()):
             if (answer := inbox.poll()) is not None:
                 del self._open[site, channel]
                 try:
-                    reply = decode(answer[1], ChangeReply)
-                    self.replies.append((site, channel, reply.accepted, reply.text))
+                    self._take_reply(site, channel, request, decode(answer[1], ChangeReply))
                 except WireError as error:
                     self.refused[error.reason] += 1
             elif now_ns - asked_ns > REPLY_TIMEOUT_NS:
@@ -326,6 +379,21 @@ class OrderDesk:
             if (site, topics.SET) not in self._open:
                 del self._waiting[site, what]
                 self._ask(site, topics.SET, request)
+
+    def _take_reply(self, site: str, channel: str, request: ChangeRequest, reply: ChangeReply) -> None:
+        """Keeps an answer for the pages; a stop that was refused is ordered again without its source.
+
+        A site of an older program knows no source and refuses the whole request; its arm has to stop too.
+        """
+        if channel == topics.STOP and not reply.accepted and request.source is not msgspec.UNSET:
+            self._ask(site, channel, msgspec.structs.replace(request, source=msgspec.UNSET))
+        else:
+            self.replies.append((site, channel, reply.accepted, reply.text))
+
+
+def _name_source(request: ChangeRequest, source: str) -> ChangeRequest:
+    """Returns a request that names who makes it, if that is known."""
+    return msgspec.structs.replace(request, source=source) if source else request
 
 
 def _link_request(order: SetLink) -> ChangeRequest:

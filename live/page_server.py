@@ -38,6 +38,7 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.process import raise_priority
 
 from .page_files import PageFiles
 from .page_orders import (
@@ -50,6 +51,7 @@ from .page_orders import (
     OrderDesk,
     PageHands,
     PageMessage,
+    ReleaseArms,
     Role,
     RoleLinks,
     Seen,
@@ -67,6 +69,8 @@ from .session_view import SessionView
 if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
     from .experiment_stage import Stage
 
+NICE = -5
+"""Priority of the page's threads and of those that bring its messages: above normal, below the sites' own."""
 FRAMES_PER_S = 30
 FRAMES_AHEAD = 2
 """Frames that a page may have got and not drawn yet: one is on its way while it draws the other."""
@@ -285,6 +289,7 @@ class PageServer:
 
     def _run(self) -> None:
         """Serves pages until the end, and again after whatever ended it."""
+        raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
             try:
                 asyncio.run(self._serve())
@@ -466,7 +471,7 @@ class PageServer:
                 page.unseen.popleft()
             page.wake.set()
         elif isinstance(message, StopArms):  # of whoever sees the page
-            self._desk.stop(view.sites)
+            self._desk.stop(view.sites, page.role.noun)
         elif isinstance(message, TakePart):
             self._ask_to_take_part(page, message.want)
         elif isinstance(message, AnswerPage):
@@ -474,7 +479,9 @@ class PageServer:
         elif not page.takes_part:
             self.refused["does not take part"] += 1
         elif isinstance(message, SetLink | SetShares):
-            self._desk.order(message, view.sites, view.links)
+            self._desk.order(message, view.sites, view.links, page.role.noun)
+        elif isinstance(message, ReleaseArms):
+            self._desk.release(message, view.sites, page.role.noun)
         elif isinstance(message, MarkMoment):
             if view.scenario is not None:
                 self._desk.mark(view.scenario.names[0], message.text)
@@ -565,11 +572,11 @@ class PageServer:
 
     def _frame_for(self, page: Page) -> dict[str, Any]:
         notices = [one for one in self._notices if one["n"] > page.notified]
-        if page.role.site:
-            shown = self._show_as(page.role.site)
-            notices = [one for one in notices if one["of"] == topics.STOP]
-        else:
-            shown = self._show_all(page)
+        if page.role.kind != "experimenter":
+            # The answers of sites name keys and commands, which only an experimenter can use.
+            stops = [notice for notice in notices if notice["of"] == topics.STOP and not notice["ok"]]
+            notices = [{**notice, "text": f"{notice['site']} was not stopped"} for notice in stops]
+        shown = self._show_as(page.role.site) if page.role.site else self._show_all(page)
         return {
             "n": self._n,
             **shown,
@@ -631,6 +638,7 @@ class PageAttendant(ExitStack):
         """
         page, clock = self._page, self._clock
         assert page is not None  # a session was attended
+        page.view.finish()  # its processes are gone, whatever they could still say
         page.files.offer(paths)
         give_up_ns = clock.monotonic_ns() + OFFERED_NS
         with suppress(KeyboardInterrupt):

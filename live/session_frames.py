@@ -9,10 +9,8 @@ site has in use, or to which the picture of the site's user has come (`SessionVi
 
 from collections import defaultdict
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from trilat_net.analysis.aligned import AlignedRecords
@@ -20,8 +18,9 @@ from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows, joint_
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.task_space import PLACE
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.core.vectors import Array
+from trilat_net.log.event_text import describe_event
 from trilat_net.log.orientations import QUATERNION_AXES, SteadyQuaternion
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
@@ -244,6 +243,7 @@ class SessionFrames:
             "shares": view.dominance,
             "energy": "" if energy is None else energy.reason,
             "ended": view.ended,
+            "silent_s": 0.0 if view.ended else round(view.session_silence_s, 1),
             "dropped": sum(view.dropped.values()),
         }
 
@@ -277,6 +277,7 @@ class SessionFrames:
             "shares": {},
             "energy": "",
             "ended": frame["ended"],
+            "silent_s": own["silent_s"],
         }
 
     def _find_known(self, site: str, peer: str, tick: int) -> Json:
@@ -300,7 +301,7 @@ class SessionFrames:
         now, extremes = self._arms[name].now(window.rows(first, newest))
         self._seen[name] = newest
         account = site.reception.accounts["state"]
-        alarm = None if site.reception.made is not None else site.find_alarm(self._view.session, name)
+        alarm = None if self._view.ended else site.find_alarm(self._view.session, name)
         return {
             **now,
             "new": newest > seen,
@@ -309,8 +310,9 @@ class SessionFrames:
             "used": record.used,
             "mode": record.mode,
             "bodies": self._turns["", name].align(record.bodies),
-            "alarm": None if alarm is None else alarm._asdict(),
-            "silent": self._view.silent(site),
+            "alarm": None if alarm is None else _show_alarm(alarm),
+            "ended": site.ended or self._view.ended,
+            "silent_s": 0.0 if self._view.ended else round(self._view.silence_s(site), 1),
             "holder": site.holder if now.get("source") else "",
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
@@ -339,13 +341,13 @@ class SessionFrames:
         }
 
 
+def _show_alarm(alarm: LifeAlarm) -> Json:
+    """Returns an alarm for a page, whose button gives the order: no page shows a command of a shell."""
+    advice = alarm.before if alarm.order else alarm.advice
+    return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}
+
+
 def show_event(event: Event) -> Json:
     """Returns an event as a page lists it."""
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    change = None
-    if event.kind == "change":
-        with suppress(msgspec.DecodeError):
-            change = msgspec.json.decode(event.command)
-    if not isinstance(change, dict) or not ("link" in change or "dominance" in change):
-        change = None  # an order to a site: its text says it
-    return {"t": t_s, "member": event.member, "kind": event.kind, "text": event.text, "change": change}
+    return {"t": t_s, "member": event.member, "kind": event.kind, "text": describe_event(event)}

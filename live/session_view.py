@@ -1,8 +1,11 @@
 """What a session does now: the records, statistics and events of its sites as they come in.
 
-Invariant: every record counts. What is missing is asked for as a recorder asks, from the same buffers, so
-that energies are those of the log; a page is shown fewer, and always the newest. A view that begins late asks
-for no records from before it, and for all events, which say what was changed.
+Invariant:
+- Every record counts. What is missing is asked for as a recorder asks, from the same buffers, so that
+  energies are those of the log; a page is shown fewer, and always the newest.
+- A view that begins late asks for no records from before it, and for all events, which say what was changed.
+- A site has ended if its `end` message says so, and never because it is silent: on a busy machine a running
+  site may be silent for long, and its records are taken in when they come again.
 """
 
 from collections import Counter, deque
@@ -29,10 +32,8 @@ from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
 """A view whose first record of a site is of a later time has joined late."""
-GONE_NS = 2 * NS_PER_S
-"""A site that is silent for so long is shown as gone."""
-ENDED_NS = 15 * NS_PER_S
-"""A session all of whose sites are silent for so long has ended."""
+SILENT_NS = 2 * NS_PER_S
+"""A running site that was not heard for so long is shown as silent."""
 EVENTS_KEPT = 400
 
 T = TypeVar("T")
@@ -86,10 +87,15 @@ class SiteView:
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
         """Returns what nobody may overlook of the site, of some name; None if there is nothing."""
         record = self.record
-        if record is None or not self.glides:
+        if record is None or not self.glides or self.ended:
             return None
         lost = self.layout.find_lost(record.mem, self.peers) if self.layout is not None else ()
         return find_alarm(session, name, record.mode, record.mem, len(record.q_des), lost)
+
+    @property
+    def ended(self) -> bool:
+        """True once the site has said that it ends."""
+        return self.reception.made is not None
 
     @property
     def complete(self) -> int:
@@ -120,6 +126,7 @@ class SessionView:
         self.energy: RunningEnergy | None = None
         self.events: Tail[Event] = Tail(EVENTS_KEPT)
         self.dropped: Counter[str] = Counter()
+        self._finished = False
         self._pictures: dict[str, PictureDelay] = {}
         self._changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
@@ -134,14 +141,29 @@ class SessionView:
 
     @property
     def ended(self) -> bool:
-        """True once every site has said that it ends, or is silent for long."""
-        return self.running and all(self.silent(site, ENDED_NS) for site in self.sites.values())
+        """True once every site has said that it ends, or `finish` was called."""
+        return self.running and (self._finished or all(site.ended for site in self.sites.values()))
 
-    def silent(self, site: SiteView, for_ns: int = GONE_NS) -> bool:
-        """True if a site has ended, or was not heard for so long, ns."""
+    def finish(self) -> None:
+        """Shows the session as ended: whoever has started its sites knows that their processes are gone."""
+        self._finished = True
+
+    def silence_s(self, site: SiteView) -> float:
+        """Returns for how long a running site was not heard, s.
+
+        It is 0.0 below `SILENT_NS`, and once the site has ended.
+        """
         heard_ns = site.reception.heard_ns
-        lately = heard_ns is None or self._clock.monotonic_ns() - heard_ns < for_ns
-        return site.reception.made is not None or not lately
+        if heard_ns is None or site.ended:
+            return 0.0
+        silence_ns = self._clock.monotonic_ns() - heard_ns
+        return silence_ns / NS_PER_S if silence_ns >= SILENT_NS else 0.0
+
+    @property
+    def session_silence_s(self) -> float:
+        """For how long no running site was heard, s; 0.0 while one is."""
+        running = [site for site in self.sites.values() if not site.ended]
+        return min((self.silence_s(site) for site in running), default=0.0)
 
     def poll(self) -> None:
         """Takes in what has come, and asks for what is missing."""
@@ -156,7 +178,8 @@ class SessionView:
             except WireError as error:
                 self.dropped[error.reason] += 1
         for name, site in self.sites.items():
-            for channel, message, _ in site.repair.poll(now_ns, alive=not self.silent(site)):
+            # A silent site is asked too: its answer may be the `end` message that was lost.
+            for channel, message, _ in site.repair.poll(now_ns, alive=not site.ended):
                 self._keep(name, site, channel, message.content)
         newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
         self.links.advance(newest_ns)

@@ -88,9 +88,16 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """The session, and its V."""
-        shown = f"as {self._as_site} knows it" if self._as_site else self._V
-        state = shown if self.view.running else "waits for its members"
+        """The session, and its V; or that it has ended, or for how long no site was heard."""
+        view = self.view
+        silence_s = view.session_silence_s
+        state = f"as {self._as_site} knows it" if self._as_site else self._V
+        if not view.running:
+            state = "waits for its members"
+        elif view.ended:
+            state = "; ".join(filter(None, ("has ended", state)))
+        elif silence_s > 0.0:
+            state = "; ".join(filter(None, (f"silent for {silence_s:.0f} s, waiting", state)))
         return f"session {self.view.session}" + (f"; {state}" if state else "")
 
     @property
@@ -98,15 +105,21 @@ class SessionWatch:
         """The sites that hold, are stopped or in fault, each with its alarm, while they run."""
         view = self.view
         known = {name: site for name, site in view.sites.items() if self._as_site in ("", name)}
-        running = {name: site for name, site in known.items() if not view.silent(site)}
-        found = ((name, site.find_alarm(view.session, name)) for name, site in running.items())
+        found = ((name, site.find_alarm(view.session, name)) for name, site in known.items())
         return [(name, alarm) for name, alarm in found if alarm is not None]
 
     def rows(self) -> list[SiteRow]:
         """Returns the row of each site; of a peer of the site that is watched, what its user is shown."""
         view, scenario, own = self.view, self.view.scenario, self._as_site
         every = {
-            name: describe_site(scenario, name, site.record, site.stats, silent=view.silent(site))
+            name: describe_site(
+                scenario,
+                name,
+                site.record,
+                site.stats,
+                ended=site.ended or view.ended,
+                silent_s=view.silence_s(site),
+            )
             for name, site in view.sites.items()
             if scenario is not None and own in ("", name)
         }
@@ -134,7 +147,7 @@ def show_in_terminal(
             watch.update()
             if read_keys is not None and STOP_KEYS.intersection(read_keys()):
                 display.say("stopping every arm" if watch.view.running else "the session has not begun")
-                desk.stop(watch.view.sites)
+                desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
                 display.say(desk.replies.pop(0)[3])

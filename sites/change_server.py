@@ -11,6 +11,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
+import msgspec
+from msgspec import UNSET
+
 from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
 from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
@@ -42,6 +45,7 @@ class ChangeServer:
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
         marks: moments that somebody marked and that no event names yet: ticks, and texts.
+        sources: who asked for an accepted change, by its text in the record, until an event says it.
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class ChangeServer:
         self._stop_tick: int | None = None
         self.stopped = False
         self.marks: list[tuple[int, str]] = []
+        self.sources: dict[str, str] = {}
 
     def take(self, k: int) -> Sequence[CoreChange]:
         """Replies to every request; returns the accepted changes, for the next tick, k."""
@@ -89,6 +94,8 @@ class ChangeServer:
                 else:
                     changes.append(self._resolve(request, first))
                     text, tick = f"{self._site} takes it in at tick {k}; it holds from tick {first} on", first
+                if isinstance(request.source, str) and changes:
+                    self.sources[changes[-1].text] = request.source
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
@@ -104,7 +111,8 @@ class ChangeServer:
         """Returns the next question of somebody who may ask the site to stop, and nothing else."""
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
-                if decode(query.payload, ChangeRequest) == ChangeRequest(order="stop"):
+                request = decode(query.payload, ChangeRequest)
+                if msgspec.structs.replace(request, source=UNSET) == ChangeRequest(order="stop"):
                     return query
             text = f"{self._site} can be asked to stop under this key, and nothing else"
             query.answer(encode(ChangeReply(member=self._site, accepted=False, text=text)))

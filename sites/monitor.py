@@ -39,9 +39,24 @@ SiteRow = Mapping[str, str]
 
 
 def describe_site(
-    scenario: Scenario, name: str, record: State | None, stats: LinkStats | None, *, silent: bool = False
+    scenario: Scenario,
+    name: str,
+    record: State | None,
+    stats: LinkStats | None,
+    *,
+    ended: bool = False,
+    silent_s: float = 0.0,
 ) -> SiteRow:
-    """Returns the row of a site by its newest record and statistics, as far as there are any."""
+    """Returns the row of a site by its newest record and statistics, as far as there are any.
+
+    Args:
+        scenario: of the session.
+        name: the site.
+        record: its newest record; None before the first.
+        stats: its newest statistics; None before the first.
+        ended: true once the site has said that it ends.
+        silent_s: for how long it was not heard, s; 0.0 if it was heard lately.
+    """
     row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
     if stats is not None:
         aged = stats.age_us.items()
@@ -66,7 +81,9 @@ def describe_site(
             "torque": f"{max(map(abs, record.tau)):.2f} N m",
             "held": "" if hand is None else "yes" if hand.source else "fades" if hand.grip else "free",
         }
-    return row | {"mode": "silent"} if silent else row
+    if ended:
+        return row | {"mode": "ended"}
+    return row | {"mode": f"silent {silent_s:.0f} s"} if silent_s > 0.0 else row
 
 
 def describe_angles(q: Sequence[float]) -> str:
@@ -84,11 +101,10 @@ def describe_row(row: SiteRow) -> str:
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
     """Returns a block for each alarm: red, or yellow of a site that holds and goes on by itself."""
     blocks = []
-    for name, (word, reason, advice) in alarms:
-        colour = "red" if word in ("FAULT", "STOPPED") else "yellow"
-        text = Text.assemble(
-            (f" {name} {word} ", f"bold reverse {colour}"), f"  {reason}\n", (advice, "bold")
-        )
+    for name, alarm in alarms:
+        colour = "red" if alarm.word in ("FAULT", "STOPPED") else "yellow"
+        head = f" {name} {alarm.word} "
+        text = Text.assemble((head, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold"))
         blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
     return blocks
 

@@ -44,6 +44,10 @@ AHEAD_S = 0.5
 """From the newest tick that is known to the end: sites say ten times a second where they are."""
 
 
+SOURCE = "the operator"
+"""Who gives the orders of this interface and of its commands, in the sites' events."""
+
+
 class ShareHistory:
     """The shares of a site in its peers, by the changes that are known."""
 
@@ -176,7 +180,7 @@ class RunningSession:
                 if name not in found or not found[name].running:
                     state = "has not begun" if name in found else "did not answer"
                     raise SessionError(f"session {self.name!r}: {name} {state}")
-            request = ChangeRequest(order=order)
+            request = ChangeRequest(order=order, source=SOURCE)
             return [send_change(bus, self._clock, self.name, name, request) for name in asked]
 
     def end(self) -> list[str]:

@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 
+import msgspec
 import numpy as np
 from msgspec.structs import asdict
 
@@ -42,7 +43,8 @@ from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.run_changes import count_skipped_ticks
+from trilat_net.scenario.run_changes import count_skipped_ticks, describe_change
+from trilat_net.scenario.scenario_types import Change
 from trilat_net.scenario.validate import check_outside_arms
 
 from . import realtime
@@ -199,7 +201,7 @@ class RunningSite:
         parts = self._parts
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.meters)
         self._publish_setup()
-        order, name = encode(ChangeRequest(order="stop")), parts.name
+        order, name = encode(ChangeRequest(order="stop", source="the operator")), parts.name
         here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
         with make_site_known(*here, order), parts.watchdog:
             ticks = parts.scenario.ticks(name)
@@ -367,8 +369,10 @@ class RunningSite:
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
         for change in output.cmd:
             if not count_skipped_ticks([change]):
-                self._publisher.publish("change", f"{name} takes in {change}", command=change, **at)
-                self._parts.say(f"takes in {change}")
+                source = self._parts.changes.sources.pop(change, "")
+                sentence = describe_change(msgspec.json.decode(change, type=Change), source)
+                self._publisher.publish("change", sentence, command=change, **at)
+                self._parts.say(sentence)
         if output.mode is not self._mode:
             self._mode = output.mode
             glides = self._parts.setup.on_stale.action is StaleAction.GLIDE

@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -199,6 +200,33 @@ def join_words(words: Iterable[str]) -> str:
         return shlex.join(words)
     quoted = ('"' + word.replace('"', '\\"') + '"' for word in words)  # as cmd and PowerShell both take it
     return " ".join(one[1:-1] if re.fullmatch(r'"[\w.:/\\=+-]+"', one) else one for one in quoted)
+
+
+def raise_priority(nice: int) -> bool:
+    """Runs the threads of this process but the main one above normal priority, where that is permitted.
+
+    The main thread is left out because the processes that it starts would inherit the priority. Linux gives
+    every thread a nice value of its own; on other systems, and without the privilege, nothing changes.
+
+    Args:
+        nice: below 0 for a priority above normal; -20 is the highest.
+
+    Returns:
+        True if the calling thread got the priority.
+    """
+    tasks = Path("/proc/self/task")
+    if not (sys.platform.startswith("linux") and tasks.is_dir()):
+        return False
+    own = threading.get_native_id()
+    others = (int(entry.name) for entry in tasks.iterdir())
+    threads = [own, *(thread for thread in others if thread not in (own, os.getpid()))]
+    try:
+        for thread in threads:
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.setpriority(os.PRIO_PROCESS, thread, nice)
+    except OSError:
+        return False
+    return True
 
 
 def count_cores() -> int:

@@ -79,12 +79,14 @@ class ArmCard {
 
   chips(site, holds) {
     const list = [];
-    if (site.mode in MODES) list.push([MODES[site.mode], "bad"]);
-    if (site.clamped) list.push(["TORQUE LIMIT", "bad"]);
-    if (site.hand_limited) list.push(["FORCE LIMIT", "bad"]);
-    if (site.silent) list.push(["SILENT", "bad"]);
-    if (holds) list.push(["you hold it", "good"]);
-    else if (site.holder) list.push([this.hold ? `REFUSED: ${site.holder} holds it` : `held by ${site.holder}`, this.hold ? "bad" : "warn"]);
+    if (site.mode === "diverged") list.push([MODES.diverged, "bad"]);
+    else if (site.ended) list.push(["ended", ""]);
+    else if (site.mode in MODES) list.push([MODES[site.mode], "bad"]);
+    if (site.clamped && !site.ended) list.push(["TORQUE LIMIT", "bad"]);
+    if (site.hand_limited && !site.ended) list.push(["FORCE LIMIT", "bad"]);
+    if (site.silent_s) list.push([`SILENT ${Math.floor(site.silent_s)} s`, "bad"]);
+    if (holds && !site.ended) list.push(["you hold it", "good"]);
+    else if (site.holder && !site.ended) list.push([this.hold ? `REFUSED: ${site.holder} holds it` : `held by ${site.holder}`, this.hold ? "bad" : "warn"]);
     const text = JSON.stringify(list);
     if (text !== this.shown) {
       this.shown = text;

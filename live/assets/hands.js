@@ -21,7 +21,7 @@ export class Hands {
     setInterval(() => this.beat(), EVERY_MS);
   }
 
-  can(card) { return this.page.takesPart && [undefined, card].includes(this.own) && ["tip", "force"].includes(card.about.hand?.mode) && Boolean(card.project); }
+  can(card) { return this.page.takesPart && !this.page.frame?.ended && [undefined, card].includes(this.own) && ["tip", "force"].includes(card.about.hand?.mode) && Boolean(card.project); }
 
   goal(card) { // the target; for an arm that is pushed the force, as far as the pointer is from the tip
     const { hand, reach } = card.about;

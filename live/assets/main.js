@@ -2,7 +2,7 @@
 // Newest state wins: the server sends a frame when this page has drawn the one before.
 import { Arms, WORDS_MS } from "./arms.js";
 import { Hands } from "./hands.js";
-import { Network, describeLink } from "./network.js";
+import { Network } from "./network.js";
 import { Plots } from "./plots.js";
 import { Shares } from "./shares.js";
 import { renew, Stage } from "./stage.js";
@@ -25,7 +25,7 @@ export function send(message) {
 
 const FINGERS = matchMedia("(pointer: coarse)");
 const LATE_MS = 1000;
-const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages";
+const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages, #alarms button";
 const stage = new Stage(send); // of an experiment; without one it shows nothing
 
 let hidesAt = 0;
@@ -44,11 +44,13 @@ function state(text, kind = "") {
   $("state").className = `chip ${kind}`;
 }
 
-function enable() { // controls act as long as the page takes part and is not cut off
-  const able = page.takesPart && !late;
+function enable() { // controls act as long as the session runs and the page takes part and is not cut off
+  const ended = Boolean(page.frame?.ended);
+  const able = page.takesPart && !late && !ended;
   for (const control of document.querySelectorAll(CONTROLS)) control.disabled = !able;
-  $("part").disabled = late;
-  $("stop").disabled = !page.stops || socket?.readyState !== WebSocket.OPEN;
+  $("part").disabled = late || ended;
+  $("stop").disabled = !page.stops || ended || socket?.readyState !== WebSocket.OPEN;
+  document.body.classList.toggle("ended", ended);
 }
 
 const tell = (text, kind = "") => { // the line that says what to do
@@ -63,9 +65,11 @@ function advise(frame) {
   const held = parts.arms.cards.filter((card) => card.hold).map((card) => card.name);
   if (frame.ended && frame.results.length) return results(frame.results);
   if (frame.ended) return tell(hello.ends ? "The session has ended. Its log is being checked; report and log will be here." : "The session has ended.");
-  const still = Object.values(frame.sites).filter((site) => site.mode === "stopped").length;
-  if (still && hello.role !== "user") return tell(`Arms are stopped. trilat enable --session ${hello.session} lets them follow again.`);
-  if (still) return tell("Arms are stopped; the experimenter lets them follow again.");
+  if (frame.silent_s) return tell(`No site has been heard for ${Math.floor(frame.silent_s)} s: what this page shows is old. It waits, and goes on as soon as they are heard.`, "late");
+  const still = Object.values(frame.sites).some(({ alarm }) => alarm?.order);
+  if (still && hello.role !== "experimenter") return tell("Arms are stopped; the experimenter lets them follow again.");
+  if (still && !frame.takes_part) return tell("Arms are stopped. Press “take part” to let them follow again.");
+  if (still) return tell("Arms are stopped. The button beside the reason lets them follow again.");
   if (held.length) return tell(`You hold ${held.join(" and ")}: lead the end where it shall go, and let go when you are there.`);
   const where = hello.as ? "your arm" : able.length > 1 ? "an arm" : able[0];
   if (able.length && FINGERS.matches) return tell(`Drag the ring at the end of ${where}. STOP stops every arm.`);
@@ -73,6 +77,11 @@ function advise(frame) {
   if (hello.role === "experimenter" && !frame.takes_part) return tell(frame.asks ? "Asking the pages that hold an arm ..." : "You watch. Press “take part” to hold arms and change links.");
   if (hello.role === "experimenter") return tell("Change links and dominance at the side; no arm here can be held.");
   tell(page.stops ? "You watch. STOP or Esc stops every arm." : "You watch.");
+}
+
+function lastResort() { // what stops the arms where this page cannot; only an experimenter has a terminal
+  if (page.hello?.role === "experimenter") return `To stop every arm: trilat stop --session ${page.hello.session}`;
+  return "Let go of your arm, and tell the experimenter.";
 }
 
 function results(paths) { // of a session that this program ran: its report and its log
@@ -91,10 +100,14 @@ setInterval(() => { // what is shown is as old as the newest message; nobody is 
   const now = silent_ms > LATE_MS && Boolean(page.hello);
   if (now) {
     const seconds = Math.floor(silent_ms / 1000);
-    state(`${seconds} s behind`, "bad");
-    const cut = page.frame?.ended ? "The session has ended, and its server with it." : `This page is ${seconds} s behind: what it shows is old, and its buttons are off but for STOP, which may be late.`;
-    tell(page.frame?.ended || socket?.readyState === WebSocket.OPEN ? cut : `This page is ${seconds} s behind and cut off: what it shows is old, and its buttons are off. To stop every arm: trilat stop --session ${page.hello.session}`, page.frame?.ended ? "" : "late");
-    if (page.frame?.ended) state("ended");
+    if (page.frame?.ended) {
+      state("ended");
+      if (!$("todo").querySelector("a")) tell("The session has ended, and its server with it.");
+    } else {
+      state(`${seconds} s behind`, "bad");
+      const old = `This page is ${seconds} s behind: what it shows is old, and its buttons are off`;
+      tell(socket?.readyState === WebSocket.OPEN ? `${old} but for STOP, which may be late.` : `This page is cut off. ${old}. ${lastResort()}`, "late");
+    }
   }
   if (now === late) return enable();
   late = now;
@@ -124,11 +137,12 @@ function begin(hello) {
   if (!hello.running) {
     const missing = hello.missing.length ? `waiting for ${hello.missing.join(", ")}` : "waiting for the session";
     state(hello.here.length && !hello.missing.length ? "about to begin" : missing, "warn");
-    tell(hello.missing.length ? `The session begins when ${hello.missing.join(" and ")} ${hello.missing.length > 1 ? "are" : "is"} there: trilat site ${hello.missing[0]}` : "The session is about to begin.");
+    const start = hello.role === "experimenter" && hello.missing.length ? `: trilat site ${hello.missing[0]}` : ".";
+    tell(hello.missing.length ? `The session begins when ${hello.missing.join(" and ")} ${hello.missing.length > 1 ? "are" : "is"} there${start}` : "The session is about to begin.");
     return;
   }
   page.stops = Object.values(hello.sites).some((site) => site.stops);
-  $("stop").dataset.tip = page.stops ? "stop every arm at once" : 'no arm of this scenario can be stopped: on_stale.action is not "glide"';
+  $("stop").dataset.tip = page.stops ? "stop every arm at once" : "the arms of this scenario stop only at the end of the session";
   enable();
   if (parts !== null) return renew(parts, hello, page.sites);
   page.sites = hello.sites;
@@ -145,7 +159,10 @@ function begin(hello) {
 
 function take(frame) {
   if (parts === null) return;
-  for (const site of Object.values(frame.sites)) for (const key of ["ghost", "hand", "wall", "pull"]) site[key] ??= []; // not known of a peer
+  for (const site of Object.values(frame.sites)) {
+    site.ended ??= frame.ended; // not known of a peer, as what follows
+    for (const key of ["ghost", "hand", "wall", "pull"]) site[key] ??= [];
+  }
   page.frame = frame;
   page.frames += 1;
   if (page.takesPart !== frame.takes_part) {
@@ -160,15 +177,17 @@ function take(frame) {
   page.asked = frame.asked;
   $("ask").hidden = !frame.asked.length;
   if (frame.asked.length) $("ask").firstElementChild.textContent = `page ${frame.asked[0]} asks to take part.`;
-  const silent = parts.names.filter((name) => frame.sites[name].silent);
+  const silent = parts.names.filter((name) => frame.sites[name].silent_s);
   const diverged = parts.names.filter((name) => frame.sites[name].mode === "diverged");
   const stopped = alarms(frame);
-  if (stopped.length) state(stopped.length > 1 ? `${stopped.length} alarms` : stopped[0], "bad");
-  else if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
-  else if (frame.ended) { state("ended"); $("end").hidden = true; }
+  if (diverged.length) state(`${diverged.join(", ")} diverged`, "bad");
+  else if (frame.ended) state("ended");
+  else if (frame.silent_s) state(`silent for ${Math.floor(frame.silent_s)} s, waiting`, "warn");
+  else if (stopped.length) state(stopped.length > 1 ? `${stopped.length} alarms` : stopped[0], "bad");
   else if (silent.length) state(`${silent.join(", ")} silent`, "bad");
   else state("running", "good");
-  for (const { ok, text } of frame.notices) if (!ok) notice(text);
+  if (frame.ended) { $("end").hidden = true; enable(); }
+  for (const { ok, text } of frame.notices) if (!ok && !frame.ended) notice(text);
   if (hidesAt && performance.now() > hidesAt) { $("notice").hidden = true; hidesAt = 0; }
   events(frame.events);
   parts.plots?.take(frame);
@@ -187,47 +206,51 @@ function take(frame) {
 }
 
 let raised = "";
-// What nobody may overlook: of arms that hold, are stopped or in fault the mode, why, and what to do; of those
-// with one reason together, as what to do ends with their names or has none.
+const RELEASES = { enable: "Enable", reset: "Reset" }; // the orders that end an alarm, as buttons name them
+// What nobody may overlook: of arms that hold, are stopped or in fault the mode, why, and what to do; arms with
+// one reason stand together. What ends it is a button for an experimenter, and for others who can end it.
 function alarms(frame) {
   const alike = new Map();
   for (const name of parts?.names || []) {
-    const { word, reason, advice = "" } = frame.sites[name]?.alarm || {};
-    const order = advice.endsWith(` ${name}`) ? advice.slice(0, -name.length) : "";
-    const key = JSON.stringify([word, reason, order || advice]);
+    const { word, reason, advice, order } = frame.sites[name]?.alarm || {};
+    const key = JSON.stringify([word, reason, advice]);
     if (word) alike.set(key, { word, reason, advice, order, names: [...(alike.get(key)?.names || []), name] });
   }
-  const list = [...alike.values()];
+  const list = frame.ended ? [] : [...alike.values()];
   const text = JSON.stringify(list);
   if (text !== raised) {
     raised = text;
-    $("alarms").replaceChildren(...list.map(({ word, reason, advice, order, names }) => {
-      const block = document.createElement("div");
-      const [what, why, act] = ["strong", "span", "code"].map((tag) => block.appendChild(document.createElement(tag)));
-      block.className = ["FAULT", "STOPPED"].includes(word) ? "raised" : "raised mild";
-      what.textContent = `${names.join(", ")} ${word}`;
-      why.textContent = reason;
-      act.textContent = order ? order + names.join(" ") : advice;
-      return block;
-    }));
+    $("alarms").replaceChildren(...list.map(raise));
+    enable();
   }
   return list.map(({ names, word }) => `${names.join(", ")} ${word}`);
 }
 
-const LOUD = ["lost", "left", "unheard", "diverged", "failed", "refused", "clock fault"];
-function describe({ link, dominance, to, at_s: at }) {
-  const shares = () => Object.entries(to).map(([peer, share]) => `${peer} ${share.toFixed(2)}`).join(" + ");
-  const what = link ? `${link.replace("->", " → ")}: ${describeLink(to)}` : `${dominance} follows ${shares()}`;
-  return `${what}, from ${at.toFixed(2)} s on`;
+function raise({ word, reason, advice, order, names }) {
+  const block = document.createElement("div");
+  const add = (tag, words) => Object.assign(block.appendChild(document.createElement(tag)), { textContent: words });
+  block.className = ["FAULT", "STOPPED"].includes(word) ? "raised" : "raised mild";
+  add("strong", `${names.join(", ")} ${word}`);
+  add("span", reason);
+  if (order && page.hello.role !== "experimenter") add("b", "the experimenter lets it follow again");
+  else if (advice) add("b", advice);
+  if (order && page.hello.role === "experimenter") {
+    const button = add("button", RELEASES[order]);
+    button.type = "button";
+    button.dataset.tip = order === "enable" ? "these arms follow their peers again" : "end the fault; these arms follow their peers again";
+    button.addEventListener("click", () => { if (!send({ do: "release", order, sites: names })) notice("not connected: nothing was ordered"); });
+  }
+  return block;
 }
 
+const LOUD = ["lost", "left", "unheard", "diverged", "failed", "refused", "clock fault"];
 function events(list) {
-  for (const { t, member, kind, text, change } of list) {
+  for (const { t, member, kind, text } of list) {
     const item = document.createElement("li");
     const [time, who, what] = ["time", "span", "span"].map((tag) => item.appendChild(document.createElement(tag)));
     time.textContent = t === null ? "" : `${t.toFixed(2)} s`;
     who.textContent = member;
-    what.textContent = change ? describe(change) : text;
+    what.textContent = text.replaceAll("->", " → ");
     if (LOUD.includes(kind)) what.className = "bad";
     $("event-list").prepend(item);
   }
@@ -299,9 +322,9 @@ for (const answer of ["yes", "no"]) {
 }
 function stop() { // of whoever sees the page, whether it takes part or not
   parts?.hands.letGo();
-  if (page.hello?.running && !page.stops) return;
+  if ((page.hello?.running && !page.stops) || page.frame?.ended) return;
   if (send({ do: "stop" })) notice("stopping every arm", 3000);
-  else notice(`not connected: nothing is stopped by this page; trilat stop --session ${page.hello?.session}`, 1e9);
+  else notice(`This page is not connected and has stopped nothing. ${lastResort()}`, 1e9);
 }
 $("stop").addEventListener("pointerdown", stop); // at the press, not when it is let go
 $("stop").addEventListener("click", ({ detail }) => { if (detail === 0) stop(); }); // by a key

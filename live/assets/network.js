@@ -6,7 +6,7 @@ const PRESETS = [["none", 0], ["100 ms", 100], ["300 ms", 300], ["900 ms", 900]]
 const NETWORKS = ["lan", "wifi", "5g", "4g", "geo", "frankfurt-newyork", "frankfurt-bangalore", "london-sydney", "sf-shanghai", "sf-bangalore", "sf-buenos_aires"];
 const number = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
-export function describeLink({ model, preset, delay_ms: delay, deviation_ms: deviation, loss, floor_ms: floor, fast_ms: fast, slow_ms: slow, slow_share: share }) {
+function describeLink({ model, preset, delay_ms: delay, deviation_ms: deviation, loss, floor_ms: floor, fast_ms: fast, slow_ms: slow, slow_share: share }) {
   let text = model;
   if (model === "constant") text = `${delay} ms`;
   else if (model === "none") text = "none";
@@ -114,7 +114,7 @@ export class Network {
     const bow = 13; // the two directions of a pair lie side by side
     const point = (x) => [a[0] + ux * (20 + x * (length - 40)) - uy * bow, a[1] + uy * (20 + x * (length - 40)) + ux * bow];
     const share = Math.max(0, Math.min(1, link.share));
-    const stale = link.age_ms !== null && link.age_ms > 1.6 * (link.stated.delay_ms || 0) + 400;
+    const stale = !frame.ended && link.age_ms !== null && link.age_ms > 1.6 * (link.stated.delay_ms || 0) + 400;
     g.strokeStyle = stale ? css("--bad") : css("--line");
     g.lineWidth = 1.5 + 5 * share;
     g.globalAlpha = share > 0 ? 1 : 0.5;

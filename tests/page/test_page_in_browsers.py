@@ -64,8 +64,8 @@ def test_axe_finds_nothing_serious(
 
 def raise_alarm(site: str, **changed: str) -> dict[str, str]:
     """What a page is told of an arm that was stopped."""
-    advice = f"trilat enable --session t {site}"
-    return {"word": "STOPPED", "reason": "ordered to stop", "advice": advice, **changed}
+    assert site in ("m1", "m2", "s")
+    return {"word": "STOPPED", "reason": "ordered to stop", "advice": "", "order": "enable", **changed}
 
 
 @pytest.mark.parametrize("screen", SCREENS)
@@ -80,12 +80,13 @@ def test_axe_finds_nothing_serious_in_what_is_raised(
     }
     ended = {"ended": True, "results": ["/x/report.html", "/x/run.mcap"], "asked": [2]}
     for scheme in SCHEMES:
-        shown = session.shown(browser, address, "experimenter", screen, scheme, sites=sites, **ended)
-        with shown as page:
-            assert page.locator("#todo a").count() == 2
+        with session.shown(browser, address, "experimenter", screen, scheme, sites=sites, asked=[2]) as page:
             assert "m1, m2, s STOPPED" in page.inner_text("#alarms .raised")
-            assert "trilat enable --session t m1 m2 s" in page.inner_text("#alarms .raised")
+            assert page.inner_text("#alarms button") == "Enable"
             assert page.inner_text("#state") == "m1, m2, s STOPPED"
+            assert grave_findings(page) == []
+        with session.shown(browser, address, "experimenter", screen, scheme, **ended) as page:
+            assert page.locator("#todo a").count() == 2
             assert grave_findings(page) == []
 
 
@@ -94,7 +95,9 @@ def test_alarms_of_one_reason_are_raised_together(
 ) -> None:
     alarms = {
         "m1": raise_alarm("m1"),
-        "m2": raise_alarm("m2", word="HOLD", reason="s is silent", advice="it goes on once it is heard"),
+        "m2": raise_alarm(
+            "m2", word="HOLD", reason="s is silent", advice="it goes on once it is heard", order=""
+        ),
         "s": raise_alarm("s"),
     }
     newest = session.frames["experimenter"][-1]["sites"]
@@ -102,7 +105,7 @@ def test_alarms_of_one_reason_are_raised_together(
     with session.shown(browser, address, "experimenter", "desktop", "light", sites=sites) as page:
         raised = [one.inner_text().split("\n") for one in page.locator("#alarms .raised").all()]
         assert raised == [
-            ["m1, s STOPPED", "ordered to stop", "trilat enable --session t m1 s"],
+            ["m1, s STOPPED", "ordered to stop", "Enable"],
             ["m2 HOLD", "s is silent", "it goes on once it is heard"],
         ]
         assert page.inner_text("#state") == "2 alarms"

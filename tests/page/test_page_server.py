@@ -325,7 +325,7 @@ def test_any_page_stops_every_arm_past_what_waits_for_answer(
         until(changes.poll)  # nobody answers
         second.send('{"do":"stop"}')
         query = until(stops.poll)
-        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop")
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop", source="the experimenter")
         second.send('{"do":"shares","site":"s","to":{"m1":1.0}}')
         until(lambda: server.refused["does not take part"] == 1)
 
@@ -438,7 +438,8 @@ def test_users_and_watchers_give_no_orders_but_stop(
         assert {reason: server.refused[reason] for reason in counted} == counted
         page.send('{"do":"stop"}')
         query = until(stops.poll)
-        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop")
+        source = "the user of m1" if who == "user m1" else "a watcher"
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop", source=source)
     assert changes.poll() is None
     assert not server.end_requested.is_set()
 

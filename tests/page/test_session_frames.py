@@ -130,7 +130,7 @@ def test_a_user_is_told_nothing_that_it_cannot_know(tmp_path: Path) -> None:
     for frame in frames:
         assert {*frame["sites"]["s"]} == {*frame["sites"]["m2"]} == KNOWN_OF_PEERS - {"age_ms"}
         assert frame["links"] == frame["shares"] == {}
-        assert {*frame} == {"t", "sites", "links", "shares", "energy", "ended"}
+        assert {*frame} == {"t", "sites", "links", "shares", "energy", "ended", "silent_s"}
     assert frames
 
 

@@ -340,7 +340,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         "links": {use.name: _describe_link(log, use) for use in summarise_links(log)},
         "changes": [
             {"at_s": one.change.at_s, "about": one.about, "to": one.text}
-            | {"site": one.site, "taken_at_tick": one.taken_at_tick}
+            | {"site": one.site, "taken_at_tick": one.taken_at_tick, "sentence": one.sentence}
             for one in list_changes(log)
         ],
     }

@@ -12,23 +12,30 @@ import numpy as np
 
 from ..core.session_life import HELD_OVERRUN_TICKS
 from ..core.ticks import find_alarm
+from ..log.event_text import describe_event
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..net.messages import MODES, ModeMeaning
 from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
+from ..scenario.run_changes import describe_change
 from ..scenario.scenario_types import Change
 
 
 class AppliedChange(NamedTuple):
     """A change of a link or of a site's dominance factors, or an order, and the site that carried it out.
 
-    `taken_at_tick` is the tick whose record names it; None for a change of the scenario.
+    Attributes:
+        change: what was changed or ordered, and when.
+        site: who carried it out.
+        taken_at_tick: the tick whose record names it; None for a change of the scenario.
+        sentence: what people are told of it, with who asked for it as far as the log knows.
     """
 
     change: Change
     site: str
     taken_at_tick: int | None
+    sentence: str
 
     @property
     def about(self) -> str:
@@ -75,11 +82,17 @@ def list_changes(log: Log) -> list[AppliedChange]:
     Raises:
         LogError: a record names a change that is none.
     """
-    found = [AppliedChange(change, find_owner(change), None) for change in log.scenario.timeline]
+    planned = log.scenario.timeline
+    found = [AppliedChange(change, find_owner(change), None, describe_change(change)) for change in planned]
+    said = {(event.member, event.command): event for event in log.events if event.kind == "change"}
     for site in log.sites:
         log.commands(site)  # refuses what is no change of that site's
         for tick, texts in log.changes(site).items():
-            found += [AppliedChange(msgspec.json.decode(text, type=Change), site, tick) for text in texts]
+            for text in texts:
+                change = msgspec.json.decode(text, type=Change)
+                event = said.get((site, text))
+                sentence = describe_change(change) if event is None else describe_event(event)
+                found.append(AppliedChange(change, site, tick, sentence))
     before_s = recorded_end_s(log)
     kept = (c for c in found if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS)
     return sorted(kept, key=lambda changed: changed.change.at_s)

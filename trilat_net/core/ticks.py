@@ -301,20 +301,24 @@ class LifeAlarm(NamedTuple):
     Attributes:
         word: the mode, in capitals.
         reason: why.
-        advice: what to do.
+        advice: what to do, at a terminal.
+        order: the order that ends it, "enable" or "reset", where a page has a button for it; "" if none does.
+        before: what has to be done before that order, a clause that ends in ", then"; "" if nothing.
     """
 
     word: str
     reason: str
     advice: str
+    order: str = ""
+    before: str = ""
 
     def __str__(self) -> str:
         return f"{self.word}: {self.reason}; {self.advice}"
 
 
 _REMEDIES = {
-    LifeReason.LIMIT_Q: "bring the joint back within its limits, then ",
-    LifeReason.ARM_SILENT: "let the program of the arm send again, then ",
+    LifeReason.LIMIT_Q: "bring the joint back within its limits, then",
+    LifeReason.ARM_SILENT: "let the program of the arm send again, then",
 }
 _ONCE_HEARD = "it goes on by itself once all its peers are heard"
 
@@ -332,21 +336,21 @@ def find_alarm(
         return None
     if mode not in ("fault", "stopped", "hold") and (mode, reason) != ("waiting", LifeReason.ALIGN_LIMIT):
         names = ", ".join(lost)
-        advice = f"start {names} again: the share comes back by itself"
+        advice = f"the share comes back by itself once {names} is there again"
         return LifeAlarm(f"WITHOUT {names}", "the others have its share", advice) if lost else None
-    if mode == "fault":
-        advice = f"{_REMEDIES.get(reason, '')}trilat reset --session {session} {site}"
-    elif mode == "stopped":
-        advice = f"trilat enable --session {session} {site}"
-    else:
-        advice = _ONCE_HEARD
+    order = {"fault": "reset", "stopped": "enable"}.get(mode, "")
+    if reason is LifeReason.RELEASED:  # the dead-man switch ends it, and no order
+        order = ""
+    before = _REMEDIES.get(reason, "") if mode == "fault" else ""
+    advice = f"{before} trilat {order} --session {session} {site}".lstrip() if order else _ONCE_HEARD
     advice = {
         (mode, LifeReason.RELEASED): "hold the switch",
         ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
         ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
         ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
     }.get((mode, reason), advice)
-    return LifeAlarm(mode.upper(), _REASONS.get(reason, reason.name.lower().replace("_", " ")), advice)
+    why = _REASONS.get(reason, reason.name.lower().replace("_", " "))
+    return LifeAlarm(mode.upper(), why, advice, order, before)
 
 
 def describe_mode(

@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 
+import msgspec
+from msgspec import UNSET
+
 from ..errors import ScenarioError, SessionError, UsageError, WireError
 from . import topics
 from .bus import Bus
@@ -129,9 +132,13 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
         whose = "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
         raise SessionError(f"{site} gave no answer; its records show whether it made the change{whose}")
     try:
-        return decode(reply, ChangeReply)
+        answer = decode(reply, ChangeReply)
     except WireError as error:
         raise SessionError(f"the answer of {site} cannot be read: {error}") from None
+    if request.order == "stop" and not answer.accepted and request.source is not UNSET:
+        # A site of an older program knows no source and refuses the whole request; its arm has to stop too.
+        return send_change(bus, clock, session, site, msgspec.structs.replace(request, source=UNSET))
+    return answer
 
 
 def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:

@@ -9,7 +9,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
@@ -44,6 +44,10 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
     It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`; or `stop_s`, the
     time since the epoch, s, before which the site's last tick lies; or `mark`, a text for the log; or an
     `order`, which the site carries out in its next tick.
+
+    Attributes:
+        source: who asks for it, for people: a noun phrase such as "the experimenter", which the site's event
+            repeats. A request without it has the bytes of a program that knows no such field.
     """
 
     link: str = ""
@@ -53,6 +57,7 @@ class ChangeRequest(Request, frozen=True, kw_only=True):
     stop_s: Annotated[float, Meta(ge=0.0, le=1e6)] | None = None
     mark: Annotated[str, Meta(max_length=80)] = ""
     order: OrderName = ""
+    source: Annotated[str, Meta(max_length=64)] | UnsetType = UNSET
 
 
 class ChangeReply(Request, frozen=True, kw_only=True):

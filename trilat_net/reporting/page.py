@@ -343,11 +343,11 @@ def _render_changes(facts: JsonObject) -> str:
     rows = []
     for n, changed in enumerate(facts["changes"], 1):
         tick = changed["taken_at_tick"]
-        by = "scenario" if tick is None else f"ordered, taken in at tick {tick} of {changed['site']}"
-        about, to = (escape(typeset(changed[key])) for key in ("about", "to"))
-        rows.append([str(n), about, _format_cell(changed["at_s"]), to, escape(by)])
-    headers = ("no.", "what", "from (s)", "becomes", "by")
-    return _render_table(headers, rows, words=[1, 3, 4]) if rows else ""
+        origin = "scenario" if tick is None else f"order, taken in at tick {tick} of {changed['site']}"
+        sentence = escape(typeset(changed["sentence"]))
+        rows.append([str(n), _format_cell(changed["at_s"]), sentence, escape(origin)])
+    headers = ("no.", "from (s)", "what happened", "origin")
+    return _render_table(headers, rows, words=[2, 3]) if rows else ""
 
 
 def _render_modes(log: Log, facts: JsonObject) -> str:

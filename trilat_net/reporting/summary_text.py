@@ -88,12 +88,12 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def format_change_lines(log: Log) -> list[str]:
-    """Returns a line per change of a link or of a site's shares."""
+    """Returns a line for each order to a site, and each change of a link or of a site's shares."""
     lines = []
     for changed in list_changes(log):
         tick = changed.taken_at_tick
-        how = "" if tick is None else f", ordered at tick {tick}"
-        lines.append(f"change at {changed.change.at_s:g} s{how}: {changed.about}: {changed.text}")
+        origin = "by the scenario" if tick is None else f"taken in at tick {tick}"
+        lines.append(f"change: {changed.sentence} ({origin})")
     return _first(lines)
 
 

@@ -78,6 +78,41 @@ def make_site_order(scenario: Scenario, site: str, order: SiteOrder, from_ns: in
     return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
 
 
+_ORDER_SENTENCES = {
+    "stop": "{site} was stopped{by} at {at}",
+    "enable": "{site} was enabled{by} at {at}",
+    "reset": "the fault of {site} was reset{by} at {at}",
+    "held": "the dead-man switch of {site} was held again at {at}",
+    "released": "the dead-man switch of {site} was released at {at}",
+    "arm_silent": "no measurement came from the arm of {site} at {at}",
+    "arm_lost": "the arm of {site} was silent for too long at {at}",
+    "arm_back": "measurements came again from the arm of {site} at {at}",
+    "overrun": "{site} missed {ticks} {noun} before {at}",
+}
+"""What people are told of each order to a site."""
+
+
+def describe_change(change: Change, ordered_by: str = "") -> str:
+    """Returns a change in a sentence without a full stop, as "m2 was stopped by the experimenter at 58.2 s".
+
+    Args:
+        change: an order to a site, a change of a link, or one of a row of shares.
+        ordered_by: who asked for it, a noun phrase; "" if nobody knows.
+    """
+    by = f" by {ordered_by}" if ordered_by else ""
+    if change.order:
+        at = f"{change.at_s:.1f} s"
+        noun = "tick" if change.ticks == 1 else "ticks"
+        sentence = _ORDER_SENTENCES[change.order]
+        return sentence.format(site=change.site, by=by, at=at, ticks=change.ticks, noun=noun)
+    at = f"{round(change.at_s, 3):g} s"
+    if change.link:
+        return f"the link {change.link} was set to {change.after.describe()}{by}, from {at} on"
+    shares = ", ".join(f"{peer} {share:g}" for peer, share in change.to.items() if share)
+    within = f" within {change.ramp_s:g} s" if change.ramp_s else ""
+    return f"the shares of {change.dominance} were set to {shares or 'nobody'}{within}{by}, from {at} on"
+
+
 def count_skipped_ticks(texts: Sequence[str]) -> int:
     """Returns how many ticks before its own a record says that its site did not make, by its changes."""
     skipped = 0
