@@ -146,6 +146,7 @@ function begin(hello) {
   enable();
   if (parts !== null) return renew(parts, hello, page.sites);
   page.sites = hello.sites;
+  document.body.classList.add("begun"); // before its parts ask for their sizes
   const names = Object.keys(hello.sites);
   const arms = new Arms($("arms"), hello, (text) => { $("painter").textContent = text; });
   const hands = new Hands(arms, hello, send, page, stop);

@@ -6,7 +6,7 @@ const PRESETS = [["none", 0], ["100 ms", 100], ["300 ms", 300], ["900 ms", 900]]
 const NETWORKS = ["lan", "wifi", "5g", "4g", "geo", "frankfurt-newyork", "frankfurt-bangalore", "london-sydney", "sf-shanghai", "sf-bangalore", "sf-buenos_aires"];
 const number = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 
-function describeLink({ model, preset, delay_ms: delay, deviation_ms: deviation, loss, floor_ms: floor, fast_ms: fast, slow_ms: slow, slow_share: share }) {
+function describeLink({ model, delay_ms: delay, deviation_ms: deviation, loss, floor_ms: floor, fast_ms: fast, slow_ms: slow, slow_share: share }) {
   let text = model;
   if (model === "constant") text = `${delay} ms`;
   else if (model === "none") text = "none";

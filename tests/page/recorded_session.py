@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,15 @@ from tests.net.waiting import until
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.net.bus import Bus
-from trilat_net.scenario import load_scenario
+from trilat_net.scenario import Scenario, load_scenario
+
+from .whole_pages import WatchedPage, watched_page
 
 SCREENS: dict[str, dict[str, Any]] = {
     "desktop": {"viewport": {"width": 1440, "height": 900}},
     "phone": {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True},
 }
-QUERIES = {"experimenter": "", "user": "?as=m1", "watcher": "?watch"}
+ROLES = ("experimenter", "user", "watcher")
 _ABOUT_PAGES = {
     "notices": [],
     "ages": True,
@@ -43,11 +46,13 @@ class RecordedSession:
     """Hellos and frames of every role.
 
     Attributes:
+        user: site of the user's page.
         cut: true: pages get nothing more.
     """
 
+    user: str = "m1"
     hellos: dict[str, Json] = field(default_factory=dict)
-    frames: dict[str, list[Json]] = field(default_factory=dict)
+    frames: dict[str, list[Json]] = field(default_factory=lambda: {role: [] for role in ROLES})
     cut: bool = False
 
     @contextmanager
@@ -59,6 +64,14 @@ class RecordedSession:
         Args:
             last: what the last frame has besides.
         """
+        with self.watched(browser, address, role, screen, scheme, **last) as watched:
+            yield watched.page
+
+    @contextmanager
+    def watched(
+        self, browser: Browser, address: str, role: str, screen: str, scheme: str, **last: Any
+    ) -> Iterator[WatchedPage]:
+        """The same page with the means to check it; at its end it has had no error."""
         *before, end = self.frames[role]
         frames = chain(before, repeat({**end, **last, "points": [], "energies": [], "events": []}))
 
@@ -70,54 +83,66 @@ class RecordedSession:
             route.on_message(answer)
             route.send(json.dumps({"hello": self.hellos[role]}))
 
-        context = browser.new_context(color_scheme=scheme, **SCREENS[screen])
-        try:
-            page = context.new_page()
+        query = {"experimenter": "", "user": f"?as={self.user}", "watcher": "?watch"}[role]
+        with watched_page(browser, color_scheme=scheme, **SCREENS[screen]) as watched:
+            page = watched.page
             page.route_web_socket("**/socket*", send)
-            page.goto(address + QUERIES[role])
+            page.goto(address + query)
             newest = self.frames[role][-1]["n"]
             until(lambda: page.evaluate("window.trilat?.frame?.n") == newest, 60.0)
             page.evaluate("new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))")
-            yield page
-        finally:
-            context.close()
+            yield watched
 
 
 def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
     """Returns a session at 300 ms in which somebody leads m1."""
     scenario = load_scenario("play", {"duration_s": duration_s, "rate_hz": 200, "link.delay_ms": 300})
-    found = RecordedSession(frames={role: [] for role in QUERIES})
+    return record_views(Session.whole(scenario, folder), "m1", leads=True)
 
-    def look(bus: Bus, clock: RelayClock) -> None:
-        view = SessionView(bus, clock, SESSION)
-        pages = SessionFrames(view)
-        hand = open_hand(bus, clock, SESSION, "m1", scenario, "Ada")
-        points = energies = events = n = 0
-        while not view.ended:
-            view.poll()
-            if (frame := pages.make()) is not None and 1.0 < frame["t"] < duration_s - 0.2:
-                n += 1
-                turn = 2.0 * frame["t"]
-                hand.move(1.0 + 0.15 * math.sin(turn), 0.6 + 0.25 * math.cos(turn))
-                added = {
-                    "points": pages.points.since(points, 10_000),
-                    "energies": pages.energies.since(energies, 10_000),
-                    "events": [show_event(event) for event in view.events.since(events, 100)],
-                }
-                points, energies, events = pages.points.count, pages.energies.count, view.events.count
-                every = {"n": n, **_ABOUT_PAGES}
-                nothing: Json = {key: [] for key in added}
-                known = pages.narrow(frame, "m1", ages=True)
-                found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
-                found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
-                found.frames["user"].append({**every, **known, **nothing, "takes_part": True})
-                about, narrow = pages.describe(), pages.describe_narrowed()
-                for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
-                    who = {"role": role, "as": "m1" if role == "user" else "", "ends": role == "experimenter"}
-                    found.hellos[role] = {**of, **who, "n": 0}
-            clock.sleep_until(clock.monotonic_ns() + 33_333_333)
 
-    session = Session.whole(scenario, folder)
-    session.stranger(look)
-    session.run()
+def record_views(session: Session, user: str, *, leads: bool = False) -> RecordedSession:
+    """Runs a session and returns what pages of every role would be sent of it.
+
+    Args:
+        session: the session, with its sites and its recorder.
+        user: site of the user's page.
+        leads: true: somebody leads that site's arm by a live hand.
+    """
+    found = RecordedSession(user)
+    scenario = session.scenario
+    session.stranger(partial(_record, found, scenario, leads=leads))
+    session.play()
     return found
+
+
+def _record(found: RecordedSession, scenario: Scenario, bus: Bus, clock: RelayClock, *, leads: bool) -> None:
+    view = SessionView(bus, clock, SESSION)
+    pages = SessionFrames(view)
+    hand = open_hand(bus, clock, SESSION, found.user, scenario, "Ada") if leads else None
+    points = energies = events = n = 0
+    while not view.ended:
+        view.poll()
+        frame = pages.make()
+        if frame is not None and 1.0 < frame["t"] < scenario.duration_s - 0.2:
+            n += 1
+            turn = 2.0 * frame["t"]
+            if hand is not None:
+                hand.move(1.0 + 0.15 * math.sin(turn), 0.6 + 0.25 * math.cos(turn))
+            added = {
+                "points": pages.points.since(points, 10_000),
+                "energies": pages.energies.since(energies, 10_000),
+                "events": [show_event(event) for event in view.events.since(events, 100)],
+            }
+            points, energies, events = pages.points.count, pages.energies.count, view.events.count
+            every = {"n": n, **_ABOUT_PAGES}
+            nothing: Json = {key: [] for key in added}
+            known = pages.narrow(frame, found.user, ages=True)
+            found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
+            found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
+            found.frames["user"].append({**every, **known, **nothing, "takes_part": True})
+            about, narrow = pages.describe(), pages.describe_narrowed()
+            for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
+                site = found.user if role == "user" else ""
+                who = {"role": role, "as": site, "ends": role == "experimenter"}
+                found.hellos[role] = {**of, **who, "n": 0}
+        clock.sleep_until(clock.monotonic_ns() + 33_333_333)

@@ -15,7 +15,7 @@ from tests.live.browsers import launch, needs_browser, tip_px
 from tests.net.local_bus import LocalNetwork
 from trilat_net.net.clock import SystemClock
 
-from .recorded_session import QUERIES, SCREENS, RecordedSession, record_session
+from .recorded_session import ROLES, SCREENS, RecordedSession, record_session
 
 pytestmark = [needs_browser, pytest.mark.long]
 
@@ -50,7 +50,7 @@ def grave_findings(page: Page) -> list[str]:
     return [f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}" for one in grave]
 
 
-@pytest.mark.parametrize("role", QUERIES)
+@pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("screen", SCREENS)
 def test_axe_finds_nothing_serious(
     session: RecordedSession, address: str, browser: Browser, role: str, screen: str
@@ -112,7 +112,7 @@ def test_alarms_of_one_reason_are_raised_together(
 
 
 def test_arms_have_half_of_the_window(session: RecordedSession, address: str, browser: Browser) -> None:
-    for role in QUERIES:
+    for role in ROLES:
         with session.shown(browser, address, role, "desktop", "light") as page:
             box = page.locator("#arms").bounding_box()
             assert box is not None
@@ -129,7 +129,7 @@ SMALL = """[...document.querySelectorAll("button, select, input, a")]
 def test_a_phone_shows_arms_first_and_targets_of_44_px(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
-    for role in QUERIES:
+    for role in ROLES:
         with session.shown(browser, address, role, "phone", "light") as page:
             arms, stop = (page.locator(part).bounding_box() for part in ("#arms", "#stop"))
             assert arms is not None
