@@ -124,7 +124,8 @@ class Stage:
         self._asked: Asked | None = None
         self._watch: TrialWatch | None = None
         self._step: Step | None = None
-        self._phase, self._told = "checking", dict[str, Any]()
+        self._phase = "checking"
+        self._told: Json = {"why": "", "measures": {}}
         self._holders: dict[str, int] = {}
         self._seen_ns: dict[str, int] = {}
 

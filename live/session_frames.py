@@ -198,7 +198,8 @@ class SessionFrames:
         if scenario is None or not view.running:
             here = sorted(view.met)
             sites = [] if scenario is None else [name for name in scenario.names if name not in view.met]
-            return {"running": False, "session": view.session, "here": here, "missing": sites}
+            waiting = {"running": False, "title": "", "here": here, "missing": sites}
+            return {"session": view.session, **waiting}
         links = {name: list(name.split("->")) for name in scenario.links}
         return {
             "running": True,

@@ -12,6 +12,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, Page, WebSocketRoute
 
+from live.experiment_stage import Stage
 from live.session_frames import SessionFrames, show_event
 from live.session_view import SessionView
 from sites.running_session import open_hand
@@ -38,6 +39,8 @@ _ABOUT_PAGES = {
     "refused": 0,
     "results": [],
 }
+_PAGES = {"user": 1, "experimenter": 8, "watcher": 9}
+"""Number of the page of each role."""
 Json = dict[str, Any]
 
 
@@ -100,22 +103,33 @@ def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
     return record_views(Session.whole(scenario, folder), "m1", leads=True)
 
 
-def record_views(session: Session, user: str, *, leads: bool = False) -> RecordedSession:
+def record_views(
+    session: Session, user: str, *, leads: bool = False, stage: Stage | None = None
+) -> RecordedSession:
     """Runs a session and returns what pages of every role would be sent of it.
 
     Args:
         session: the session, with its sites and its recorder.
         user: site of the user's page.
         leads: true: somebody leads that site's arm by a live hand.
+        stage: of an experiment, of which the session is a trial.
     """
     found = RecordedSession(user)
     scenario = session.scenario
-    session.stranger(partial(_record, found, scenario, leads=leads))
+    session.stranger(partial(_record, found, scenario, leads=leads, stage=stage))
     session.play()
     return found
 
 
-def _record(found: RecordedSession, scenario: Scenario, bus: Bus, clock: RelayClock, *, leads: bool) -> None:
+def _record(
+    found: RecordedSession,
+    scenario: Scenario,
+    bus: Bus,
+    clock: RelayClock,
+    *,
+    leads: bool,
+    stage: Stage | None,
+) -> None:
     view = SessionView(bus, clock, SESSION)
     pages = SessionFrames(view)
     hand = open_hand(bus, clock, SESSION, found.user, scenario, "Ada") if leads else None
@@ -123,6 +137,8 @@ def _record(found: RecordedSession, scenario: Scenario, bus: Bus, clock: RelayCl
     while not view.ended:
         view.poll()
         frame = pages.make()
+        if stage is not None:
+            stage.poll(view, [(site, n) for n, site in enumerate(stage.users, 1)])
         if frame is not None and 1.0 < frame["t"] < scenario.duration_s - 0.2:
             n += 1
             turn = 2.0 * frame["t"]
@@ -144,5 +160,9 @@ def _record(found: RecordedSession, scenario: Scenario, bus: Bus, clock: RelayCl
             for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
                 site = found.user if role == "user" else ""
                 who = {"role": role, "as": site, "ends": role == "experimenter"}
-                found.hellos[role] = {**of, **who, "n": 0}
+                staged: Json = {}
+                if stage is not None:
+                    staged = {"stage": stage.describe(role, site, _PAGES[role], frame["t"])}
+                found.frames[role][-1].update(staged)
+                found.hellos[role] = {**of, **who, **staged, "n": 0}
         clock.sleep_until(clock.monotonic_ns() + 33_333_333)

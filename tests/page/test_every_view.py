@@ -1,9 +1,10 @@
-"""Every view of the live page with data of every kind: no error, no empty frame, every line of every plot drawn."""
+"""Every view of the live page with data of every kind: no error, no empty frame, every line drawn."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
@@ -22,9 +23,8 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment
-from trilat_net.studies.experiment.trial_run import ExperimentTrial
+from trilat_net.studies.experiment.trial_run import ExperimentTrial, SyntheticTrial
 
-from .people import NO_SESSION
 from .recorded_session import ROLES, RecordedSession, record_session, record_views
 from .whole_pages import watched_page
 
@@ -40,17 +40,16 @@ OF_LINKS = {name for model in DELAY_MODELS.values() for name in model.__struct_f
 def list_optional_fields(session: RecordedSession, role: str) -> list[str]:
     """Patterns of the fields that a page of a role may read although its frames lack them.
 
-    A message is a hello or a frame. A stage belongs to an experiment. A link has the fields of its model. A user's page
-    gets all fields of its own site, and of the other sites what the user is shown of them.
+    A message is a hello or a frame. A stage belongs to an experiment. A link has the fields of its
+    model. A user's page gets all fields of its own site, and of the other sites what the user is
+    shown of them.
     """
     own = {"age_ms", *OF_A_HAND, *session.frames[role][-1]["sites"][session.user]}
     links = [f"links.*.stated.{name}" for name in OF_LINKS]
-    changes = [f"events[[]].change.to.{name}" for name in OF_LINKS]
-    kinds = [f"events[[]].change.{name}" for name in ("link", "dominance")]
-    return ["hello", "hello.stage", "stage", *(f"sites.*.{name}" for name in own), *links, *changes, *kinds]
+    return ["hello", "hello.stage", "stage", *(f"sites.*.{name}" for name in own), *links]
 
 
-def give_orders(orders: dict[float, str], bus: Bus, clock: Clock) -> None:
+def give_orders(orders: Mapping[float, str], bus: Bus, clock: Clock) -> None:
     """Orders sites of a running session, at times after its start, s."""
     begun_ns = clock.monotonic_ns()
     for at_s, order in orders.items():
@@ -58,7 +57,7 @@ def give_orders(orders: dict[float, str], bus: Bus, clock: Clock) -> None:
         reached(bus, clock).order(["s"], order)
 
 
-def record(scenario: Scenario, user: str, orders: dict[float, str] = {}) -> Views:
+def record(scenario: Scenario, user: str, orders: Mapping[float, str] = {}) -> Views:
     """Returns what records the views of a session, in which the slave may be given orders."""
 
     def run(folder: Path) -> RecordedSession:
@@ -175,3 +174,105 @@ questionnaires = [
 rest_s = 30
 feedback = ["completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m"]
 """
+OF_A_STAGE = (
+    "key", "users", "appeared", "second", "done", "left_s", "rest_s", "who", "number", "way",
+    "told.succeeded", "form.ends.*",
+)  # fmt: skip
+"""Fields of a stage that depend on the phase, on the role and on what the protocol asks for."""
+OF_STAGED_PAGES = ["hello", *(f"{place}.{name}" for place in ("stage", "hello.stage") for name in OF_A_STAGE)]
+PHASES = ("no step", "consent", "invitation", "rest", "success", "failure", "repetition", "starting",
+          "checking", "sliders", "buttons", "over")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    folder = tmp_path_factory.mktemp("experiment")
+    file = write_protocol(folder, '["m1", "m2"]')
+    file.write_text(file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8")
+    return begin_experiment(file, folder / "out")
+
+
+def set_phase(stage: Stage, experiment: Experiment, phase: str, clock: Clock, folder: Path) -> None:
+    """Brings a stage to a phase."""
+    plan = experiment.plan
+    steps = {
+        (step.kind, step.form.name if step.form else ""): step for step in reversed(list(plan.list_steps()))
+    }
+    trial = steps["trial", ""]
+    if phase in ("success", "failure"):
+        made = SyntheticTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
+        entry = made.write(folder / "log.mcap")
+        stage.tell(msgspec.structs.replace(entry, succeeded=phase == "success"))
+    if phase == "repetition":
+        stage.tell(None, "an arm was stopped")
+    if phase == "starting":
+        stage.ask(trial)
+        stage.begin(TrialWatch(watched_trial(experiment), clock))
+    elif phase == "checking":
+        stage.ask(trial)
+        stage.check()
+    elif phase == "over":
+        stage.close()
+    elif phase != "no step":
+        step = {
+            "consent": ("consent", ""),
+            "sliders": ("questionnaire", "tlx"),
+            "buttons": ("questionnaire", "trust"),
+        }
+        stage.ask(steps[step.get(phase, ("trial", ""))], rest_s=30.0 if phase == "rest" else 0.0)
+
+
+def watched_trial(experiment: Experiment) -> ExperimentTrial:
+    plan = experiment.plan
+    return ExperimentTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
+
+
+STAGED_VIEWS = {"participant": "?as=m1", "experimenter": "", "watcher": "?watch"}
+
+
+@pytest.mark.parametrize(
+    "phase", [pytest.param(phase, marks=() if phase == "sliders" else pytest.mark.long) for phase in PHASES]
+)
+def test_stage_between_trials_has_no_empty_frame(
+    phase: str, experiment: Experiment, browser: Browser, tmp_path: Path
+) -> None:
+    clock = SystemClock()
+    stage = Stage(experiment.plan, clock)
+    set_phase(stage, experiment, phase, clock, tmp_path)
+    with PageServer(LocalNetwork().join(), clock, "idle", stage=stage) as server:
+        for view, query in STAGED_VIEWS.items():
+            with watched_page(browser) as watched:
+                page = watched.page
+                page.goto(server.address + query)
+                page.wait_for_function("window.trilat?.hello?.stage !== undefined")
+                watched.assert_whole(OF_STAGED_PAGES)
+                assert page.is_visible("#sheet") == (view == "participant")
+                if page.locator("#sheet button.main:enabled").count():
+                    page.click("#sheet button.main")
+                    watched.assert_whole(OF_STAGED_PAGES)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        "reach",
+        pytest.param("apart", marks=pytest.mark.long),
+        pytest.param("corridor", marks=pytest.mark.long),
+    ],
+)
+def test_stage_in_a_trial_draws_everything(task: str, browser: Browser, address: str, tmp_path: Path) -> None:
+    text = {"reach": REACH, "apart": APART, "corridor": f"{REACH}\ncorridor_m = 0.03"}[task]
+    experiment = begin_experiment(write_protocol(tmp_path, '["m1", "m2"]', text), tmp_path / "out")
+    clock = ManualClock(1)
+    stage = Stage(experiment.plan, clock)
+    stage.ask(next(step for step in experiment.plan.list_steps() if step.kind == "trial"))
+    trial = watched_trial(experiment)
+    stage.begin(TrialWatch(trial, clock))
+    (tmp_path / "log").mkdir()
+    session = record_views(Session.whole(trial.scenario, tmp_path / "log", ends={}), "m1", stage=stage)
+    for role in ROLES:
+        with session.watched(browser, address, role, "desktop", "light") as watched:
+            optional = [*list_optional_fields(session, role), *OF_STAGED_PAGES]
+            watched.assert_whole(optional)
+            assert watched.page.is_visible("#stage")
+            assert not watched.page.is_visible("#sheet")

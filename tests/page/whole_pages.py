@@ -43,10 +43,13 @@ class WatchedPage:
         Args:
             unsent: patterns of fields that the page may read although nobody has sent them.
         """
-        assert self.errors == []
-        assert self.page.evaluate("observed.faults()") == []
-        read: list[str] = self.page.evaluate("observed.unsent()")
-        assert [name for name in read if not any(fnmatch(name, one) for one in unsent)] == []
+        faults: list[str] = [*self.errors, *self.page.evaluate("observed.faults()")]
+        faults += [
+            f"a script reads {name}, which nobody has sent"
+            for name in self.page.evaluate("observed.unsent()")
+            if not any(fnmatch(name, pattern) for pattern in unsent)
+        ]
+        assert not faults, "\n".join(faults)
 
 
 @contextmanager
