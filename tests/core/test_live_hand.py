@@ -23,7 +23,9 @@ from trilat_net.core.live_hand import (
     HandMemory,
     HandRules,
     HandStep,
+    Reach,
     advance_hand,
+    find_stopping_speed,
     free_hand,
 )
 
@@ -167,3 +169,103 @@ def test_a_grip_never_jumps_and_its_target_keeps_its_limit(messages: Any) -> Non
             moved = math.dist(before.target, now.target)
             assert moved <= 1.5e-3 + 1e-12
     assert all(math.isfinite(x) for hand in steps for x in (*hand.target, *hand.rate, hand.grip))
+
+
+# The acceleration of a target
+
+LIMIT_M_S2 = 20.0
+LIMITED = RULES._replace(acceleration_limit=LIMIT_M_S2)
+H_S = 1e-3
+
+
+@given(
+    speed=st.floats(1e-6, 10.0), acceleration=st.floats(0.1, 100.0), h_s=st.sampled_from([1e-4, 1e-3, 5e-3])
+)
+def test_the_way_from_the_stopping_speed_is_the_distance(
+    speed: float, acceleration: float, h_s: float
+) -> None:
+    """Eq. (L1): the ways of ticks at v, v - a h, ... add up to the distance whose stopping speed v is."""
+    step = acceleration * h_s
+    ways = [h_s * (speed - n * step) for n in range(int(speed / step) + 1)]
+    assert find_stopping_speed(sum(ways), acceleration, h_s) == pytest.approx(speed, rel=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
+def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
+    """Also where one lets go, is silent, or takes hold of a grip that fades."""
+    steps = hands(run(messages, 600, LIMITED))
+    assert all(math.hypot(*now.rate) <= 1.5 + 1e-9 for now in steps)
+    for before, now in pairwise(steps):
+        if now.grip > 0.0 and before.grip > 0.0:
+            assert math.dist(before.rate, now.rate) <= LIMIT_M_S2 * H_S + 1e-12
+            moved = [x + v * H_S for x, v in zip(before.target, before.rate, strict=True)]
+            assert now.target == pytest.approx(moved, abs=1e-12)
+
+
+@settings(max_examples=12, deadline=None)
+@given(goal=st.tuples(st.floats(-1.0, 3.0), st.floats(-1.0, 2.0)), limit=st.floats(5.0, 200.0))
+def test_target_comes_to_rest_at_still_goal_without_overshoot(
+    goal: tuple[float, float], limit: float
+) -> None:
+    rules = RULES._replace(acceleration_limit=limit)
+    way = [x - start for x, start in zip(goal, ARM, strict=True)]
+    distance = math.hypot(*way)
+    # a hand repeats its last message while nothing changes
+    messages = {k: at(k, goal, n=0)[k] for k in range(0, 3000, 50)}
+    steps = hands(run(messages, 3000, rules))
+    for now in steps:
+        moved = [x - start for x, start in zip(now.target, ARM, strict=True)]
+        along = sum(a * b for a, b in zip(moved, way, strict=True)) / max(distance, 1e-9)
+        assert along <= distance + 1e-9
+        assert math.hypot(*moved) == pytest.approx(abs(along), abs=1e-9)
+    assert steps[-1].target == pytest.approx(goal, abs=1e-9)
+    assert math.hypot(*steps[-1].rate) < 1e-9
+
+
+def test_target_passes_a_goal_that_comes_back_by_its_stopping_way() -> None:
+    messages = at(0, (4.0, 0.5)) | at(199, (4.0, 0.5), n=0) | at(200, (1.1, 0.5))
+    messages |= {k: at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
+    steps = hands(run(messages, 2000, LIMITED))
+    way = max(now.target[0] for now in steps) - steps[200].target[0]
+    assert 0.0 < way <= 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
+    assert min(now.target[0] for now in steps[400:]) >= 1.1 - 1e-9
+    assert steps[-1].target == pytest.approx((1.1, 0.5))
+
+
+@pytest.mark.parametrize("gap", [10, 25, 60, 150])
+def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
+    """A hand at 0.3 m/s whose states come in bursts: its spring and damper change by 0.85 N in a tick."""
+    stiffness_n_m, damping_n_s_m = 300.0, 20.0
+    messages: dict[int, Any] = {}
+    for k in range(0, 3000, 10):
+        place = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
+        arrives = k + gap if (k // 100) % 2 else k  # every other 100 ms the machine hands over late
+        messages.setdefault(arrives - arrives % gap, []).extend(at(k, place)[k])
+    for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
+        steps = hands(run(messages, 3000, limits))
+        force = [stiffness_n_m * now.target[0] + damping_n_s_m * now.rate[0] for now in steps if now.source]
+        assert least <= np.abs(np.diff(force)).max() <= most + 1e-9
+
+
+# The reach of an arm
+
+
+def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
+    ring = Reach((0.0, 0.0), 0.5, 2.0)
+    assert ring.find_nearest((3.0, 4.0)) == pytest.approx((1.2, 1.6))
+    assert ring.find_nearest((0.0, 0.1)) == pytest.approx((0.0, 0.5))
+    assert math.hypot(*ring.find_nearest((0.0, 0.0))) == 0.5
+    assert ring.find_nearest((1.0, -1.0)) == (1.0, -1.0)
+    box = Reach(low=(-1.0, -math.inf), high=(1.0, 2.0))
+    assert box.find_nearest((-3.0, 5.0)) == (-1.0, 2.0)
+    assert Reach().find_nearest((50.0, 60.0)) == (50.0, 60.0)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=2), max_size=30))
+def test_target_never_leaves_the_reach_by_more_than_it_takes_to_stop(messages: Any) -> None:
+    rules = LIMITED._replace(reach=Reach((0.0, 0.0), 0.0, 2.0))
+    steps = hands(run(messages, 500, rules))
+    stopping_m = 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
+    assert all(math.hypot(*now.target) <= 2.0 + stopping_m for now in steps)

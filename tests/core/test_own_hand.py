@@ -105,12 +105,20 @@ def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -
     st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)) | st.none(), min_size=1, max_size=14),
     st.integers(0, 45),
     st.floats(0.05, 2.0),
+    st.just(math.inf) | st.floats(1.0, 100.0),
 )
 def test_compiled_spans_are_the_ticks_bit_for_bit(
-    goals: list[tuple[float, float] | None], delay: int, speed_limit: float
+    goals: list[tuple[float, float] | None], delay: int, speed_limit: float, acceleration_limit: float
 ) -> None:
     """Goals come at every 20th tick, and then none for longer than a silence that lets go."""
-    rules = HandRules(2, 1000, speed_limit, from_arm=True, farthest=100.0)
+    rules = HandRules(
+        2,
+        1000,
+        speed_limit,
+        from_arm=True,
+        farthest=100.0,
+        acceleration_limit=acceleration_limit,
+    )
     by_tick, by_span = (OwnHand(rules, EVERY, delay, lambda _: PLACE) for _ in range(2))
     singles = []
     for k in range(EVERY * len(goals) + 500):

@@ -18,8 +18,8 @@ unevenly, and its speed never exceeds the largest one from which it can stop at 
 
 with d the distance to the goal, a the acceleration limit and h the period. A target at that speed needs n more
 ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d exactly. A target that begins at rest
-therefore moves in a straight line and comes to rest at a still goal without overshoot. If the goal comes nearer
-while the target moves, it passes the goal by no more than the way in which it can stop, at most
+therefore moves in a straight line and comes to rest at a still goal without overshoot. If the goal comes back
+along that line, the target passes it by no more than the way in which it can stop, at most
 V^2 / (2 a) + V h / 2 at the speed limit V.
 """
 
@@ -73,9 +73,10 @@ class Reach(NamedTuple):
         radius = math.sqrt(sum(x * x for x in way))
         if self.inner_m <= radius <= self.outer_m:
             return nearest
+        allowed_m = min(max(radius, self.inner_m), self.outer_m)
         if radius == 0.0:  # every direction is as near
             way[0] = radius = 1.0
-        share = min(max(radius, self.inner_m), self.outer_m) / radius
+        share = allowed_m / radius
         return tuple(middle + share * x for x, middle in zip(way, self.centre, strict=True))
 
 
