@@ -13,6 +13,8 @@ import msgspec
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
+from trilat_net.net.host_names import check_hosts
+
 from . import DeviceState, Vector
 
 SILENCE_S = 0.15
@@ -41,12 +43,16 @@ class HaplyInverse3:
         self._socket: ClientConnection | None = None
         self._first: dict[str, Any] = {}
         self._id = ""
+        self._was_there = False
 
     def __enter__(self) -> Self:
+        if not self._was_there:
+            check_hosts([self._address])  # a misspelt name never answers; one that did may be away for a while
         try:
             self._socket = self._open.enter_context(connect(self._address, open_timeout=2.0, **_PLAIN))
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectionError(f"no service of an Inverse3 at {self._address}: {error}") from None
+        self._was_there = True
         self._first, self._id = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}, ""
         return self
 

@@ -505,6 +505,7 @@ def ros2_command(
     from sites.ros2_topics import read_topic_table
     from sites.running_session import RunningSession
 
+    from ..net.host_names import check_hosts
     from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
     from ..net.zenoh_config import BRIDGE
 
@@ -512,6 +513,7 @@ def ros2_command(
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
     table = read_topic_table(names)
+    check_hosts(ros or ())  # before a session is looked for: the bridge waits for its router
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:

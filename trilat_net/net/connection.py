@@ -21,6 +21,7 @@ from ..errors import SessionError, UsageError
 from . import topics
 from .bus import Bus
 from .clock import Clock
+from .host_names import UnknownHost, check_hosts
 from .zenoh_bus import RouterSilent, ZenohBus
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
 
@@ -106,8 +107,13 @@ class Connection:
         return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
 
     def open(self) -> ZenohBus:
-        """Opens it; see `ZenohBus`."""
+        """Opens it; see `ZenohBus`.
+
+        Raises:
+            UnknownHost: an endpoint names a host that does not resolve, to which Zenoh would connect for ever.
+        """
         listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
+        check_hosts(find_endpoint_addresses([*listen, *connect]))
         return ZenohBus(listen, connect, self.mode, self.own)
 
     def require(self, member: str) -> "Connection":
@@ -274,12 +280,16 @@ def open_bus(
 
     Raises:
         UsageError: an endpoint cannot be used.
+        UnknownHost: a host name does not resolve at the first attempt; later on it may be away for a while.
         SessionError: no router answered in time.
     """
     begun_ns, printed = clock.monotonic_ns(), False
     while not stopped():
         try:
             return connection.open()
+        except UnknownHost:
+            if not printed:
+                raise
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None

@@ -25,6 +25,8 @@ from zenoh import CongestionControl, Reliability, handlers
 
 from ..errors import TrilatError, UsageError
 from .clock import Clock
+from .connection import find_endpoint_addresses
+from .host_names import check_hosts
 from .zenoh_bus import open_zenoh
 from .zenoh_config import Endpoint
 
@@ -254,6 +256,7 @@ class Ros2Graph:
         domain: int = 0,
         distro: str = "jazzy",
     ) -> None:
+        check_hosts(find_endpoint_addresses(routers))
         self._session = open_zenoh([], routers, "client", _OWN, "no router of ROS answers at {}")
         if not self.connected and self._session.info.peers_zid():
             self._session.close()

@@ -1,8 +1,11 @@
 """The Zenoh configuration of a session member, what each may send and hear, and checks of a user's own file.
 
-Invariant: explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never
-meet by accident. No setting of a user's file is overruled silently: it is taken, or refused with its key,
-its value and the value required.
+Invariant:
+    - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never meet by
+      accident.
+    - No setting of a user's file is overruled silently: it is taken, or refused with its key, its value and
+      the value required. A setting that a session makes itself is taken if it has the session's value.
+    - A file is refused once, with all its settings that contradict a session.
 
 Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here, for bursts of
 catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never waits and the receiver counts
@@ -53,6 +56,14 @@ QUEUES = [
 """Zenoh's queues of a link, by priority."""
 
 
+CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
+"""A client's session opens with its router; where that is not there yet, `open_bus` tries again."""
+CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
+LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
+"""Zenoh's default, which a session leaves as it is."""
+LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
+
+
 def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     """Returns the setting of Zenoh by which a member drops longer messages of others."""
     return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": ["**"], "size_limit": size}
@@ -74,12 +85,11 @@ def make_zenoh_config(
     tries = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     needed: dict[str, Any] = {
         "mode": mode,
-        "listen": {"endpoints": list(listen), "exit_on_failure": True},
+        "listen": {"endpoints": list(listen), "exit_on_failure": LISTEN_EXIT_ON_FAILURE[mode]},
         "connect": {
             "endpoints": list(connect),
-            # a client's session opens with its router; where that is not there yet, `open_bus` tries again
-            "timeout_ms": 0 if mode == "client" else -1,
-            "exit_on_failure": mode == "client",
+            "timeout_ms": CONNECT_TIMEOUT_MS[mode],
+            "exit_on_failure": CONNECT_EXIT_ON_FAILURE[mode],
             "retry": tries,
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -127,16 +137,31 @@ def _at_least(least: int, must: str) -> _Requirement:
     return (lambda stated: isinstance(stated, int) and stated >= least, must)
 
 
-_OURS: _Requirement = (lambda _: False, "left out: a session sets it itself")
+def _as_used(used: Mapping[str, Any]) -> _Requirement:
+    """Returns the requirement of a key that a session sets itself, by the mode of the member.
+
+    A file states it for a mode each, or once for the file's own mode (`_expand_mode`).
+    """
+
+    def is_used(stated: Any) -> bool:
+        return isinstance(stated, dict) and all(
+            mode in used and value == used[mode] and isinstance(value, type(used[mode]))
+            for mode, value in stated.items()
+        )
+
+    values = ", ".join(f"{mode} {json.dumps(value)}" for mode, value in used.items())
+    return is_used, f"left out, or as a session sets it itself: {values}"
+
+
 _NAMED = _exactly(False, "false: members meet at named endpoints and nowhere else")
 _UNTOUCHED = _exactly([], "empty: it would change or thin out a session's messages")
 _TX = "transport/link/tx"
 
 REQUIREMENTS: Mapping[str, _Requirement] = {
-    "connect/timeout_ms": _OURS,
-    "connect/exit_on_failure": _OURS,
-    "listen/timeout_ms": _OURS,
-    "listen/exit_on_failure": _OURS,
+    "connect/timeout_ms": _as_used(CONNECT_TIMEOUT_MS),
+    "connect/exit_on_failure": _as_used(CONNECT_EXIT_ON_FAILURE),
+    "listen/timeout_ms": _as_used(LISTEN_TIMEOUT_MS),
+    "listen/exit_on_failure": _as_used(LISTEN_EXIT_ON_FAILURE),
     "scouting/multicast/enabled": _NAMED,
     "scouting/gossip/enabled": _NAMED,
     **{
@@ -187,30 +212,20 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
     """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing settings, or "".
 
     Raises:
-        UsageError: it is no Zenoh configuration, or contradicts a requirement of a session.
+        UsageError: it is no Zenoh configuration, or contradicts a requirement of a session; with every key that
+            does so.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
     settings = _without_nulls(stated)
-    if refusal(settings):
-        path, reason = _find_refused_key(settings, refusal, ()) or ((), refusal(settings))
-        raise UsageError(f"{source}: {'/'.join(path)}: {_suggest_key(path, reason)}")
-    for key, value in _leaves(settings, ()):
-        need = REQUIREMENTS.get(key)
-        if need is not None and not need[0](value):
-            text = json.dumps(value)
-            shown = text if len(text) <= 60 else f"{text[:57]}..."
-            raise UsageError(f"{source}: {key}: {shown} must be {need[1]}")
-        if key.startswith("access_control/") and "enabled" not in settings["access_control"]:
-            raise UsageError(
-                f"{source}: access_control: has no `enabled: true`, without which Zenoh lets everybody in"
-            )
-        if re.fullmatch(_FILES, key):
-            try:
-                open_regular(Path(str(value))).close()
-            except OSError as error:
-                raise UsageError(f"{source}: {key}: {value} cannot be read: {error.strerror}") from None
-    settings.pop("low_pass_filter", None)
+    if reason := refusal(settings):
+        refused = list(_find_refused_keys(settings, refusal, ()))
+        problems = [f"{'/'.join(path)}: {_suggest_key(path, why)}" for path, why in refused]
+        raise UsageError(_list_problems(source, problems or [reason]))
+    if problems := list(_find_problems(settings)):
+        raise UsageError(_list_problems(source, problems))
+    for path in (*_SET_BY_MODE, "low_pass_filter"):
+        _drop_key(settings, path)  # it says what a session does by itself
     mode = settings.pop("mode", "")
     endpoints = {
         side: settings[side].pop("endpoints")
@@ -218,6 +233,52 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
         if "endpoints" in settings.get(side, {})
     }
     return ZenohFile(source, mode, settings, endpoints)
+
+
+def _list_problems(source: str, problems: Sequence[str]) -> str:
+    """Returns the problems of a file in one line."""
+    if len(problems) == 1:
+        return f"{source}: {problems[0]}"
+    return f"{source}: {len(problems)} settings cannot be taken: {'; '.join(problems)}"
+
+
+def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
+    """Yields what contradicts a requirement of a session, each with its key."""
+    for key, value in _leaves(settings, ()):
+        compared = _expand_mode(settings, value) if key in _SET_BY_MODE else value
+        need = REQUIREMENTS.get(key)
+        if need is not None and not need[0](compared):
+            text = json.dumps(value)
+            shown = text if len(text) <= 60 else f"{text[:57]}..."
+            yield f"{key}: {shown} must be {need[1]}"
+        if re.fullmatch(_FILES, key):
+            try:
+                open_regular(Path(str(value))).close()
+            except OSError as error:
+                yield f"{key}: {value} cannot be read: {error.strerror}"
+    if settings.get("access_control") and "enabled" not in settings["access_control"]:
+        yield "access_control: has no `enabled: true`, without which Zenoh lets everybody in"
+
+
+_SET_BY_MODE = (
+    "connect/timeout_ms",
+    "connect/exit_on_failure",
+    "listen/timeout_ms",
+    "listen/exit_on_failure",
+)
+"""Keys that a session sets itself, by the mode of the member."""
+
+
+def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
+    """Returns the value of a key by mode: one that is stated once is that of the file's mode, or of peers."""
+    return value if isinstance(value, dict) else {settings.get("mode", "peer"): value}
+
+
+def _drop_key(settings: dict[str, Any], path: str) -> None:
+    *folders, last = path.split("/")
+    for folder in folders:
+        settings = settings.get(folder, {})
+    settings.pop(last, None)
 
 
 def _without_nulls(stated: Mapping[str, Any]) -> dict[str, Any]:
@@ -237,18 +298,18 @@ def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tupl
             yield "/".join(here), value
 
 
-def _find_refused_key(
+def _find_refused_keys(
     settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
-) -> tuple[tuple[str, ...], str] | None:
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yields every key that Zenoh refuses by itself, as deep as it goes, with Zenoh's reason."""
     for key, value in settings.items():
         here = (*path, key)
         alone: Any = value
         for part in reversed(here):
             alone = {part: alone}
         if reason := refusal(alone):
-            deeper = _find_refused_key(value, refusal, here) if isinstance(value, dict) else None
-            return deeper or (here, reason)
-    return None
+            deeper = list(_find_refused_keys(value, refusal, here)) if isinstance(value, dict) else []
+            yield from deeper or [(here, reason)]
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:

@@ -20,6 +20,7 @@ from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
 from ..log.log_layout import collect_provenance
 from ..net.clock import SystemClock
+from ..net.host_names import UnknownHost, check_hosts
 from ..scenario.code_consent import ImportedCode
 from ..scenario.imported_code import read_code
 
@@ -125,7 +126,10 @@ class DaskCluster:
         self._clock = SystemClock()
         self._alone_ns = -1
         try:
+            check_hosts([address])
             self._client = _distributed().Client(address, timeout=CONNECT_S, set_as_default=False)
+        except UnknownHost as unknown:
+            raise UsageError(f"--on {unknown}") from None
         except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
             raise UsageError(
                 f"--on {address}: no Dask scheduler answers there: {str(error).splitlines()[0]}"
