@@ -18,7 +18,7 @@ from rich.console import Console
 from sites.demo_session import SessionResult, compile_core, run_demo
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, LogRefused, RunFailed
-from trilat_net.files import describe_write_error, make_folder
+from trilat_net.files import describe_write_error, make_subfolder
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -109,7 +109,7 @@ class ExperimentSessions:
         plan, planned = self.experiment.plan, step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
-        path = make_folder(self.experiment.folder / LOGS) / planned.file
+        path = make_subfolder(self.experiment.folder / LOGS) / planned.file
         if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
             return True
         for left in self._list_tries(planned)[-1:]:
@@ -136,7 +136,8 @@ class ExperimentSessions:
     def _try(self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float) -> bool:
         """Runs the session of a trial, once all users are ready; false if it does not count."""
         number, begun_ns = len(self._list_tries(step.planned)) + 1, self.clock.monotonic_ns()
-        folder = make_folder(self.experiment.folder / TRIES / f"{step.planned.number:05d}-{number:02d}")
+        tries = make_subfolder(self.experiment.folder / TRIES)
+        folder = make_subfolder(tries / f"{step.planned.number:05d}-{number:02d}")
         watch, asked = TrialWatch(trial, self.clock), self.stage.ask(step, rest_s)
         ready: list[str] = []
 

@@ -26,7 +26,7 @@ from setproctitle import setproctitle
 from trilat_net.core.jit import compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import find_page, make_results_folder
+from trilat_net.files import create_file, find_page, make_results_folder, make_subfolder, write_whole
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
@@ -97,7 +97,7 @@ class ProcessStarter:
         self._folder, self._output = folder, folder / "starter.txt"
         self._processes: dict[str, SessionProcess] = {}
         self._orders, theirs = Pipe()
-        with theirs, self._output.open("wb") as sink:
+        with theirs, create_file(self._output) as sink:
             words = ["start-processes", str(theirs.fileno()), str(scenario_file)]  # see `run_starter`
             self._starter = subprocess.Popen(
                 [sys.executable, "-m", "trilat_net", *words],
@@ -111,7 +111,7 @@ class ProcessStarter:
     def start(self, name: str, words: Sequence[str]) -> SessionProcess:
         """Starts a command, given by its words, as a process of a name that no other has."""
         started = SessionProcess(self, name, self._folder / f"{name}.txt")
-        started.output.write_bytes(b"")  # here, where a disk that refuses it is told of
+        create_file(started.output).close()  # here, where a disk that refuses it is told of
         self._processes[name] = started
         self._order(name, [*words], 0, started.output)
         return started
@@ -219,8 +219,8 @@ def _start(
     scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
     file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
-    file.write_bytes(scenario.text.encode())
-    output.mkdir(exist_ok=True)
+    write_whole(file, scenario.text)
+    make_subfolder(output)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     starter, session = reserved.enter_context(closing(ProcessStarter(file, output))), scenario.name
     connect = [["--connect", endpoint] for endpoint in endpoints]
@@ -330,7 +330,7 @@ class _Starter:
 def _become(words: list[str], output: Path) -> None:
     """Makes a copy what a shell would have started: its name, session, output and signals."""
     os.setsid()
-    sink = os.open(output, os.O_WRONLY)
+    sink = os.open(output, os.O_WRONLY | os.O_NOFOLLOW)
     for stream in (sys.stdout, sys.stderr):
         os.dup2(sink, stream.fileno())
     os.close(sink)

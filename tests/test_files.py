@@ -5,6 +5,7 @@ import errno
 import os
 import re
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,14 +17,18 @@ from tests.other_systems import replace_os
 from trilat_net import files
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
+    create_file,
+    extend_file,
     format_extra_install,
     make_results_folder,
+    make_subfolder,
     open_regular,
     refuse_existing,
     stage_output,
     sync_folder,
     write_whole,
 )
+from trilat_net.log.log_file import LogFile
 from trilat_net.reporting.export import EXPORT_MANIFEST
 
 
@@ -159,12 +164,60 @@ def test_every_text_that_is_written_states_its_line_ends() -> None:
     assert not found
 
 
-def test_link_stays_link_and_device_is_written_to(tmp_path: Path) -> None:
+@pytest.mark.parametrize("exists", [False, True])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_whole(path, b"1"),
+        lambda path: create_file(path),
+        lambda path: extend_file(path),
+        lambda path: make_subfolder(path),
+        lambda path: make(path, "1", folder=False, force=True),
+        lambda path: make(path, "1", folder=True, force=True),
+        lambda path: LogFile(path, force=True),
+    ],
+    ids=["whole", "create", "extend", "subfolder", "staged", "staged folder", "log"],
+)
+def test_no_output_is_written_through_a_link(
+    write: Callable[[Path], object], exists: bool, tmp_path: Path
+) -> None:
+    if exists:
+        (tmp_path / "real").write_text("years")
     (tmp_path / "linked").symlink_to(tmp_path / "real")
-    write_whole(tmp_path / "linked", b"1")
-    write_whole(Path("/dev/null"), b"1")
+    with pytest.raises(UsageError, match="linked: is a symbolic link, and no output is written through one"):
+        write(tmp_path / "linked")
     assert (tmp_path / "linked").is_symlink()
-    assert (tmp_path / "real").read_text() == "1"
+    assert everything(tmp_path) == {"linked": "years", "real": "years"} if exists else {"linked": ""}
+
+
+@pytest.mark.parametrize("name", ["out.unfinished", "out.mcap.active"])
+def test_links_in_place_of_unfinished_files_are_removed(name: str, tmp_path: Path) -> None:
+    (tmp_path / "real").write_text("years")
+    (tmp_path / name).symlink_to(tmp_path / "real")
+    write_whole(tmp_path / "out", "1")
+    file = LogFile(tmp_path / "out.mcap", force=True)
+    file.write(b"1")
+    file.flush()
+    file.end()
+    assert (tmp_path / "real").read_text() == "years"
+
+
+def test_hard_links_of_other_files_are_not_written_to(tmp_path: Path) -> None:
+    for name in ("real", "out.mcap.active"):
+        (tmp_path / name).write_text("years") if name == "real" else os.link(
+            tmp_path / "real", tmp_path / name
+        )
+    file = LogFile(tmp_path / "out.mcap", force=True)
+    file.write(b"1")
+    file.flush()
+    file.end()
+    create_file(tmp_path / "out.mcap.active").close()
+    assert (tmp_path / "real").read_text() == "years"
+
+
+def test_devices_and_links_of_the_system_are_written_to() -> None:
+    write_whole(Path("/dev/null"), b"1")
+    write_whole(Path("/dev/stdout"), b"")
     assert not Path("/dev/null").is_file()
 
 

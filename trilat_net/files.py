@@ -1,8 +1,11 @@
 """Output files and folders: refused where something exists, replaced only by force, written whole.
 
-Invariant: nothing that exists is replaced unless the caller forces it, and an output bears its name only once
-it is complete. An optional package is imported where it is used; if it is missing, the error names what
-installs it.
+Invariant:
+- Nothing that exists is replaced unless the caller forces it, and an output bears its name only once it is
+  complete.
+- No output is written through a symbolic link that stands in place of an output file, or of a folder that the
+  program makes within its output: whoever planted the link would choose the file that is overwritten.
+- An optional package is imported where it is used; if it is missing, the error names what installs it.
 """
 
 import errno
@@ -193,6 +196,55 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
+SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
+"""Folders in which symbolic links are the system's own, as /dev/stdout is."""
+
+
+def refuse_link(path: Path) -> None:
+    """Refuses a symbolic link in place of an output.
+
+    Raises:
+        UsageError: the path is one, and not one of the system's own.
+    """
+    if path.is_symlink() and path.parent.as_posix() not in SYSTEM_FOLDERS:
+        problem = "is a symbolic link, and no output is written through one"
+        raise UsageError(f"{path}: {problem}; remove it, or choose another name")
+
+
+def make_subfolder(folder: Path) -> Path:
+    """Makes a folder within an output folder, and returns it; it may exist.
+
+    Raises:
+        UsageError: a symbolic link stands in its place, or it cannot be made.
+    """
+    refuse_link(folder)
+    return make_folder(folder)
+
+
+def create_file(path: Path) -> BinaryIO:
+    """Returns a new file without a buffer, in place of any earlier one, which is removed and not written to.
+
+    Raises:
+        UsageError: a symbolic link stands in its place.
+        OSError: the file cannot be made.
+    """
+    refuse_link(path)
+    path.unlink(missing_ok=True)
+    return path.open("xb", buffering=0)
+
+
+def extend_file(path: Path) -> BinaryIO:
+    """Returns a file without a buffer that is written to at its end; it may exist.
+
+    Raises:
+        UsageError: a symbolic link stands in its place.
+        OSError: the file cannot be opened.
+    """
+    refuse_link(path)
+    no_link = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
+    return open(path, "ab", buffering=0, opener=lambda name, flags: os.open(name, flags | no_link, 0o666))
+
+
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for results: the given one, or the next free `runs/NAME-N`.
 
@@ -237,8 +289,9 @@ def refuse_existing(
         manifest: file that marks a folder as an earlier output; None where the output is a file.
 
     Raises:
-        UsageError: the name is taken.
+        UsageError: the name is taken, or is that of a symbolic link.
     """
+    refuse_link(path)
     if os.path.lexists(path) and not (manifest and path.is_dir() and not any(path.iterdir())):
         replaceable = (path / manifest).is_file() if manifest else path.is_file()
         if not replaceable:
@@ -279,6 +332,8 @@ def write_whole(
 ) -> None:
     """Writes a file so that it exists whole or not at all; a device or pipe is written to directly.
 
+    A symbolic link in its place is refused; one that appears meanwhile is replaced, and not followed.
+
     Args:
         path: the file.
         data: its content; text is encoded as UTF-8.
@@ -287,25 +342,25 @@ def write_whole(
         mode: rights of a new file, less those that the umask takes.
 
     Raises:
-        UsageError: it exists, or cannot be made.
+        UsageError: it exists, is a symbolic link, or cannot be made.
         LogRefused: the disk refused it.
     """
     content = data.encode() if isinstance(data, str) else data
+    refuse_link(path)
     if not force:
         refuse_existing(path, force=False)
     try:
         if path.exists() and not path.is_file():
             path.write_bytes(content)
             return
-        target = path.resolve()  # a link stays a link
-        unfinished = target.with_name(f"{target.name}.unfinished")
+        unfinished = path.with_name(f"{path.name}.unfinished")
         try:
             unfinished.unlink(missing_ok=True)  # of an earlier try: its rights may be others
-            with open(unfinished, "wb", opener=partial(os.open, mode=mode)) as stream:
+            with open(unfinished, "xb", opener=partial(os.open, mode=mode)) as stream:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-            publish_file(unfinished, target, force=force)
+            publish_file(unfinished, path, force=force)
         except OSError:
             unfinished.unlink(missing_ok=True)
             raise

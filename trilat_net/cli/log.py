@@ -1,5 +1,6 @@
 """`trilat log`: info, check, sign, recover, export, view. None of them executes the log."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -163,19 +164,18 @@ def log_view_command(
     """
     from importlib.util import find_spec
 
-    from ..files import refuse_existing
+    from ..files import stage_output
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
-    if save is not None:
-        refuse_existing(save, force=force)
     if not (full or web or save) and find_spec("rerun") is None:
         return _open_page(files)
-    open_rerun(
-        files,
-        lambda: terminal.open_with_progress(*files),
-        ViewerOptions(full=full, web=web, save=save),
-        terminal.print_text,
-    )
+    with stage_output(save, force=force) if save is not None else nullcontext() as staged:
+        open_rerun(
+            files,
+            lambda: terminal.open_with_progress(*files),
+            ViewerOptions(full=full, web=web, save=staged),
+            terminal.print_text,
+        )
     if save is not None:
         terminal.print_text(f"{save}: open it with: rerun {save}")
     return None

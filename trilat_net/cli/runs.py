@@ -225,9 +225,13 @@ def figure_command(
     if listed:
         _list_figures(log, as_json=as_json)
         return
+    from ..files import refuse_link
     from ..reporting.figures.registry import write_figures, write_overlay
 
-    place = folder if folder is not None else file.with_name(f"{file.stem}-figures")
+    place = folder
+    if place is None:  # nobody has named the folder: who sent the log may have planted a link there
+        place = file.with_name(f"{file.stem}-figures")
+        refuse_link(place)
     kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
     if not kinds:
         raise UsageError("--format names no format, as in --format pdf,png")
@@ -275,11 +279,14 @@ def report_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Writes the page and the summary of a log, with --png its figures as well."""
-    from ..files import make_results_folder
+    from ..files import make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
     log = laws.open(*files)  # before its folder is made
-    results = make_results_folder(folder if folder is not None else files[0].with_suffix(""), "", force=force)
+    if folder is None:  # nobody has named the folder: who sent the log may have planted a link there
+        folder = files[0].with_suffix("")
+        refuse_link(folder)
+    results = make_results_folder(folder, "", force=force)
     with terminal.progress_bar("drawing") as progress:
         conclusion = conclude(log, results, progress, min_coverage=min_coverage, png=png)
     terminal.print_result(conclusion, as_json=as_json)

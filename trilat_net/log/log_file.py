@@ -178,7 +178,9 @@ class LogFile:
         self._force = force
         try:
             refuse_existing(path, force=force, unfinished=self.working)
-            self._raw = (opened or FileIO)(self.working, "wb" if force else "xb")
+            if force:  # what is left there is removed, not written to: it may be a link
+                self.working.unlink(missing_ok=True)
+            self._raw = (opened or FileIO)(self.working, "xb")
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
         sync_folder(path.parent)

@@ -118,7 +118,8 @@ def allow_logged_code(
                 if named[key].settings not in settings:
                     settings.append(named[key].settings)
             make_folder(_find_store().parent)
-            write_whole(_find_store(), msgspec.json.format(msgspec.json.encode(known), indent=1))
+            store = _find_store().resolve()  # people link their own settings
+            write_whole(store, msgspec.json.format(msgspec.json.encode(known), indent=1))
 
 
 def _class_of(key: CodeKey) -> str:

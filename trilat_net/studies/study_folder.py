@@ -21,7 +21,7 @@ import tomli_w
 
 from ..core.fingerprint import compute_fingerprint
 from ..errors import ScenarioError
-from ..files import describe_write_error
+from ..files import describe_write_error, extend_file
 from ..log.log_layout import collect_provenance
 from ..process import join_words
 from ..scenario.imported_code import name_law_classes
@@ -115,7 +115,7 @@ class RunJournal(Generic[E]):
             if tab and digits == b"%08x" % self._checksum(text):
                 entry = msgspec.convert(json.loads(text), kind)  # unlike msgspec, json knows infinity
                 self.done.setdefault((entry.cell, entry.seed), entry)
-        self._file = path.open("ab", buffering=0)
+        self._file = extend_file(path)
         if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
             self._put(b"\n")
 

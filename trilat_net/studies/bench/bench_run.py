@@ -24,7 +24,7 @@ from ...analysis.twin_growth import TwinGrowth, judge_end_by_twins, measure_virt
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import UsageError
-from ...files import make_results_folder, write_whole
+from ...files import make_results_folder, refuse_link, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
@@ -203,6 +203,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         UsageError: it holds something else, or runs from elsewhere, or cannot be made.
     """
     chosen = path or Path("runs") / f"bench-{plan.study}"
+    if path is None:
+        refuse_link(chosen)
     arithmetic, versions = describe_program()
     facts = {"arithmetic": arithmetic, **versions}
     file, origin = chosen / ORIGIN_NAME, json.dumps(facts, indent=2) + "\n"

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from ...errors import UsageError
-from ...files import find_version, make_folder, write_whole
+from ...files import find_version, make_folder, make_subfolder, write_whole
 from ...reporting import style
 from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
@@ -270,7 +270,7 @@ def analyse_experiment(
     """
     experiment = open_experiment(folder)
     return ExperimentAnalysis(experiment, exclude).write(
-        experiment.folder / FOLDER if out is None else Path(out)
+        make_subfolder(experiment.folder / FOLDER) if out is None else Path(out)
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...errors import UsageError
-from ...files import digest_file, make_folder, make_results_folder, write_whole
+from ...files import digest_file, make_results_folder, make_subfolder, write_whole
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
@@ -138,7 +138,7 @@ class Experiment(Result):
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
     ) -> "Experiment":
         """Makes the trials that are left, with synthetic participants, and writes the tables."""
-        logs, plan = make_folder(self.folder / LOGS), self.plan
+        logs, plan = make_subfolder(self.folder / LOGS), self.plan
         with self.open_trials(people=False) as journal:
             if plan.protocol.staircase is not None:
                 self._choose(plan.protocol.staircase)
