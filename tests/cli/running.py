@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import subprocess
 import sys
 from functools import cache
@@ -94,3 +95,12 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
             code = end.code
     allowed_code.update(before)  # logs that other tests keep name laws
     return Done(0 if code is None else int(str(code)), out.getvalue(), err.getvalue())
+
+
+def shorten(file: Path) -> None:
+    """Makes the experiment of a protocol short: two participants, two conditions, a trial each."""
+    text = file.read_text(encoding="utf-8")
+    text = re.sub(r"\[conditions\.(delay_100|jitter_300)\]\n[^\[]*", "", text)
+    for key, value in {"participants": 2, "trials": 1, "practice": 0}.items():
+        text = re.sub(rf"^{key} = \d+", f"{key} = {value}", text, flags=re.MULTILINE)
+    file.write_text(text, encoding="utf-8")

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.test_experiments import shorten
 from tests.studies.sweep.quick import SHORT
 
-from .running import trilat
+from .running import shorten, trilat
 
 LAW = ["--law", "p_d", "--budget", "4", "--jobs", "1", "--duration", "2", "--out", "fronts"]
 SWEEP = ["--over", "link.delay_ms=0:20:20", "--jobs", "1", "-o", "swept"]
