@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 import trilat_net
 from tests.cli.running import PLAIN
 from tests.live.browsers import launch
-from tests.live.page_client import page_client
+from tests.live.page_client import page_client, with_query
 from tests.live.processes import PAPER, Session, Stage
 from tests.net.waiting import until
 from trilat_net.log.log_reader import Log
@@ -116,7 +116,7 @@ def _press_often(browser: Browser, address: str, way: str, apart_ms: list[float]
     """Presses, lets the arms follow again, and so on; returns when, Unix time, ms."""
     options, press = WAYS[way]
     page = browser.new_page(**options)
-    page.goto(f"{address}?as=m1")
+    page.goto(with_query(address, "as=m1"))
     until(lambda: page.evaluate("window.trilat?.frame?.t > 2"), 120.0)
     page.evaluate(_STAMP)
     pressed = []

@@ -4,8 +4,8 @@ Invariant: a message is one of the types below with finite numbers in range and 
 comes no oftener than its kind may, or it is counted and dropped. What a site takes in is for the site to
 decide. Of a link or a row only the newest order waits, however often it is changed, and one question to a
 site is open at a time, besides that to stop. A token gives a role and, to a user, a site; the rest of a link
-may lower the role and never raises it. Without tokens, on loopback, whoever comes is an experimenter, unless
-the link says less. Every role stops the arms.
+may lower the role and never raises it. Every link has a token, on loopback as well: other users of the
+machine reach that too. Every role stops the arms.
 """
 
 import hmac
@@ -222,19 +222,15 @@ class Role:
 
 
 class RoleLinks:
-    """The links of a page that is served, a token for each role.
+    """The links of a page that is served, a token for each role."""
 
-    Args:
-        guarded: true: a link needs its token.
-    """
-
-    def __init__(self, *, guarded: bool) -> None:
-        self._secret = secrets.token_bytes(TOKEN_BYTES) if guarded else b""
+    def __init__(self) -> None:
+        self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
         """Returns the link of a role; its token stands where a browser sends it to no server by itself."""
         query = f"?{role.query}" if role.query else ""
-        return f"{address}{query}" + (f"#token={self._make_token(role)}" if self._secret else "")
+        return f"{address}{query}#token={self._make_token(role)}"
 
     def find(self, query: str) -> Role | None:
         """Returns the role of whoever comes by a link with this query; None if no role has its token."""
@@ -252,7 +248,7 @@ class RoleLinks:
         return hmac.digest(self._secret, f"{role.kind} {role.site}".encode(), "sha256")[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        return not self._secret or hmac.compare_digest(token.encode(), self._make_token(role).encode())
+        return hmac.compare_digest(token.encode(), self._make_token(role).encode())
 
 
 class PageHands:

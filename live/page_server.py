@@ -6,8 +6,8 @@ stage around them. A browser is opened only where there is one.
 
 Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
 page sees fewer frames and nobody waits for it. A page of another origin, without a token, with messages that
-are too many, too large or not of its role is refused and counted; nothing of it reaches a site. One thread
-serves all pages and takes in the session's messages.
+are too many, too large or not of its role is refused and counted; nothing of it reaches a site. Places are
+kept by role (`page_entrance`). One thread serves all pages and takes in the session's messages.
 """
 
 import asyncio
@@ -17,7 +17,6 @@ import socket
 import ssl
 import sys
 import threading
-import webbrowser
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -40,7 +39,9 @@ from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_memb
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import raise_priority
 
+from .page_entrance import Strangers, choose_to_leave, is_full
 from .page_files import PageFiles
+from .page_opening import BrowserOpening
 from .page_orders import (
     MAX_MESSAGE_BYTES,
     AnswerPage,
@@ -76,7 +77,8 @@ FRAMES_AHEAD = 2
 """Frames that a page may have got and not drawn yet: one is on its way while it draws the other."""
 MOST_EXCESS = 1_000
 """A page that sends so many more messages than it may is closed."""
-MOST_PAGES = 16
+OPENING_S = 3.0
+"""Time for a connection to say what it wants: for the encryption, and again for its request, s."""
 ANSWER_NS = 10_000_000_000
 """A page that holds an arm may say for so long whether another one takes part."""
 RESTART_S = 1.0
@@ -105,7 +107,18 @@ class Visitor(ServerConnection):
     """One connection: what is no request of a page is counted, and answered with 400 if it is not HTTP."""
 
     refused: Counter[str]
+    strangers: Strangers
     _heard = _counted = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begins the connection."""
+        super().connection_made(transport)
+        self.strangers.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Ends the connection."""
+        self.strangers.remove(self)
+        super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Takes in what has come."""
@@ -200,7 +213,7 @@ class PageServer:
     """Serves one session's page; a context, at whose beginning a browser is opened at it.
 
     Args:
-        options: how it is served; at another address than this machine's links need their tokens.
+        options: how it is served.
         ends: true if pages may end the session.
         say: tells the people at the terminal what went wrong.
         stage: what is asked of people between sessions and in them, in an experiment.
@@ -229,13 +242,15 @@ class PageServer:
         self.refused: Counter[str] = Counter()
         self._next: tuple[Bus, str] | None = None
         self._turn_to(bus, session)
-        self._guarded, self._opens = options.host not in HERE, options.opens
-        self._links, self._told = RoleLinks(guarded=self._guarded), False
+        self._is_local, self._opens = options.host in HERE, options.opens
+        self._links, self._told = RoleLinks(), False
         self.files = PageFiles()
         self._ages = stage is None or stage.shows_ages
         self._met = self._n = 0
         self.end_requested = threading.Event()
         self.address = ""
+        self._opening = BrowserOpening("")
+        self._closing: set[asyncio.Task[None]] = set()
         self._ready = threading.Event()
         self._problem: OSError | None = None
         self._ending = threading.Event()
@@ -251,8 +266,8 @@ class PageServer:
         self._say(f"experimenter: {self.address}")
         screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
         if self._opens and sys.stdout.isatty() and (screen or not sys.platform.startswith("linux")):
-            with suppress(OSError, webbrowser.Error):
-                webbrowser.open(self.address)
+            self._opening = BrowserOpening(self.address)
+            self._opening.open()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -261,6 +276,7 @@ class PageServer:
             with suppress(RuntimeError):  # its loop has ended already
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
+        self._opening.forget()
 
     def show(self, bus: Bus, session: str) -> None:
         """Shows another session from now on; the bus of the one before is no longer used on return."""
@@ -316,19 +332,23 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        counted = {"refused": self.refused, "strangers": Strangers(self.refused)}
+        encrypted = self._tls is not None
+        timeouts = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0} if encrypted else {}
         server = await serve(
             *(self._attend, self._host, self._port),
             ssl=self._tls,
             process_request=self._answer,
-            create_connection=type("Counted", (Visitor,), {"refused": self.refused}),
+            create_connection=type("Counted", (Visitor,), counted),
             max_size=MAX_MESSAGE_BYTES,
             max_queue=32,
             compression=None,
             ping_interval=5,
             ping_timeout=30,  # a busy machine is no dead page
-            open_timeout=3,
+            open_timeout=OPENING_S,
             close_timeout=1,
             logger=_SILENT,
+            **timeouts,
         )
         async with server, asyncio.TaskGroup() as tasks:
             self._pages.clear()
@@ -398,9 +418,10 @@ class PageServer:
             self.refused[problem] += 1
             return connection.respond(HTTPStatus.FORBIDDEN, problem + "\n")
         if target.path == "/socket":
-            if len(self._pages) >= MOST_PAGES:
-                self.refused["too many pages"] += 1
-                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages\n")
+            role = self._links.find(target.query)
+            if role is not None and role.kind == "watcher" and is_full(self._pages, role):
+                self.refused["too many watchers"] += 1
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many watchers\n")
             return None
         found = self.files.find(target.path)
         return found or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
@@ -408,7 +429,7 @@ class PageServer:
     def _problem_of(self, request: Request, query: str) -> str | None:
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
-        if not self._guarded and name not in HERE:
+        if self._is_local and name not in HERE:
             return "foreign host"  # a name of somebody else's that leads here
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{self._scheme}://{host}":
@@ -426,7 +447,12 @@ class PageServer:
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
         alone = role.kind == "experimenter" and not any(one.takes_part for one in self.experimenters)
         page = Page(connection, self._met, role, hands, takes_part=alone or role.kind == "user")
+        self._make_room(role)
         self._pages.add(page)
+        if isinstance(connection, Visitor):
+            connection.strangers.remove(connection)
+        if role.kind == "experimenter":
+            self._opening.forget()
         sending = asyncio.create_task(self._send(page))
         try:
             async for text in connection:
@@ -441,6 +467,20 @@ class PageServer:
             page.hands.release()
             sending.cancel()
             self._pages.discard(page)
+
+    def _make_room(self, role: Role) -> None:
+        """Closes the page that gives way to a new page of a role, if all places of that role are taken."""
+        page = choose_to_leave(self._pages, role)
+        if page is None:
+            return
+        self._pages.discard(page)
+        page.takes_part = False
+        page.hands.release()
+        self.refused[f"too many pages of {role.kind}s"] += 1
+        close = page.connection.close(_POLICY_VIOLATION, "a newer page took its place")
+        task = asyncio.get_running_loop().create_task(close)
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
 
     def _take(self, page: Page, text: str | bytes) -> None:
         """Takes a message of a page, unless it sends more than it may; its failure is its own."""

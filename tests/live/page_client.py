@@ -20,6 +20,12 @@ def socket_address(link: str) -> str:
     return f"ws://{parts.netloc}/socket" + (f"?{query}" if query else "")
 
 
+def with_query(link: str, query: str) -> str:
+    """A page's link with more in its query, which stands before the token: another role, another view."""
+    parts = urlsplit(link)
+    return parts._replace(query="&".join(filter(None, (parts.query, query)))).geturl()
+
+
 @contextmanager
 def page_client(link: str) -> Iterator["PageClient"]:
     with connect(socket_address(link), max_size=None) as socket:

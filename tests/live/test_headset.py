@@ -16,6 +16,7 @@ from trilat_net import create_keys
 from trilat_net.log.log_reader import Log, open_log
 
 from .browsers import browser_page, needs_browser, page_address, role_address, shows
+from .page_client import with_query
 from .processes import Process, Stage, executed_again
 
 pytestmark = needs_browser
@@ -106,7 +107,7 @@ def leads(page: Page, hands: Controllers) -> bool:
 def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
     """By the log: half as far, ahead as x, left as y, up as z; what jumps by 0.6 m moves nothing."""
     running = served(stage)
-    with browser_page(f"{page_address(running)}?flat", script=RUNTIME, gl=True, **VIEW) as page:
+    with browser_page(with_query(page_address(running), "flat"), script=RUNTIME, gl=True, **VIEW) as page:
         assert page.evaluate("isSecureContext && location.protocol === 'https:'")
         hands = enter(page)
         assert any(leads(page, hands) for _ in range(5))

@@ -32,7 +32,7 @@ from .browsers import (
     take_hold,
     tip_px,
 )
-from .page_client import page_client
+from .page_client import page_client, with_query
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
 pytestmark = needs_browser
@@ -301,7 +301,7 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
 @pytest.mark.parametrize("gl", [True, False], ids=["WebGL", "no WebGL"])
 def test_three_arms_are_drawn_with_webgl_and_without(gl: bool, stage: Stage) -> None:
     running = live(stage, "paper", "--duration", "30")
-    with browser_page(page_address(running) + "?webgl", gl=gl) as page:
+    with browser_page(with_query(page_address(running), "webgl"), gl=gl) as page:
         shows(page, "trilat.frame && trilat.frame.t > 2")
         until(lambda: page.inner_text("#painter").startswith("drawn with" if gl else "no WebGL"))
         for n in range(3):  # something of the arm's colour is drawn in every card

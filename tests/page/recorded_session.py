@@ -16,6 +16,7 @@ from live.experiment_stage import Stage
 from live.session_frames import SessionFrames, show_event
 from live.session_view import SessionView
 from sites.running_session import open_hand
+from tests.live.page_client import with_query
 from tests.net.waiting import until
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
@@ -86,11 +87,11 @@ class RecordedSession:
             route.on_message(answer)
             route.send(json.dumps({"hello": self.hellos[role]}))
 
-        query = {"experimenter": "", "user": f"?as={self.user}", "watcher": "?watch"}[role]
+        query = {"experimenter": "", "user": f"as={self.user}", "watcher": "watch"}[role]
         with watched_page(browser, color_scheme=scheme, **SCREENS[screen]) as watched:
             page = watched.page
             page.route_web_socket("**/socket*", send)
-            page.goto(address + query)
+            page.goto(with_query(address, query))
             newest = self.frames[role][-1]["n"]
             until(lambda: page.evaluate("window.trilat?.frame?.n") == newest, 60.0)
             page.evaluate("new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))")

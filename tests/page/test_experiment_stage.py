@@ -11,7 +11,7 @@ from live.experiment_stage import AWAY_NS, END_NS, Stage, TrialWatch
 from live.page_orders import AbortTrial, DoStep
 from live.page_server import PageServer
 from sites.demo_session import SessionResult
-from tests.live.page_client import page_client
+from tests.live.page_client import page_client, with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
@@ -350,8 +350,8 @@ def test_server_turns_from_session_to_session(experiment: Experiment) -> None:
     asked = stage.ask(first_trial(experiment))
     with (
         PageServer(network.join(), clock, "idle", stage=stage) as server,
-        page_client(server.address + "?as=m1") as user,
-        page_client(server.address + "?watch") as watcher,
+        page_client(with_query(server.address, "as=m1")) as user,
+        page_client(with_query(server.address, "watch")) as watcher,
     ):
         user.take()
         assert user.hello["stage"]["who"] == "P1"

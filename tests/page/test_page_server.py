@@ -5,7 +5,7 @@ import json
 import ssl
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
 from socket import SHUT_WR, create_connection, create_server
@@ -16,10 +16,12 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
+from live.page_entrance import MOST_PAGES, MOST_STRANGERS
+from live.page_opening import BrowserOpening
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
-from live.page_server import MOST_EXCESS, PageOptions, PageServer
+from live.page_server import MOST_EXCESS, OPENING_S, PageOptions, PageServer
 from tests.cli.running import trilat
-from tests.live.page_client import socket_address
+from tests.live.page_client import socket_address, with_query
 from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.waiting import drained, until
 from trilat_net.errors import UsageError
@@ -95,11 +97,12 @@ def test_it_serves_its_own_files_and_no_others(server: PageServer) -> None:
 
 
 def test_a_page_of_another_site_gets_no_socket(server: PageServer) -> None:
-    for origin in ("http://evil.example", "null", server.address.replace("http", "https").rstrip("/")):
+    own_origin = server.address.partition("/#")[0]
+    for origin in ("http://evil.example", "null", own_origin.replace("http", "https")):
         with pytest.raises(InvalidStatus, match="403"):
             socket(server, origin)
     assert server.refused["foreign origin"] == 3
-    with socket(server, server.address.rstrip("/")) as own:
+    with socket(server, own_origin) as own:
         assert "hello" in hears(own)
 
 
@@ -118,16 +121,23 @@ def test_port_in_use_is_found_before_folder_is_made(tmp_path: Path) -> None:
     PageOptions(port=port).check()
 
 
-def test_another_address_than_loopback_demands_insecure_and_a_token(network: LocalNetwork) -> None:
+def test_another_address_than_loopback_demands_insecure() -> None:
     with pytest.raises(UsageError, match="insecure=True"):
         PageOptions(host="0.0.0.0").check()
     PageOptions(host="0.0.0.0", insecure=True).check()
-    with PageServer(network.join(), SystemClock(), "s1", PageOptions(host="0.0.0.0")) as server:
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "0.0.0.0"])
+def test_every_socket_needs_the_token_of_its_link(host: str, network: LocalNetwork) -> None:
+    """On loopback too, which every user of the machine reaches."""
+    with PageServer(network.join(), SystemClock(), "s1", PageOptions(host=host)) as server:
         token = urlsplit(server.address).fragment
         assert len(token) > len("token=") + 20
         for query in ("", "?token=", "?token=guess", f"?{token}x", "?token=%C3%A9", f"?as=m1&{token}x"):
             assert get(server, f"/socket{query}")[0] == 403
-        assert server.refused["no token"] == 6
+        for query in ("?watch", "?as=m1"):
+            assert get(server, f"/socket{query}")[0] == 403
+        assert server.refused["no token"] == 8
         with socket(server) as page:
             assert "hello" in hears(page)
         assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
@@ -292,7 +302,8 @@ def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> Non
     with socket(server) as page:
         page.socket.sendall(b"\xff" * 64)
         until(lambda: server.refused["broken frames"] == 1)
-    assert raw(server, b"GET /socket HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 426 ")
+    request = f"GET /socket?{urlsplit(server.address).fragment} HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    assert raw(server, request.encode()).startswith(b"HTTP/1.1 426 ")
     assert server.refused["malformed request"] == 1
 
 
@@ -462,7 +473,7 @@ def test_a_users_token_opens_no_other_view() -> None:
 def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
     """Nobody asks a user, and a user asks nobody."""
     with PageServer(network.join(), SystemClock(), "s1") as server:
-        with socket(server, link=server.address + "?as=m1") as user, socket(server) as page:
+        with socket(server, link=with_query(server.address, "as=m1")) as user, socket(server) as page:
             hears(user), hears(page)
             until(lambda: len(server._pages) == 2)
             taking = {one.role.kind: one.takes_part for one in server._pages}
@@ -471,7 +482,10 @@ def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
 
 def test_a_page_as_no_site_of_the_session_is_closed(server: PageServer) -> None:
     server.view.scenario = load_scenario("paper")
-    with socket(server, link=server.address + "?as=m9") as page, pytest.raises(ConnectionClosed) as closed:
+    with (
+        socket(server, link=with_query(server.address, "as=m9")) as page,
+        pytest.raises(ConnectionClosed) as closed,
+    ):
         hears(page)
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.reason == "the session has no such site"
@@ -487,14 +501,100 @@ def test_report_and_log_are_the_experimenters_alone(
     report.write_text("<p>a report</p>")
     server.files.results = {"/secret/report.html": report}
     told = {}
-    for link in ("", "?as=m1", "?watch", "?watch&as=m1"):
-        with socket(server, link=server.address + link) as page:
+    for link in ("", "as=m1", "watch", "watch&as=m1"):
+        with socket(server, link=with_query(server.address, link)) as page:
             while "results" not in (message := hears(page)):
                 page.send(json.dumps({"do": "seen", "n": 2**40}))
             told[link] = message["results"]
-    assert told == {"": ["/secret/report.html"], "?as=m1": [], "?watch": [], "?watch&as=m1": []}
+    assert told == {"": ["/secret/report.html"], "as=m1": [], "watch": [], "watch&as=m1": []}
     status, policy, content = get(server, "/secret/report.html")
     assert (status, content) == (200, b"<p>a report</p>")
     assert "sandbox" in policy
     assert "default-src 'none'" in policy
     assert get(server, "/report.html")[0] == get(server, "/secret/")[0] == 404
+
+
+def test_watchers_take_no_places_of_others(network: LocalNetwork) -> None:
+    """Whoever has the watchers' link takes all places of watchers, and locks nobody else out."""
+    said: list[str] = []
+    with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server, ExitStack() as stack:
+        links = told_links(server, said)
+        for _ in range(MOST_PAGES["watcher"]):
+            hears(stack.enter_context(socket(server, link=links["watcher"])))
+        for _ in range(3):
+            with pytest.raises(InvalidStatus, match="503"):
+                socket(server, link=links["watcher"])
+        assert server.refused["too many watchers"] == 3
+        for who in ("experimenter", "user m1", "user m2"):
+            assert "hello" in hears(stack.enter_context(socket(server, link=links[who])))
+
+
+@pytest.mark.parametrize("who", ["experimenter", "user m1"])
+def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNetwork) -> None:
+    """Pages that were left open elsewhere give way, the one that takes part last."""
+    said: list[str] = []
+    with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server, ExitStack() as stack:
+        links = told_links(server, said)
+        kind = who.split()[0]
+        pages = []
+        for _ in range(MOST_PAGES[kind] + 1):
+            pages.append(stack.enter_context(socket(server, link=links[who])))
+            assert "hello" in hears(pages[-1])
+        other = stack.enter_context(socket(server, link=links["user m2"]))
+        assert "hello" in hears(other)
+        oldest = pages[1] if kind == "experimenter" else pages[0]  # the first experimenter takes part
+        with pytest.raises(ConnectionClosed) as closed:
+            until(lambda: hears(oldest) and False)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.reason == "a newer page took its place"
+        until(lambda: len(server._pages) == MOST_PAGES[kind] + 1)
+        assert server.refused[f"too many pages of {kind}s"] == 1
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HT", b"GET /three.module.min.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"]
+)
+def test_silent_and_slow_connections_keep_nobody_out(sent: bytes, server: PageServer) -> None:
+    """Connections that say nothing, half of a request, or never read their answer."""
+    at = urlsplit(server.address)
+    with ExitStack() as stack:
+        for _ in range(3 * MOST_STRANGERS):
+            slow = stack.enter_context(create_connection((at.hostname, at.port), 5))
+            slow.sendall(sent)
+        with socket(server) as page:
+            assert "hello" in hears(page)
+        assert get(server, "/")[0] == 200
+    if len(sent) < 10:  # the others were answered, and closed
+        assert server.refused["too many connections"] >= 2 * MOST_STRANGERS - 10
+
+
+def test_silent_connections_are_closed(server: PageServer) -> None:
+    at = urlsplit(server.address)
+    with create_connection((at.hostname, at.port), 20 * OPENING_S) as silent:
+        silent.sendall(b"GET / HT")
+        assert silent.recv(100) == b""
+
+
+def test_silent_connections_to_encrypted_page_are_closed(network: LocalNetwork, tmp_path: Path) -> None:
+    (keys,) = create_keys(tmp_path / "keys", ["operator"])
+    with PageServer(network.join(), SystemClock(), "s1", PageOptions(tls=keys)) as server:
+        at = urlsplit(server.address)
+        with create_connection((at.hostname, at.port), 20 * OPENING_S) as silent:
+            assert silent.recv(100) == b""
+
+
+def test_browser_is_opened_by_a_file_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The token stands in no command line, which every user of the machine can list."""
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    opening = BrowserOpening("http://127.0.0.1:1/?as=m1&x=<b>#token=secret")
+    opening.open()
+    (folder,) = tmp_path.iterdir()
+    file = folder / "open.html"
+    assert opened == [file.as_uri()]
+    assert "secret" not in opened[0]
+    assert 'href="http://127.0.0.1:1/?as=m1&amp;x=&lt;b&gt;#token=secret"' in file.read_text()
+    assert (folder.stat().st_mode & 0o777, file.stat().st_mode & 0o777) == (0o700, 0o600)
+    opening.forget()
+    assert not list(tmp_path.iterdir())

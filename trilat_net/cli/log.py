@@ -186,11 +186,12 @@ def _open_page(files: list[Path]) -> None:
     import webbrowser
     from contextlib import suppress
 
-    from ..files import format_extra_install, make_results_folder
+    from ..files import format_extra_install, make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
     terminal.print_note(f"Rerun is not installed ({format_extra_install('view')}); this is the log's page")
     folder = files[0].with_suffix("")
+    refuse_link(folder)
     page = folder / "report.html"
     if not page.is_file():
         log = terminal.open_with_progress(*files)
