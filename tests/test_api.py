@@ -29,7 +29,16 @@ def test_what_a_key_completes_is_what_there_is() -> None:
     assert all(getattr(tn, name) for name in dir(tn))
 
 
-@pytest.mark.parametrize("package", ["gymnasium", "matplotlib", "scipy", "loky", "polars", "websockets"])
+@pytest.mark.parametrize(
+    "package",
+    [
+        "gymnasium",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("matplotlib", "scipy", "loky", "polars", "websockets")
+        ),
+    ],
+)
 def test_a_missing_package_shows_in_the_call(package: str) -> None:
     """In an interpreter of its own, since whatever was imported before stays."""
     script = f"""
@@ -52,8 +61,8 @@ print(*missing)
     missing = subprocess.run(
         [sys.executable, "-c", script], check=True, capture_output=True, text=True
     ).stdout.split()
-    assert ("make_env" in missing) == (package in ("gymnasium",))
-    assert ("figure" in missing) == (package == "matplotlib")
+    assert ("make_env" in missing) == (package == "gymnasium")
+    assert ("figure" in missing) == (package in ("matplotlib", "scipy"))
 
 
 COUNTERPARTS = {

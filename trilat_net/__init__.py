@@ -137,7 +137,7 @@ def __getattr__(name: str) -> _Any:
 
 
 def _import_part(name: str) -> _Any:
-    """Returns what is offered by this name; where a package is missing, a stand-in that says so when it is called.
+    """Returns what is offered by this name; if a package is missing, a stand-in that says so when called.
 
     Programs look for names (`hasattr`, `dir`, completion) without the wish to use them.
     """
@@ -153,11 +153,9 @@ def _import_part(name: str) -> _Any:
             raise
         from .files import STUDY_LIBRARIES
 
-        remedy = ", which trilat-net-core does without: pip install trilat-net"
-        problem = (
-            f"this needs {package}{remedy if package in STUDY_LIBRARIES else ', which is not installed'}"
-        )
-        return _make_stand_in(name, problem)
+        in_core = "which trilat-net-core does without: pip install trilat-net"
+        remedy = in_core if package in STUDY_LIBRARIES else "which is not installed"
+        return _make_stand_in(name, f"this needs {package}, {remedy}")
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:

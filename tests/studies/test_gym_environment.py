@@ -13,6 +13,7 @@ from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.studies.gym_environment import ENV_ID, Judgement, ReachTask, Scene, TeleoperationEnv
 
 VARY = {"link.delay_ms": (0.0, 300.0)}
+BENT = {f"sites.{name}.q0_rad": [0.4, 1.2] for name in ("m1", "m2", "s")}
 
 
 def episode(env: Any, seed: int, steps: int = 25) -> tuple[list[Any], list[float]]:
@@ -40,6 +41,15 @@ def assert_same(a: Any, b: Any) -> None:
 @pytest.mark.parametrize("mode", ["tip", "joint", "force"])
 def test_gymnasiums_checker_finds_nothing(mode: str) -> None:
     check_env(tn.make_env("paper", mode=mode, duration_s=1, vary=VARY), skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized")
+@pytest.mark.parametrize("flat", [False, True])
+def test_gymnasiums_checker_renders_as_well(flat: bool) -> None:
+    made = gymnasium.make(
+        ENV_ID, scenario="paper", set=BENT, duration_s=1, render_mode="rgb_array", flat=flat
+    )
+    check_env(made.unwrapped)
 
 
 def test_an_episode_is_a_function_of_its_seed() -> None:
@@ -154,3 +164,163 @@ def test_an_action_that_is_none_is_refused() -> None:
         env.step(np.array([np.nan, 0.0]))
     with pytest.raises(UsageError, match="3 numbers, not 2"):
         tn.make_env("paper", duration_s=1).step(np.zeros(3))
+
+
+def test_a_valid_action_works_after_refused_ones() -> None:
+    """The refused ones leave no trace: the episode equals one without them."""
+    env, other = (tn.make_env("paper", BENT, user="m2", duration_s=1) for _ in range(2))
+    env.reset(seed=1)
+    other.reset(seed=1)
+    refused = ([np.nan, 0.0], [np.inf, 0.0], [1.0], [[1.0, 2.0]], "left", None, [0.1, 0.2, 0.3], 5.0)
+    for n in range(6):
+        for action in refused:
+            with pytest.raises(UsageError, match="an action"):
+                env.step(action)
+        action = np.array([0.5, 0.5 + 0.01 * n])
+        seen, again = env.step(action), other.step(action)
+        assert_same([seen[0]], [again[0]])
+        assert seen[1:4] == again[1:4]
+
+
+def test_steps_need_a_reset_first() -> None:
+    env = tn.make_env("paper", BENT, duration_s=0.1, render_mode="rgb_array")
+    for order in (lambda: env.step(np.zeros(2)), env.render):
+        with pytest.raises(UsageError, match="call reset first") as error:
+            order()
+        assert isinstance(error.value, gymnasium.error.ResetNeeded)
+    for seed in (1, 2):
+        env.reset(seed=seed)
+        ended = False
+        while not ended:
+            *_, cut, _ = returned = env.step(np.zeros(2))
+            ended = returned[2] or cut
+        with pytest.raises(UsageError, match="call reset first"):
+            env.step(np.zeros(2))
+        assert env.render().any()  # the end of an episode can still be drawn
+
+
+def test_a_refused_reset_needs_another_one() -> None:
+    env = tn.make_env("paper", BENT, duration_s=1)
+    env.reset(seed=1)
+    with pytest.raises(ScenarioError, match="delay"):
+        env.reset(options={"link.delay": 5})
+    with pytest.raises(UsageError, match="call reset first"):
+        env.step(np.zeros(2))
+    env.reset(seed=1)
+    env.step(np.zeros(2))
+
+
+@pytest.mark.parametrize("start", [{}, BENT], ids=["straight", "bent"])
+def test_every_goal_lies_within_reach(start: dict[str, Any]) -> None:
+    env = tn.make_env("paper", start, user="m2", duration_s=1, vary=VARY)
+    length_m = sum(env.scenario.arms["s"].lengths_m)
+    goals = [env.reset(seed=seed)[0]["goal"] for seed in range(40)]
+    start_m = np.array(env.scenario.arms["s"].end_effector(env.scenario.sites["s"].q0_rad))
+    for goal in goals:
+        assert np.linalg.norm(goal) < length_m
+        assert np.linalg.norm(goal - start_m) <= 0.3
+    assert len({tuple(goal) for goal in goals}) == 40
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["six_joints", "seven_joints", "unlike_arms"])
+def test_goals_of_chains_are_reached_by_a_pose(scenario: str) -> None:
+    env = tn.make_env(scenario, user=_first_master(scenario), duration_s=1)
+    for seed in range(10):
+        env.reset(seed=seed)
+        scene = env._look()
+        assert scene.can_reach("s", env.task.goal)
+        assert not scene.can_reach("s", env.task.goal + 10.0)
+
+
+def _first_master(scenario: str) -> str:
+    return next(name for name in tn.load_scenario(scenario).names if name != "s")
+
+
+def test_a_task_without_a_goal_in_reach_is_refused() -> None:
+    task = ReachTask(radius_m=0.01)
+    with pytest.raises(UsageError, match=r"the task has no goal: .* start from another pose"):
+        tn.make_env("paper", {"arm.l2_m": 0.5, "sites.s.q0_rad": [0.4, 0.0]}, task=task)
+
+
+def test_pictures_show_the_motion() -> None:
+    env = tn.make_env("paper", BENT, duration_s=1, render_mode="rgb_array")
+    env.reset(seed=1)
+    pictures = [env.render()]
+    for _ in range(10):
+        env.step(np.array([0.3, 1.2]))
+    pictures.append(env.render())
+    for picture in pictures:
+        assert picture.shape == (240, 720, 3)
+        assert picture.dtype == np.uint8
+    assert (pictures[0] != pictures[1]).any()
+    assert env.metadata["render_fps"] == 50
+    silent = tn.make_env("paper", BENT, duration_s=1)
+    silent.reset(seed=1)
+    assert silent.render() is None
+    with pytest.raises(UsageError, match="render_mode is rgb_array or None, not 'human'"):
+        tn.make_env("paper", render_mode="human")
+
+
+def test_flat_observations_are_the_same_numbers() -> None:
+    env, parts = (tn.make_env("paper", BENT, duration_s=1, vary=VARY, flat=flat) for flat in (True, False))
+    flat, seen = env.reset(seed=3)[0], parts.reset(seed=3)[0]
+    for _ in range(5):
+        assert flat.dtype == np.float32
+        assert flat in env.observation_space
+        by_name = dict(zip(env.observation_names, flat.tolist(), strict=True))
+        assert by_name["peer_q[1][0]"] == np.float32(seen["peer_q"][1, 0])
+        assert by_name["goal[1]"] == np.float32(seen["goal"][1])
+        assert sum(part.size for part in seen.values()) == len(flat)
+        action = env.action_space.sample()
+        assert action.dtype == np.float32
+        flat, seen = env.step(action)[0], parts.step(action)[0]
+
+
+class BufferedEnvs:
+    """Several environments as Stable-Baselines3 runs them: one buffer, and a reset where an episode ends."""
+
+    def __init__(self, makers: list[Any]) -> None:
+        self.envs = [make() for make in makers]
+        space = self.envs[0].observation_space
+        self.seen = np.zeros((len(self.envs), *space.shape), dtype=space.dtype)
+        self.last: list[np.ndarray] = []
+
+    def reset(self, seed: int) -> np.ndarray:
+        for n, env in enumerate(self.envs):
+            self.seen[n], _ = env.reset(seed=seed + n, options=None)
+        return self.seen.copy()
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rewards, done = np.zeros(len(self.envs), dtype=np.float32), np.zeros(len(self.envs), dtype=bool)
+        for n, env in enumerate(self.envs):
+            self.seen[n], rewards[n], ended, truncated, _ = env.step(actions[n])
+            done[n] = ended or truncated
+            if done[n]:
+                self.last.append(self.seen[n].copy())
+                self.seen[n], _ = env.reset()
+        return self.seen.copy(), rewards, done
+
+
+def test_a_buffer_of_environments_runs_over_ends() -> None:
+    several = BufferedEnvs([lambda: tn.make_env("paper", BENT, duration_s=0.2, flat=True)] * 2)
+    seen, ends = several.reset(seed=7), 0
+    for _ in range(25):
+        actions = np.stack([env.action_space.sample() for env in several.envs])
+        seen, rewards, done = several.step(actions)
+        assert np.isfinite(seen).all()
+        assert np.isfinite(rewards).all()
+        ends += int(done.sum())
+    assert ends == 4
+    assert len(several.last) == 4
+
+
+@pytest.mark.parametrize("kind", ["sync", pytest.param("async", marks=pytest.mark.long)])
+def test_vector_forms_take_flat_spaces(kind: str) -> None:
+    keys = {"scenario": "paper", "set": BENT, "duration_s": 0.2, "flat": True}
+    several = gymnasium.make_vec(ENV_ID, 2, kind, **keys)
+    seen, _ = several.reset(seed=5)
+    assert seen.dtype == np.float32
+    cuts = sum(int(several.step(several.action_space.sample())[3].sum()) for _ in range(24))
+    several.close()
+    assert cuts == 4

@@ -1,15 +1,20 @@
 """A Gymnasium environment: one user of an experiment acts, by what that user knows over the network.
 
-Invariant: an episode is a run in virtual time, of which the scenario, the seed and the actions say all; saved
-as a log it verifies. A step is a fixed number of ticks. What is observed, and when an action acts, is as of a
-hand of one's own (`OwnHand`), so that what is trained here can hold an arm live, unchanged; only orientations
-are observed as six numbers, which never jump (`expand_poses`).
+Invariant:
+- An episode is a run in virtual time and a function of the scenario, the seed and the actions; saved as a log
+  it verifies.
+- A step is a fixed number of ticks. A refused action makes no step and changes nothing.
+- Steps follow a reset and end with the episode.
+- What is observed, and when an action acts, is as of a hand of one's own (`OwnHand`), so that what is trained
+  here can hold an arm live, unchanged. Only orientations are observed as six numbers, which never jump
+  (`expand_poses`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from msgspec.structs import replace
@@ -27,6 +32,10 @@ from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
 from ..scenario.own_plant import make_plant_players
+from .reachable_places import can_reach
+
+if TYPE_CHECKING:
+    from ..reporting.episode_picture import EpisodePicture
 
 try:
     import gymnasium
@@ -38,6 +47,12 @@ except ImportError:
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
 """Bound of what is observed where nothing tighter is known: rad, rad/s, m, N m, s."""
+MOST_DRAWS = {False: 1000, True: 100}
+"""Places that a task draws at most until one is within reach; of chains fewer, whose poses are searched."""
+
+
+class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
+    """There is no episode: none has begun, or it has ended."""
 
 
 class Scene(NamedTuple):
@@ -49,6 +64,8 @@ class Scene(NamedTuple):
         end_effector_m: place of the end effector by site, m.
         view: what the user sees.
         bodies: the poses of the bodies of plants, by site and then name, as a record has them, shape (7,).
+        can_reach: says of a site and a place, m, whether its end effector can be brought there.
+        draws: places that a task may draw at most until one is within reach.
     """
 
     t_s: float
@@ -56,6 +73,8 @@ class Scene(NamedTuple):
     end_effector_m: dict[str, Array]
     view: HandView
     bodies: dict[str, dict[str, Array]]
+    can_reach: Callable[[str, Array], bool] = lambda _site, _place: True
+    draws: int = MOST_DRAWS[False]
 
 
 class Judgement(NamedTuple):
@@ -81,7 +100,7 @@ class EpisodeTask(Protocol):
 
 
 class ReachTask:
-    """The slave's end effector is brought to a place that is drawn, and stays there.
+    """The slave's end effector is brought to a place that is drawn within its reach, and stays there.
 
     The reward of a step is minus the distance, m, times the step, s; and 1 once it was there for `stay_s`.
 
@@ -100,11 +119,25 @@ class ReachTask:
         self._since_s = self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws a place around the start, evenly over the area."""
+        """Draws a place around the start, evenly over the part of the area that the end effector can reach.
+
+        Raises:
+            UsageError: none of the places that were drawn is within reach.
+        """
         start = scene.end_effector_m[self._site]
-        way = random.normal(size=len(start))
-        share = random.uniform() ** (1.0 / len(start))
-        self.goal = start + self._radius_m * share * way / np.linalg.norm(way)
+        for _ in range(scene.draws):
+            way = random.normal(size=len(start))
+            share = random.uniform() ** (1.0 / len(start))
+            place = start + self._radius_m * share * way / np.linalg.norm(way)
+            if scene.can_reach(self._site, place):
+                break
+        else:
+            around = f"{self._radius_m:g} m around the start of {self._site}"
+            raise UsageError(
+                f"the task has no goal: the end effector can reach none of {scene.draws} places "
+                f"within {around}; start from another pose (sites.NAME.q0_rad), or give a task of your own"
+            )
+        self.goal = place
         self._since_s = self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
@@ -132,7 +165,8 @@ class ActedHand(HandPlayer):
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     """An experiment in which one user is trained, in steps, see docs/policies.md; also called `tn.make_env`.
 
-    >>> env = tn.make_env("two_sites", user="m", duration_s=1)
+    >>> bent = {f"sites.{name}.q0_rad": [0.4, 1.0] for name in ("m", "s")}
+    >>> env = tn.make_env("two_sites", bent, user="m", duration_s=1)
     >>> observation, info = env.reset(seed=1)
     >>> observation["peer_q"].shape
     (1, 2)
@@ -148,13 +182,18 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         task: what is to be done; by default `leads` brings its end effector to a place.
         vary: what each episode draws, by key a list, or a pair of numbers.
         leads: the site that works.
+        render_mode: "rgb_array": `render` returns a picture of the arms and the goal; None: nothing.
+        flat: whether an observation is one array of float32 in place of a dictionary, and an action float32.
+
+    Attributes:
+        observation_names: with `flat` what each number of an observation is, as in "peer_q[1][0]".
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
         UsageError: the site or the rate is none, or Gymnasium is not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
@@ -169,7 +208,16 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         task: EpisodeTask | None = None,
         vary: Mapping[str, Sequence[Any]] = {},
         leads: str = "s",
+        render_mode: str | None = None,
+        flat: bool = False,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            modes = ", ".join(self.metadata["render_modes"])
+            raise UsageError(f"render_mode is {modes} or None, not {render_mode!r}")
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": rate_hz}
+        self._picture: EpisodePicture | None = None
+        self._runs = False
         self._user, self._mode, self._rate_hz, self._delay_s = user, mode, rate_hz, delay_ms * 1e-3
         self._vary, self._leads = vary, leads
         self.task: EpisodeTask = task or ReachTask(leads)
@@ -179,7 +227,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._every = self._base.sites[user].rate_hz // rate_hz
         far = self._place(self._base).describe()
         self._most = far.limit if far.mode == "force" else self._find_reach()
-        self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), np.float64)
+        self._size = far.size
+        kind = np.float32 if flat else np.float64
+        self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), kind)
         self._begin(self._base)
         self.task.begin(np.random.default_rng(0), self._look())
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
@@ -187,7 +237,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         for name, one in self._observe(self._look()).items():
             most = bounds.get(name, FAR)
             boxes[name] = spaces.Box(-most, most, one.shape, np.float64)
-        self.observation_space: Any = spaces.Dict(boxes)
+        self._of_parts = spaces.Dict(boxes)
+        self.observation_space: Any = _flatten_space(self._of_parts) if flat else self._of_parts
+        self.observation_names = _name_numbers(self._of_parts) if flat else []
+        self._flat = flat
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns an experiment in which the user has a live hand and no other operator holds that arm."""
@@ -232,7 +285,19 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         bodies = {
             site: dict(zip(self.scenario.bodies_m(site), at, strict=True)) for site, at in poses.items()
         }
-        return Scene(self._k / self._tick_rate_hz, q, places, view, bodies)
+        reach = partial(self._can_reach, q)
+        draws = MOST_DRAWS[arms[self._leads].chain is not None]
+        return Scene(self._k / self._tick_rate_hz, q, places, view, bodies, reach, draws)
+
+    def _can_reach(self, q: Mapping[str, Array], site: str, place_m: Array) -> bool:
+        return can_reach(self.scenario.arms[site], q[site], place_m)
+
+    def _return(self, scene: Scene) -> Any:
+        """Returns an observation in the form of the observation space."""
+        parts = self._observe(scene)
+        if not self._flat:
+            return parts
+        return np.concatenate([np.ravel(parts[name]) for name in self._of_parts]).astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
         view = scene.view
@@ -260,22 +325,36 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Array], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode: draws what varies, its links' randomness and its task.
 
         `options` are overrides of this episode alone, as in {"link.delay_ms": 200}.
+
+        Raises:
+            ScenarioError: the options or what was drawn are not valid.
+            UsageError: the task has no goal within reach.
         """
+        self._runs = False
         super().reset(seed=seed)
         drawn = {key: _draw(self.np_random, of) for key, of in self._vary.items()}
         drawn |= {"seed": int(self.np_random.integers(2**31)), **(options or {})}
         self._begin(load_scenario(self._base, drawn))
         scene = self._look()
         self.task.begin(self.np_random, scene)
-        return self._observe(scene), self._inform(scene, succeeded=False)
+        self._runs = True
+        return self._return(scene), self._inform(scene, succeeded=False)
 
-    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
-        """Acts, and moves on by a step."""
-        self._actions.append(np.clip(np.asarray(action, dtype=np.float64), -self._most, self._most))
+    def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Acts, and moves on by a step.
+
+        Raises:
+            UsageError: the action is not valid; the episode stays where it was.
+            EpisodeError: there is no episode, or it has ended.
+        """
+        checked = self._check_action(action)
+        if not self._runs:
+            raise EpisodeError("there is no episode, or it has ended: call reset first")
+        self._actions.append(checked)
         self._k += self._every
         try:
             self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
@@ -286,8 +365,44 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         said = Judgement(*said) if isinstance(said, tuple) else Judgement(said)
         ended = said.succeeded or said.failed or diverged
         truncated = self._k + self._every > self._ticks and not ended
+        self._runs = not (ended or truncated)
         info = self._inform(scene, succeeded=said.succeeded)
-        return self._observe(scene), said.reward, ended, truncated, info
+        return self._return(scene), said.reward, ended, truncated, info
+
+    def _check_action(self, action: Array) -> Array:
+        """Returns an action within its bounds.
+
+        Raises:
+            UsageError: the action has another number of values, or one that is not finite.
+        """
+        try:
+            values = np.array(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(f"an action: it is {self._size} numbers, not {action!r:.80}") from None
+        if values.shape != (self._size,):
+            found = f"{values.size} numbers" if values.ndim == 1 else f"an array of shape {values.shape}"
+            raise UsageError(f"an action: it acts with {found}, not {self._size}")
+        if not np.isfinite(values).all():
+            raise UsageError(f"an action: it acts with {values.tolist()}, which is not finite")
+        return np.clip(values, -self._most, self._most)
+
+    def render(self) -> Any:
+        """Returns a picture of the arms and of the goal, shape (height, width, 3); None without a mode.
+
+        Raises:
+            EpisodeError: no episode has begun.
+        """
+        if self.render_mode is None:
+            return None
+        if not (self._runs or self._actions):
+            raise EpisodeError("there is no episode to be drawn: call reset first")
+        from ..reporting.episode_picture import EpisodePicture, is_place  # Matplotlib takes a second
+
+        if self._picture is None:
+            self._picture = EpisodePicture(self.scenario, self._leads)
+        scene = self._look()
+        goal = self.task.goal if is_place(self.task.goal, scene.end_effector_m[self._leads]) else None
+        return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Writes the episode so far as a log, which verifies.
@@ -301,6 +416,24 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
         record_virtual(lasted, Path(path), force=force, hands={self._user: player.track})
         return Path(path)
+
+
+def _flatten_space(parts: spaces.Dict) -> spaces.Box:
+    """Returns the space of all numbers of observations, one after the other, as float32."""
+    low, high = (
+        np.concatenate([np.ravel(getattr(box, end)) for box in parts.values()]).astype(np.float32)
+        for end in ("low", "high")
+    )
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _name_numbers(parts: spaces.Dict) -> list[str]:
+    """Returns what each number of a flat observation is."""
+    return [
+        name + "".join(f"[{index}]" for index in place)
+        for name, box in parts.items()
+        for place in np.ndindex(box.shape)  # type: ignore[arg-type] - a box has one
+    ]
 
 
 def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:

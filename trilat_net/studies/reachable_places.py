@@ -1,0 +1,59 @@
+"""Which places an arm can reach with its end effector.
+
+Invariant: a place that counts as reachable can be reached: for a planar arm by the lengths of its links, for
+a chain by a pose within its joint limits, which was found. Some reachable places of chains are not found.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.vectors import Array
+from ..scenario.arms import ArmModel
+
+PLANAR_MARGIN = 0.01
+"""Share of a planar arm's length by which a place must lie inside its reach: no goal needs a straight arm."""
+FOUND_WITHIN_M = 1e-3
+_STEPS = 40
+_PROBE_RAD = 1e-6
+_DAMPING = 1e-3
+_LARGEST_STEP_RAD = 0.5
+
+
+def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, place_m: Array) -> bool:
+    """Returns whether the end effector of an arm can be brought to a place.
+
+    Args:
+        arm: the model of the arm.
+        start_rad: joint angles from which a pose of a chain is searched, rad, shape (n,).
+        place_m: the place in the coordinates of `ArmModel.end_effector`, m.
+    """
+    if arm.chain is not None:
+        return _find_pose(arm, np.array(start_rad, dtype=np.float64), np.asarray(place_m))
+    first_m, second_m = arm.lengths_m
+    margin_m = PLANAR_MARGIN * (first_m + second_m)
+    distance_m = math.hypot(*place_m)
+    return abs(first_m - second_m) <= distance_m <= first_m + second_m - margin_m
+
+
+def _find_pose(arm: ArmModel, q: Array, place_m: Array) -> bool:
+    """Searches a pose within the joint limits by damped least squares (Wampler 1986)."""
+    assert arm.chain is not None
+    lower = np.array([joint.lower for joint in arm.chain.joints])
+    upper = np.array([joint.upper for joint in arm.chain.joints])
+    for _ in range(_STEPS):
+        at_m = np.array(arm.end_effector(q.tolist()))
+        error_m = place_m - at_m
+        if float(np.linalg.norm(error_m)) <= FOUND_WITHIN_M:
+            return True
+        jacobian = np.empty((len(at_m), len(q)))
+        for joint in range(len(q)):
+            moved = q.copy()
+            moved[joint] += _PROBE_RAD
+            jacobian[:, joint] = (np.array(arm.end_effector(moved.tolist())) - at_m) / _PROBE_RAD
+        damped = jacobian @ jacobian.T + _DAMPING * np.eye(len(at_m))
+        step = jacobian.T @ np.linalg.solve(damped, error_m)
+        step *= min(1.0, _LARGEST_STEP_RAD / max(float(np.abs(step).max()), 1e-12))
+        q = np.clip(q + step, lower, upper)
+    return False
