@@ -24,6 +24,7 @@ from trilat_net.log.event_text import describe_event
 from trilat_net.log.orientations import QUATERNION_AXES, SteadyQuaternion
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.laws import identify_law
 
 from .session_view import SessionView, SiteView, Tail
 
@@ -78,7 +79,7 @@ class ArmFrames:
             "unit": "m" if self._model.shares_pose else "rad",
             "hand": self._describe_hand(),
             "stops": self._spec.on_stale.action == "glide",
-            "law": type(self._spec.control).__struct_config__.tag,
+            "law": identify_law(self._spec.control),
         }
 
     def _describe_hand(self) -> Json | None:

@@ -44,7 +44,7 @@ def test_gymnasiums_checker_finds_nothing(mode: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized")
-@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("flat", [pytest.param(False, marks=pytest.mark.long), True])
 def test_gymnasiums_checker_renders_as_well(flat: bool) -> None:
     made = gymnasium.make(
         ENV_ID, scenario="paper", set=BENT, duration_s=1, render_mode="rgb_array", flat=flat

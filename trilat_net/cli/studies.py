@@ -156,8 +156,16 @@ _LINES = 10
 
 
 @contextmanager
-def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal."""
+def show_progress(
+    label: str, print_line: Callable[[str], None], items: str = "runs"
+) -> Iterator[Callable[[int, int], None]]:
+    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal.
+
+    Args:
+        label: what a bar is called.
+        print_line: prints a line.
+        items: what is counted, in the plural.
+    """
     if terminal.err.is_interactive:
         with terminal.progress_bar(label) as show:
             yield show
@@ -175,7 +183,7 @@ def show_progress(label: str, print_line: Callable[[str], None]) -> Iterator[Cal
             return
         printed = done * _LINES // total
         left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
-        print_line(f"  {done} of {total} runs, about {format_wall_time(left_s)} left")
+        print_line(f"  {done} of {total} {items}, about {format_wall_time(left_s)} left")
 
     yield line
 

@@ -48,6 +48,7 @@ def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
     from ..reporting.appearance import COLUMN_IN, make_print_size
+    from ..studies.sweep.fixed_gains import FAIR_COMPARISON
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map
     from ..studies.sweep.sweep_plan import build_sweep_command
@@ -55,10 +56,15 @@ def _draw_map(
     form = make_print_size(COLUMN_IN if width is None else width)
     words = [] if width is None else ["--width", f"{width:g}"]
     command = build_sweep_command(results.plan, "--map", *words)
-    with terminal.progress_bar("linear analysis") as progress:
+    terminal.print_text("map: the lines of theory ...")
+    with show_progress("linear analysis", terminal.print_text, "columns of the map") as progress:
         made = build_stability_map(results, (command,), jobs, progress, on=on)
     terminal.print_texts(f"note: {line}" for line in made.remarks)
-    terminal.print_paths(write_map(made, folder, form.width_in))
+    terminal.print_text("map: drawing ...")
+    paths = write_map(made, folder, form.width_in)
+    terminal.print_texts(f"not swept: {text}" for text in made.fixed)
+    terminal.print_text(FAIR_COMPARISON)
+    terminal.print_paths(paths)
 
 
 def _search_margins(
@@ -78,7 +84,10 @@ def _search_margins(
     from ..studies.sweep.margin_search import SweepMargins, search_margins
 
     chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=None)
-    with terminal.progress_bar("searching") as progress:
+    with (
+        terminal.lines_aside(as_json),
+        show_progress("searching", terminal.print_text, "places") as progress,
+    ):
         found = SweepMargins(asked, within, search_margins(asked, within, jobs, progress, on))
     paths = found.write(chosen)
     if not as_json:

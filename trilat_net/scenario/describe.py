@@ -341,6 +341,10 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 def describe_law(control: Mapping[str, Any]) -> str:
     """Returns a law and its gains in a few words, from its table."""
+    if "code" in control:  # a user's law: the settings are its gains, and its file has a hash
+        settings = control.get("settings", {})
+        gains = ", ".join(f"{key} {describe_value(value)}" for key, value in settings.items())
+        return f"{control['code']} ({gains})" if gains else str(control["code"])
     gains = ", ".join(f"{key} {describe_value(value)}" for key, value in control.items() if key != "law")
     return f"{control['law']} ({gains})"
 

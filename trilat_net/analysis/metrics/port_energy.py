@@ -14,6 +14,7 @@ import numpy as np
 from ...core.site_setup import Gains, Law, Scheme
 from ...core.vectors import Array
 from ...scenario import Scenario
+from ...scenario.laws import identify_law
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque, view_delayed_peer
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import follow_rows
@@ -121,12 +122,14 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     """
     runs, peer, site = view.sites, view.links[link].peer, view.links[link].site
     arm = build_arm_rows(view.scenario, site)
-    gains = view.scenario.sites[site].control.gains(arm.theta)
+    law = view.scenario.sites[site].control
+    gains = law.gains(arm.theta)
     absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
     if gains.law is Law.OWN:
-        return unavailable(ENERGY, "a law of somebody's own: what it makes of a peer is not known", of="link")
+        unknown = f"the law {identify_law(law)} does not say which part of its torque is due to a peer"
+        return unavailable(ENERGY, unknown, of="link")
     records, other, factors = runs[site].records, runs[peer].records, runs[site].dominance
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")

@@ -17,6 +17,7 @@ from ...core.site_setup import Law
 from ...core.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario
+from ...scenario.laws import identify_law
 from ..aligned import find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
@@ -295,7 +296,7 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
     gains, none = spec.control.gains(arm.theta), np.zeros(len(spec.q0_rad))
     if gains.law is Law.OWN:
-        return none, "a law of somebody's own"
+        return none, f"the law {identify_law(spec.control)} states no stiffness that holds e at rest"
     if not spec.arm.known:
         return none, "theta of the arm is not known"
     if np.any(gains.k_f):

@@ -8,6 +8,7 @@ for grey print and colour-blind readers.
 """
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import COLUMN_IN, FigureSize, make_print_size
 from ...reporting.result_text import TextTable
+from .fixed_gains import FAIR_COMPARISON
 from .stability_map import (
     CELL_CLASSES,
     MapLine,
@@ -69,15 +71,27 @@ _FULL_IN = 2.3
 """Height of a panel that has a row to itself."""
 _BESIDE_IN = 1.75
 _STRIP_IN = 0.7
+_CAPTION_PT = 5.5
+_CAPTION_LINE_IN = 0.1
+_CAPTION_LETTERS_PER_IN = 25
 
 
-def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[MapLine]], form: FigureSize) -> Figure:
-    """Returns the figure of a plane."""
+def draw_stability_map(
+    plane: MapPlane,
+    lines: Sequence[Sequence[MapLine]],
+    form: FigureSize,
+    fixed: Sequence[str] = (),
+) -> Figure:
+    """Returns the figure of a plane; `fixed` are the gains that were not swept, a text per law."""
     columns = _columns(len(plane.panels), form)
     rows = -(-len(plane.panels) // columns)
     each_in = _STRIP_IN if not plane.y.key else _FULL_IN if columns == 1 else _BESIDE_IN
     barred = plane.judged_by_twins or plane.seeds > 1
-    with style.styled_figure(form, 0.95 + rows * each_in) as figure:
+    caption = _wrap_caption(fixed, form)
+    height_in = 0.95 + rows * each_in + _CAPTION_LINE_IN * len(caption)
+    with style.styled_figure(form, height_in) as figure:
+        if caption:
+            _write_caption(figure, caption, height_in)
         grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
         for axes in grid[len(plane.panels) :]:
             axes.set_axis_off()
@@ -104,6 +118,25 @@ def draw_stability_map(plane: MapPlane, lines: Sequence[Sequence[MapLine]], form
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
     return figure
+
+
+def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
+    """Returns the lines of the caption: the gains that were not swept."""
+    if not fixed:
+        return []
+    width = round(_CAPTION_LETTERS_PER_IN * form.width_in)
+    texts = [f"not swept: {'; '.join(fixed)}", FAIR_COMPARISON]
+    return [line for text in texts for line in textwrap.wrap(text, width)]
+
+
+def _write_caption(figure: Figure, caption: Sequence[str], height_in: float) -> None:
+    """Writes the caption below the panels, which give way to it."""
+    share = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, share, 1.0, 1.0 - share))
+    figure.text(
+        0.01, 0.02 / height_in, "\n".join(caption), va="bottom", fontsize=_CAPTION_PT, color=style.REFERENCE
+    )
 
 
 def _columns(panels: int, form: FigureSize) -> int:
@@ -271,7 +304,7 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
         UsageError: there is no such width.
     """
     form = make_print_size(width_in)
-    figure = draw_stability_map(chart.plane, chart.lines, form)
+    figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
     paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf", "md")]
     for path in paths[:-1]:
         style.write_figure(figure, path, _DPI)
@@ -284,7 +317,9 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
     parts = [f"# {chart.title}", "```sh\n" + "\n".join(chart.commands) + "\n```", f"![map]({picture})"]
     parts.append(tabulate_classes(chart.plane).markdown())
     meanings = dict.fromkeys(f"{line.text}: {line.about}" for lines in chart.lines for line in lines)
-    if notes := [*meanings, *chart.remarks]:
+    fixed = [f"gains that were not swept: {text}" for text in chart.fixed]
+    advice = [FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")] if fixed else []
+    if notes := [*meanings, *chart.remarks, *fixed, *advice]:
         parts.append("\n".join(f"- {one}" for one in notes))
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
         table = tabulate_edges(chart.plane, panel, lines)

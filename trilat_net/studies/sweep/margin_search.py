@@ -26,6 +26,7 @@ from ...scenario.code_consent import list_imported_code
 from ...theory.linear_edge import find_root_crossings
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
+from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
 from .stability_map import StableInterval, evaluate_criterion, find_criterion_edge
 from .sweep_plan import (
     SweepCell,
@@ -328,6 +329,9 @@ class SweepMargins(Result):
         if islands := sum(len(one.margin.spans) > 1 for one in self.found):
             where = f"in {islands} of {len(self.found)} places"
             parts.append(f"Stability is not monotone {where}: they have several edges.")
+        fixed = "; ".join(describe_fixed_gains(self.plan))
+        advice = FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
+        parts.append(f"Gains that were not swept: {fixed}. {advice[0].upper()}{advice[1:]}.")
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:

@@ -35,6 +35,7 @@ from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
 from ...theory.linear_edge import GrowthColumn, compute_growth_column
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from .fixed_gains import describe_fixed_gains
 from .sweep_cell import CellClass
 from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
 from .sweep_results import SweepResults
@@ -486,13 +487,23 @@ LAW_AXIS = "law"
 
 
 class StabilityMap(NamedTuple):
-    """A map: its plane, per panel the lines of theory with remarks, and the commands that make it."""
+    """A map.
+
+    Attributes:
+        plane: what it shows.
+        lines: per panel the lines of theory.
+        remarks: on these lines.
+        commands: that make the map.
+        title: of its page.
+        fixed: the gains that were not swept, a text per law.
+    """
 
     plane: MapPlane
     lines: tuple[tuple[MapLine, ...], ...]
     remarks: tuple[str, ...]
     commands: tuple[str, ...]
     title: str
+    fixed: tuple[str, ...] = ()
 
 
 def build_stability_map(
@@ -513,8 +524,9 @@ def build_stability_map(
     keys = [*([LAW_AXIS] if len(plan.laws) > 1 else []), *(one.key for one in plan.axes)]
     drawn = build_plane(results.rows, keys, plan.base)
     title = plan.base.title or plan.base.name
+    fixed = tuple(describe_fixed_gains(plan))
     if not drawn.y.key or len(drawn.y.values) < 2:
-        return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title)
+        return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title, fixed)
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
     lines = [
         [trace_zero_exponent(panel), trace_closed_form(one, drawn.x, drawn.y)]
@@ -530,7 +542,7 @@ def build_stability_map(
             some.append(line)
             remarks |= dict.fromkeys(why)
     kept = tuple(tuple(line for line in some if line is not None) for some in lines)
-    return StabilityMap(drawn, kept, tuple(remarks), commands, title)
+    return StabilityMap(drawn, kept, tuple(remarks), commands, title, fixed)
 
 
 def _column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
