@@ -16,20 +16,22 @@ from functools import partial
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import TrilatError, UsageError
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
+from trilat_net.log.ros2.published import COMMON_TOPICS, pack_diagnostics
+from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
+from trilat_net.log.ros2.topic_names import DIAGNOSTICS, FRAMES, RobotTable, TopicTable
 from trilat_net.net import topics
 from trilat_net.net.arm_client import ArmClient, Hand
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import find_members, list_past_events
 from trilat_net.net.membership import read_messages, read_records
-from trilat_net.net.messages import Event, Info
+from trilat_net.net.messages import Event, Info, LinkStats
 from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPublisher
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
 
-from .ros2_topics import POSE, RELIABLE, WRENCH, Ends, RobotTable, SiteTopics, TopicTable
+from .ros2_topics import RELIABLE, Ends, SiteTopics
 from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
@@ -45,10 +47,6 @@ SAFE_NS = 10_000_000
 DRIVE_S, ASK_S = 0.001, 0.05
 """Between two looks for a torque; for shares that are wanted."""
 TRIGGER = "std_srvs/srv/Trigger"
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-_OK, _WARNING, _ERROR = 0, 1, 2
-_LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
-"""Of `/diagnostics`, by mode; others warn."""
 
 
 class OneSender:
@@ -249,16 +247,23 @@ class Bridge:
 
     def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
         graph, bus, clock, session, _ = self._ends = ends
-        states, events = (topics.key(session, "*", channel) for channel in (topics.STATE, topics.EVENT))
-        self._records, self._events = bus.inbox(states, 4096), bus.inbox(events, 4096)
+        self._records, self._events, self._links = (
+            bus.inbox(topics.key(session, "*", channel), 4096)
+            for channel in (topics.STATE, topics.EVENT, topics.LINK)
+        )
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._present, self._met = set[topics.KeyParts](), False
         self._epoch_unix_ns = epoch_unix_ns
-        frames = graph.publisher("tf", cdr.TRANSFORMS, RELIABLE)
+        frames, self._diagnostics = (
+            graph.publisher(topic, COMMON_TOPICS[topic].kind, RELIABLE) for topic in (FRAMES, DIAGNOSTICS)
+        )
+        self._lines = {
+            name: graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
+            for name, channel in SESSION_CHANNELS.items()
+        }
         self._sites = {
             name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names
         }
-        self._diagnostics = graph.publisher("diagnostics", DIAGNOSTICS, RELIABLE)
         running = RunningSession(session, Connection(), bus)
         self.targets, self.dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
         for name, shown in self._sites.items():
@@ -310,6 +315,11 @@ class Bridge:
             anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
             if event.member in self._sites:
                 self._sites[event.member].shares.take(event.command)
+            for name, data in pack_event(event, self._ends.clock.unix_ns()):
+                self._lines[name].put(data)
+        for stats in read_messages(self._links, LinkStats):
+            if stats.site in self._sites:
+                self._sites[stats.site].show_statistics(stats)
         for parts, alive in topics.read_presence(self._presence):
             if parts.member in self._sites:
                 (self._present.add if alive else self._present.discard)(parts)
@@ -318,13 +328,8 @@ class Bridge:
 
     def _diagnose(self) -> None:
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
-        newest_ns, parts = max((record.t_ns for record in records), default=0), list[cdr.Diagnosis]()
-        for record in records:
-            values = {"tick": record.tick, "late_us": record.late_us, "busy_us": record.busy_us}
-            shown = {key: str(value) for key, value in values.items()}
-            level, name = _LEVELS.get(record.mode, _WARNING), f"{self._ends.session}/{record.site}"
-            parts.append(cdr.Diagnosis(level, name, record.mode, shown))
-        self._diagnostics.put(cdr.pack_diagnostics(max(0, self._epoch_unix_ns + newest_ns), parts))
+        if self._diagnostics.heard:
+            self._diagnostics.put(pack_diagnostics(self._ends.session, self._epoch_unix_ns, records))
 
 
 def describe_target(
@@ -338,8 +343,8 @@ def describe_target(
         read = partial(read_joint_target, list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read, hand.turn
     if live.mode == "force":
-        return "target_wrench", WRENCH, partial(read_place_target, frame, axes, 6), hand.push
-    return "target_pose", POSE, partial(read_place_target, frame, axes, 7), hand.move
+        return "target_wrench", cdr.WRENCH, partial(read_place_target, frame, axes, 6), hand.push
+    return "target_pose", cdr.POSE, partial(read_place_target, frame, axes, 7), hand.move
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:

@@ -144,7 +144,7 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
                 others[connection.topic].append(message.data.tolist())
     for site in log.sites:
         part = log[site]
-        states, references = joints[f"/{site}/joint_states"], joints[f"/{site}/reference"]
+        states, references = joints[f"/lab/{site}/joint_states"], joints[f"/lab/{site}/reference"]
         assert [log_ns for log_ns, _ in states] == part.log_time_ns.tolist()
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in states]
         assert stamps == [EPOCH_NS + k * 10**6 for k in part.tick.tolist()]
@@ -153,11 +153,11 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
         assert np.array_equal([m.position for _, m in references], part.q_des)
         assert np.array_equal([m.velocity for _, m in references], part.qd_des)
         assert all(len(m.effort) == 0 for _, m in references)
-        assert np.array_equal(others[f"/{site}/error"], part.e)
-        assert np.array_equal(others[f"/{site}/tau_x"], part.tau_x)
-        assert np.array_equal(others[f"/{site}/theta_hat"], part.theta_hat)
-        assert others[f"/{site}/mode"] == [[float(Mode.RUN)]] * len(part)
-        assert len(others[f"/{site}/link_delay"]) == len(log.link_stats(site))
+        assert np.array_equal(others[f"/lab/{site}/error"], part.e)
+        assert np.array_equal(others[f"/lab/{site}/tau_x"], part.tau_x)
+        assert np.array_equal(others[f"/lab/{site}/theta_hat"], part.theta_hat)
+        assert others[f"/lab/{site}/mode_number"] == [[float(Mode.RUN)]] * len(part)
+        assert len(others[f"/lab/{site}/link_delay"]) == len(log.link_stats(site))
 
 
 def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: Log) -> None:
@@ -165,8 +165,8 @@ def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: L
     for topic, _, message in decoded(files["bag"], "/"):
         times[topic].append(message.publish_time)
     for site in log.sites:
-        for name in ("joint_states", "reference", "error", "tau_x", "theta_hat", "mode"):
-            assert times[f"/{site}/{name}"] == log[site].publish_time_ns.tolist()
+        for name in ("joint_states", "reference", "error", "tau_x", "theta_hat", "tip_pose", "mode_number"):
+            assert times[f"/lab/{site}/{name}"] == log[site].publish_time_ns.tolist()
 
 
 def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
@@ -185,12 +185,12 @@ def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
     assert metadata["trilat.source"]["session"] == "lab"
     assert scenario.data.decode() == SCENARIO.text
     with Reader(files["bag"]) as bag:
-        (profile,) = {tuple(c.ext.offered_qos_profiles) for c in bag.connections}
-        assert (profile[0].depth, profile[0].reliability.name, profile[0].durability.name) == (
-            10,
-            "RELIABLE",
-            "VOLATILE",
-        )
+        for connection in bag.connections:
+            (profile,) = connection.ext.offered_qos_profiles
+            latched = connection.topic.rpartition("/")[2] in ("mode", "dominance", "robot_description")
+            durability = "TRANSIENT_LOCAL" if latched else "VOLATILE"
+            found = profile.depth, profile.reliability.name, profile.durability.name
+            assert found == (1 if latched else 10, "RELIABLE", durability)
 
 
 LONG = [pytest.param(kind, marks=pytest.mark.long) for kind in ("virtual", "first part", "last part")]

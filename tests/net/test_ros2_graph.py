@@ -24,13 +24,13 @@ from trilat_net.net.ros2_graph import (
     QualityOfService,
     Refusals,
     Ros2Graph,
-    check_ros_name,
     find_misfit,
     find_type_hash,
     make_gid,
     parse_attachment,
     topic_key,
 )
+from trilat_net.net.ros2_names import check_ros_name
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import ZenohMode, make_zenoh_config
 

@@ -154,9 +154,11 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
     with path.open("rb") as stream:
         for _, channel, message, decoded in make_reader(
             stream, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages(topics=[f"/{site}/joint_states" for site in "abc"]):
+        ).iter_decoded_messages(
+            topics=[f"/{log().session['session']}/{site}/joint_states" for site in "abc"]
+        ):
             row = [*decoded.position, *decoded.velocity, *decoded.effort, message.publish_time]
-            found.setdefault(channel.topic.split("/")[1], []).append(row)
+            found.setdefault(channel.topic.split("/")[2], []).append(row)
     names = ("q1_rad", "q2_rad", "qd1_rad_s", "qd2_rad_s", "tau1_nm", "tau2_nm", "publish_time_ns")
     for site in "abc":
         rows = zip(*(wanted[f"{site}_state"][name] for name in names), strict=True)

@@ -71,7 +71,7 @@ def test_a_finished_log_with_views_is_opened_itself(files: dict[str, Path]) -> N
 
 def test_what_was_made_for_it_is_gone_when_viewer_is(files: dict[str, Path]) -> None:
     rerun, said = shown([files["live"]], ViewerOptions(full=True, save=Path("x.rrd")))
-    assert "/m/joint_states" in rerun.topics
+    assert "/lab/m/joint_states" in rerun.topics
     assert said == ["making standard channels of every record ..."]
     assert not rerun.log.exists()
     assert not rerun.layout.exists()
@@ -85,7 +85,7 @@ def test_parts_are_shown_as_one_and_a_torn_log_too(files: dict[str, Path], tmp_p
     for paths, name in ((parts, parts[0].name), ([torn], "run.mcap")):
         rerun, _ = shown(paths, ViewerOptions(save=Path("x.rrd")))
         assert rerun.log.name == name
-        assert {"/m/joint_states", "/s/error"} <= rerun.topics
+        assert {"/lab/m/joint_states", "/lab/s/error"} <= rerun.topics
 
 
 def test_a_name_that_rerun_does_not_take_is_replaced(files: dict[str, Path], tmp_path: Path) -> None:
@@ -177,11 +177,14 @@ def test_a_bag_shows_the_reference_beside_the_joints(
 ) -> None:
     of = boards(files)
     bag, views = of["bag"][1].pages["Motion"], of["live"][1].pages["Motion"]
-    assert [c.entity for c in bag[0][0].curves] == ["/m/joint_states/position", "/m/reference/position"]
+    assert [c.entity for c in bag[0][0].curves] == [
+        "/lab/m/joint_states/position",
+        "/lab/m/reference/position",
+    ]
     assert bag[0][0].curves[1].names == ("m_q1_ref", "m_q2_ref")
-    assert [c.entity for c in bag[2][0].curves] == ["/m/joint_states/effort", "/m/tau_x"]
+    assert [c.entity for c in bag[2][0].curves] == ["/lab/m/joint_states/effort", "/lab/m/tau_x"]
     assert views[2][0].curves[0].shown == (True, True, False, False)
-    assert of["bag"][1].lines == "/log"
+    assert of["bag"][1].lines == "/lab/log"
 
 
 def test_what_there_is_not_takes_no_room(files: dict[str, Path]) -> None:

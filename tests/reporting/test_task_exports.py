@@ -7,6 +7,7 @@ import csv
 import json
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -76,22 +77,39 @@ def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
         assert np.array_equal(frame.select(heads).to_numpy(), wanted)
 
 
+def list_numbers(message: Any) -> list[float]:
+    """The place, velocity or force of a stamped message."""
+    if hasattr(message, "pose"):
+        vector = message.pose.position
+    else:
+        vector = message.twist.linear if hasattr(message, "twist") else message.wrench.force
+    return [vector.x, vector.y, vector.z]
+
+
 def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
     path = exported("ros2", tmp_path)
     found: dict[str, list[list[float]]] = {}
     with AnyReader([path]) as bag:
         for connection, _, data in bag.messages():
-            if connection.topic.startswith("/s/") and connection.msgtype.endswith("Float64MultiArray"):
+            if connection.topic.startswith("/planar/s/") and connection.msgtype.endswith("Float64MultiArray"):
                 message = bag.deserialize(data, connection.msgtype)
                 found.setdefault(connection.topic, []).append(message.data.tolist())
+            if connection.topic.startswith("/planar/s/") and "geometry_msgs" in connection.msgtype:
+                message = bag.deserialize(data, connection.msgtype)
+                found.setdefault(connection.topic, []).append(list_numbers(message))
         types = {connection.topic: connection.msgtype for connection in bag.connections}
     part = log()["s"]
-    assert found["/s/reference"] == np.hstack([part.q_des, part.qd_des]).tolist()
-    assert found["/s/end_effector"] == np.hstack([part.x, part.xd]).tolist()
-    assert found["/s/wrench"] == part.wrench.tolist()
-    assert found["/s/error"] == part.e.tolist()
-    assert types["/s/joint_states"] == "sensor_msgs/msg/JointState"
-    assert types["/s/robot_description"] == "std_msgs/msg/String"
+    for topic, vectors in {
+        "reference_pose": part.q_des,
+        "reference_twist": part.qd_des,
+        "tip_pose": part.x,
+        "tip_twist": part.xd,
+        "tip_wrench": -part.wrench,
+        "error": part.e,
+    }.items():
+        assert np.array_equal([row[:3] for row in found[f"/planar/s/{topic}"]], vectors)
+    assert types["/planar/s/joint_states"] == "sensor_msgs/msg/JointState"
+    assert types["/planar/s/robot_description"] == "std_msgs/msg/String"
     assert types["/tf"] == "tf2_msgs/msg/TFMessage"
 
 
@@ -118,8 +136,8 @@ def test_messages_are_in_order_of_arrival(
     assert times == sorted(times)
     topics = [channel.topic for _, channel, _ in messages]
     assert sum(topic.endswith("/joint_states") for topic in topics) == sum(told) == 3 * 120
-    assert {"/m1/link_age", "/events", "/log"} <= set(topics)
-    assert not {"/m1/link_delay", "/m1/link_offset", "/m1/timing"} & set(topics)
+    assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(topics)
+    assert not {f"/paper/m1/{name}" for name in ("link_delay", "link_offset", "timing")} & set(topics)
 
 
 def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
@@ -128,7 +146,7 @@ def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     export_ros2(log, path)
     with path.open("rb") as stream:
-        states = [m for _, c, m in make_reader(stream).iter_messages("/m1/joint_states")]
+        states = [m for _, c, m in make_reader(stream).iter_messages("/paper/m1/joint_states")]
     assert len(states) == 100
 
 

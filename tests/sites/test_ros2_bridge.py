@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -30,8 +31,9 @@ from sites.ros2_bridge import (
     refuse_other_robots,
     show_session,
 )
-from sites.ros2_topics import Ends, RobotTable, SiteTopics, read_topic_table
+from sites.ros2_topics import Ends, SiteTopics
 from sites.running_session import ShareHistory
+from tests.log.standard_files import made
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
@@ -39,13 +41,15 @@ from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_
 from trilat_net.core.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
+from trilat_net.log.ros2.published import list_topics
+from trilat_net.log.ros2.topic_names import RobotTable, read_topic_table
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.membership import describe_member, liveliness_token
 from trilat_net.net.messages import Event
 from trilat_net.net.requests import ArmMeasurement, Backfill
-from trilat_net.net.ros2_graph import Attachment, Refusals
+from trilat_net.net.ros2_graph import Attachment, QualityOfService, Refusals
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.scenario import load_scenario
 
@@ -251,6 +255,7 @@ class Listener:
     def __init__(self) -> None:
         self.came: dict[str, Topic] = defaultdict(Topic)
         self.refusals, self.served = Refusals(print), list[str]()
+        self.offered: dict[str, tuple[str, bool]] = {}
 
     def subscribe(self, *_: object) -> None:
         pass
@@ -258,7 +263,8 @@ class Listener:
     def serve(self, service: str, _kind: str, _answer: object) -> None:
         self.served.append(service)
 
-    def publisher(self, topic: str, _kind: str, _qos: object) -> Topic:
+    def publisher(self, topic: str, kind: str, qos: QualityOfService) -> Topic:
+        self.offered[topic] = kind, qos.latched
         return self.came[topic]
 
 
@@ -513,20 +519,20 @@ def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
 class Sites:
     """The sites of a session: who they are, what they have noted, and records; a bridge that shows them."""
 
-    def __init__(self, noted: Sequence[Event]) -> None:
-        network, self._scenario = LocalNetwork(), load_scenario("paper")
+    def __init__(self, noted: Sequence[Event], scenario: str = "paper", session: str = "t") -> None:
+        network, self._scenario, self.session = LocalNetwork(), load_scenario(scenario), session
         bus, self._info = network.join(), b""
         past = {"channel": "event", "first": 0, "payloads": [*map(encode, noted)], "made": len(noted)}
         for site in self._scenario.names:
-            bus.announce(liveliness_token("t", site, 1))
-            bus.respond(topics.key("t", site, topics.INFO), lambda _: self._info)
+            bus.announce(liveliness_token(session, site, 1))
+            bus.respond(topics.key(session, site, topics.INFO), lambda _: self._info)
             kept = encode(Backfill(member=site, boot=1, **past))
-            bus.respond(topics.key("t", site, topics.PAST), lambda _, kept=kept: kept)
+            bus.respond(topics.key(session, site, topics.PAST), lambda _, kept=kept: kept)
         self._state, self._event = (
-            bus.publisher(topics.key("t", "s", channel)) for channel in (topics.STATE, topics.EVENT)
+            bus.publisher(topics.key(session, "s", channel)) for channel in (topics.STATE, topics.EVENT)
         )
         self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
-        self._ends: Any = Ends(self.graph, network.join(), SystemClock(), "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+        self._ends: Any = Ends(self.graph, network.join(), SystemClock(), session, read_topic_table("crisp"))  # type: ignore[arg-type]
 
     def begin(self, epoch_unix_ns: int) -> None:
         about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
@@ -536,8 +542,9 @@ class Sites:
     def ticks(self, k: int) -> None:
         zeros = [0.0, 0.0]
         motion = zeros, zeros, zeros, zeros, zeros, zeros, [0.0] * 5
-        record = TickRecord(k, k * 10**6, Mode.RUN, *motion, [-1, -1], 0, [], [])
-        self._state(encode_state("s", 1, ["m1", "m2"], record, (), 0, 0))
+        peers = self._scenario.peers("s")
+        record = TickRecord(k, k * 10**6, Mode.RUN, *motion, [-1] * len(peers), 0, [], [])
+        self._state(encode_state("s", 1, peers, record, (), 0, 0))
 
     @contextmanager
     def shown(self) -> Iterator[threading.Thread]:
@@ -549,7 +556,7 @@ class Sites:
         bridge = threading.Thread(target=show)
         self.graph.came.clear()  # before the bridge takes its topics from it
         bridge.start()
-        until(lambda: self.ticks(7) or self.graph.came["t/s/joint_states"])  # type: ignore[func-returns-value]
+        until(lambda: self.ticks(7) or self.graph.came[f"{self.session}/s/joint_states"])  # type: ignore[func-returns-value]
         yield bridge
         over.set()
         bridge.join()
@@ -591,3 +598,43 @@ def test_shares_that_were_changed_before_are_shown() -> None:
         (told,) = until(lambda: sites.graph.came["t/s/dominance"])
         assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [0.75, 0.25]
         assert {"t/stop", "t/s/stop", "t/m1/reset", "t/end"} <= set(sites.graph.served)
+
+
+def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
+    """Type of every topic of a bag, and whether it is latched, by rosbags."""
+    with Reader(path) as bag:
+        return {
+            one.topic.removeprefix("/"): (
+                one.msgtype,
+                one.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL",  # type: ignore[union-attr]
+            )
+            for one in bag.connections
+        }
+
+
+def test_a_bag_has_the_topics_of_the_live_bridge(tmp_path: Path) -> None:
+    bag = list_bag(made(tmp_path)["bag"])
+    sites = Sites([], "two_sites", "lab")
+    sites.begin(10**18)
+    with sites.shown():
+        live = dict(sites.graph.offered)
+    assert bag == live
+    assert {"tf", "diagnostics", "lab/s/robot_description", "lab/m/tip_pose", "lab/log"} <= bag.keys()
+
+
+@pytest.mark.parametrize("name", ["six_joints", "wall_in_space", "box", "handover"])
+@pytest.mark.parametrize("naming", ["crisp", "crtk"])
+def test_bags_of_other_scenarios_have_no_topic_of_their_own(tmp_path: Path, name: str, naming: str) -> None:
+    log = trilat_net.simulate(name, {"duration_s": 0.02})
+    trilat_net.export(log, "ros2", tmp_path / "bag.mcap", names=naming)
+    graph, table = Listener(), read_topic_table(naming)
+    ends: Any = Ends(graph, None, None, name, table)  # type: ignore[arg-type]
+    for site in log.sites:
+        SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+    planned = list_topics(log.scenario, name, table)
+    assert {topic: offer for topic, offer in graph.offered.items() if topic in planned} == graph.offered
+    bag = list_bag(tmp_path / "bag.mcap")
+    assert bag == {topic: (planned[topic].kind, planned[topic].latched) for topic in bag}
+    assert graph.offered.items() >= {topic: bag[topic] for topic in bag if topic in graph.offered}.items()
+    missing = {topic.rpartition("/")[2] for topic in planned.keys() - bag.keys()}
+    assert missing <= {"link_delay", "link_offset", "timing", "events", "log"}  # of live sessions alone

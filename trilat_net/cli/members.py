@@ -502,11 +502,12 @@ def ros2_command(
         names: Names of topics, or a TOML file of them and of robots.
     """
     from sites.ros2_bridge import serve_ros2
-    from sites.ros2_topics import read_topic_table
     from sites.running_session import RunningSession
 
+    from ..log.ros2.topic_names import read_topic_table
     from ..net.host_names import check_hosts
-    from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph, check_ros_name
+    from ..net.ros2_graph import DISTROS, Refusals, Ros2Graph
+    from ..net.ros2_names import check_ros_name
     from ..net.zenoh_config import BRIDGE
 
     if distro not in DISTROS:

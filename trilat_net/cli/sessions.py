@@ -212,7 +212,8 @@ def _benchmark(
 def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool) -> None:
     from sites.session_ping import ping_topic
 
-    from ..net.ros2_graph import Refusals, Ros2Graph, check_ros_name
+    from ..net.ros2_graph import Refusals, Ros2Graph
+    from ..net.ros2_names import check_ros_name
 
     name, clock = check_ros_name(topic, "topic"), SystemClock()
     graph = Ros2Graph(

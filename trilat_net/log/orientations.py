@@ -18,7 +18,6 @@ Invariant:
 - Rotation vectors of any length are taken.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -89,7 +88,7 @@ def bring_nearer(turns: Array, references: Array) -> Array:
 
 
 def find_steady_vectors(turns: Array) -> Array:
-    """Returns rotation vectors, shape (K, 3), rad, that pass half a turn without a jump, up to a whole turn."""
+    """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns have them."""
     quaternions = find_quaternions(turns)
     w, v = quaternions[:, :1], quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
@@ -110,6 +109,8 @@ class SteadyQuaternion:
     def follow(self, quaternion: Sequence[float]) -> tuple[float, ...]:
         """Returns a quaternion or its negative, which is the same rotation."""
         last = self._last
-        dot = math.sumprod(quaternion, last) if last else quaternion[self._w]
+        dot = quaternion[self._w]
+        if last:
+            dot = sum(a * b for a, b in zip(quaternion, last, strict=True))
         self._last = tuple(-one for one in quaternion) if dot < 0.0 else tuple(quaternion)
         return self._last

@@ -11,7 +11,6 @@ delay its caller.
 """
 
 import hashlib
-import re
 import struct
 import threading
 from collections import Counter
@@ -33,7 +32,9 @@ from .zenoh_config import Endpoint
 TYPE_HASHES = {
     "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "geometry_msgs/msg/TwistStamped": "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
     "geometry_msgs/msg/WrenchStamped": "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
+    "rcl_interfaces/msg/Log": "e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
     "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "std_msgs/msg/Float64MultiArray": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
     "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
@@ -44,7 +45,6 @@ TYPE_HASHES = {
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 _NO_HASH = "TypeHashNotSupported"
 """What Humble writes in place of a hash."""
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
@@ -101,17 +101,6 @@ def parse_attachment(found: Any) -> Attachment | None:
         return None
     number, sent_unix_ns, _, gid = _ATTACHMENT.unpack(data)
     return Attachment(number, sent_unix_ns, gid)
-
-
-def check_ros_name(name: str, what: str) -> str:
-    """Returns a name of ROS without the slash before it.
-
-    Raises:
-        UsageError: it is none.
-    """
-    if not _NAME.fullmatch(bare := name.removeprefix("/")):
-        raise UsageError(f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /")
-    return bare
 
 
 def find_type_hash(kind: str, distro: str) -> str:

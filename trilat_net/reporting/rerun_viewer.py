@@ -22,9 +22,10 @@ from ..errors import RunFailed, UsageError
 from ..files import import_extra
 from ..log.log_layout import ACTIVE_SUFFIX
 from ..log.log_reader import Log
-from ..log.ros2.cdr import JOINT_STATE, TRANSFORMS
+from ..log.ros2.cdr import JOINT_STATE, STRING, TRANSFORMS
 from ..log.ros2.robot_model import WORLD
 from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, SENT_PREFIX, Ros2Channel, read_ros2_channels
+from ..log.ros2.topic_names import DIAGNOSTICS
 from .exports.ros2 import export_ros2
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
@@ -113,6 +114,8 @@ def _free_port() -> int:
 
 
 Ros2Channels = Mapping[str, Ros2Channel]
+_SESSION_TOPICS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
+"""Last parts of the names of topics that are of no site."""
 
 
 class PlotCurves(NamedTuple):
@@ -145,7 +148,7 @@ _PAGES = {
         ("estimated masses", "kg", (("theta_hat", "m"),)),
         ("estimated first moments", "kg m", (("theta_hat", "mc"),)),
         ("estimated moments of inertia", "kg m^2", (("theta_hat", "I"),)),
-        ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""),)),
+        ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""), ("mode_number", ""))),
     ),
     "Links, timing": (
         ("age of samples in use, by peer", "ms", (("link_age", ""),)),
@@ -170,7 +173,7 @@ class PlotLayout(NamedTuple):
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
     """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session `<root>/log`."""
-    session = [topic for topic in channels if topic.rpartition("/")[2] in (EVENTS, LINES, FRAMES)]
+    session = [topic for topic in channels if topic.rpartition("/")[2] in _SESSION_TOPICS]
     roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
     pages = {
         name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
@@ -199,7 +202,7 @@ def _row(
 
 
 def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves | None:
-    if channel is None:
+    if channel is None or channel.kind == STRING:
         return None
     axes = (axis.split(" ") for axis in channel.about.get("names", "").split("; "))
     names = tuple(" ".join(filter(None, one)) for one in product(*axes))

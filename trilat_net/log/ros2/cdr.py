@@ -20,6 +20,9 @@ FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
 LOG = "rcl_interfaces/msg/Log"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
 _LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
@@ -28,7 +31,17 @@ DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
 """Texts of ROS: types with the types of their fields, the quality of service of a bag, the planar arm."""
 ROS2_SCHEMAS = {
     name: (DEFINITIONS / f"{name.rpartition('/')[2]}.msg").read_bytes()
-    for name in (JOINT_STATE, FLOAT64_ARRAY, STRING, TRANSFORMS, LOG)
+    for name in (
+        JOINT_STATE,
+        FLOAT64_ARRAY,
+        STRING,
+        TRANSFORMS,
+        LOG,
+        POSE,
+        TWIST,
+        WRENCH,
+        DIAGNOSTICS,
+    )
 }
 """Complete definitions of the types that are packed here, by name."""
 
@@ -134,7 +147,11 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
-    """Returns a `PoseStamped` (x, y, z, m, and a quaternion) or a `WrenchStamped` (N, N m) of a frame."""
+    """Returns a message of vectors in a frame.
+
+    It is a `PoseStamped` (x, y, z, m, and the quaternion x, y, z, w), a `TwistStamped` (m/s, rad/s) or a
+    `WrenchStamped` (N, N m).
+    """
     head = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, frame)
     return _HEAD + head + b"\0" * (-len(head) % 8) + struct.pack(f"<{len(numbers)}d", *numbers)
 

@@ -5,7 +5,7 @@ one file stand beside each other below `WORLD`. A file without shapes gets plain
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -135,7 +135,13 @@ class RobotModel:
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
         """Returns the transforms of a time (Unix ns, not below 0) at positions q as one message."""
-        numbers = [x for origin, turned in self.transforms(q) for x in (*origin, *turned)]
+        return self.pack_transforms(stamp_ns, self.transforms(q))
+
+    def pack_transforms(
+        self, stamp_ns: int, transforms: Iterable[tuple[Sequence[float], Sequence[float]]]
+    ) -> bytes:
+        """Returns the transforms of a time as one message: origins, m, and quaternions x, y, z, w."""
+        numbers = [x for origin, turned in transforms for x in (*origin, *turned)]
         return self._packer.pack(stamp_ns, numbers)
 
 

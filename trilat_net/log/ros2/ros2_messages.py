@@ -38,27 +38,28 @@ ROBOT, FRAMES = "robot_description", "tf"
 
 
 class Ros2Channel(NamedTuple):
-    """A standard channel: the type of its messages, and its metadata."""
+    """A standard channel: type of its messages, metadata, and whether late subscribers get the last one."""
 
     kind: str
     about: dict[str, str]
+    latched: bool = False
 
 
 class StandardChannels:
     """The channels of a file, of all that are known by topic; each is registered with its first message."""
 
-    def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel], **about: str) -> None:
-        self._file, self._known, self._about = file, known, about
+    def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
+        self._file, self._known = file, known
         self._numbers: dict[str, int] = {}  # of schemas by their kind, and of channels by their topic
 
     def __getitem__(self, topic: str) -> int:
         if topic not in self._numbers:
-            kind, about = self._known[topic]
+            kind, about, _ = self._known[topic]
             if kind not in self._numbers:
                 schema = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind])
                 self._numbers[kind] = schema
-            own = self._numbers[kind], {**self._about, **about}
-            self._numbers[topic] = self._file.register_channel(topic, cdr.ENCODING, *own)
+            schema = self._numbers[kind]
+            self._numbers[topic] = self._file.register_channel(topic, cdr.ENCODING, schema, about)
         return self._numbers[topic]
 
 
@@ -105,7 +106,7 @@ class Ros2SiteChannels:
     Attributes:
         joints: names of its joints: those of its file, or numbered ones of a planar arm.
         arrays: the channels that are arrays, by the last part of their topic.
-        task: the names of those that stand for the end effector, in task space; else ().
+        record_arrays: the names of those that a record has; the others are of statistics.
         error_row: of a row of `stack_signals`, behind the joints, the error e = q - q_des, Eq. (9).
         slow_row: the rest: tau_x, theta_hat, what the law sends, mode.
         robot: the arm for viewers, or None where arms are planar ones alone.
@@ -126,6 +127,7 @@ class Ros2SiteChannels:
             estimate = ("estimate", "kg, kg m, kg m^2")
         sent = _make_sent_channels(scenario, site)
         self._slow = ("tau_x", "theta_hat", *sent, "mode")
+        self.record_arrays = ("error", *self._slow)
         self.arrays = {
             "error": ArrayChannel("x - x_des", "m or rad", axes)
             if arm.shares_pose
@@ -141,13 +143,6 @@ class Ros2SiteChannels:
             ),
             "timing": ArrayChannel("largest in the last 100 ms", "us", ("lateness", "computing_time")),
         }
-        self.task = ("reference", "end_effector", "wrench") if arm.shares_pose else ()
-        motion = "m and m/s, rad and rad/s"
-        for name in self.task[:2]:
-            what = "end effector" if name == "end_effector" else "its reference"
-            self.arrays[name] = ArrayChannel(what, motion, ("pose", "derivative"), axes)
-        if self.task:
-            self.arrays["wrench"] = ArrayChannel("tau_x at the end effector", "N or N m", axes)
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
@@ -172,12 +167,6 @@ class Ros2SiteChannels:
             array = self.arrays[name]
             yield name, array.pack(*row[start : start + array.size])
             start += array.size
-
-    def end_effector(self, state: "Record") -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one record that stand for the end effector; none in joint space."""
-        rows = (state.q_des, state.qd_des), (state.x, state.xd), (state.wrench,)
-        for name, vectors in zip(self.task, rows, strict=False):
-            yield name, self.arrays[name].pack(*(value for vector in vectors for value in vector))
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields the arrays of one statistics; those of clocks and networks only in a live session."""

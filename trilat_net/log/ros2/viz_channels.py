@@ -85,7 +85,7 @@ class _SiteBuckets:
         self.most_pending_bytes = MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
         self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
         own = {"joint_states": shapes.joint_states(names), **shapes.channels}
-        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in own if name not in shapes.task}
+        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in own}
         self.channels = {topic: own[name] for name, topic in self._topics.items()}
         self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
