@@ -2,7 +2,7 @@
 
 Invariant: no message is lost that arrived, or that a site still buffers. Messages are stamped on arrival and
 wait in one bounded queue; one thread writes. The file is flushed every 100 ms and completed on every orderly
-end of the process.
+end of the process. A signal ends it when it has what the sites hold, a second one at once.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from trilat_net import process
+from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
@@ -30,12 +31,25 @@ from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
 
 POLL_NS = 10_000_000
+END_NS = 10_000_000_000
+"""Longest time after a signal for what the sites still hold; they hold it as long as that, see `sites`."""
 FLUSH_NS = 65_000_000
 """Between two turns of writing, each of which ends in a flush: a crash loses this. Fewer turns cost less."""
 
 
 class Recorder:
-    """One recording, from the first poll to the end mark of the file."""
+    """One recording, from the first poll to the end mark of the file.
+
+    Args:
+        bus: the connection to the session.
+        clock: the time.
+        session: the session's name.
+        boot: the number of this start of the recorder.
+        storage: where the log goes.
+        stopped: returns True once it is to end at once.
+        say: prints a line for the user.
+        is_ending: returns True once it is to end as soon as it has what the sites hold, after `END_NS` at most.
+    """
 
     def __init__(
         self,
@@ -46,9 +60,11 @@ class Recorder:
         storage: LogStorage,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
+        is_ending: Callable[[], bool] = lambda: False,
     ) -> None:
         self._bus, self._clock, self._session, self._storage = bus, clock, session, storage
         self._stopped, self._say = stopped, say
+        self._is_ending = is_ending
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._queue.take)
@@ -65,7 +81,7 @@ class Recorder:
             SessionError: none began in time.
         """
         begun_ns = self._clock.monotonic_ns()
-        while not self._stopped():
+        while not (self._stopped() or self._is_ending()):
             epoch = self._joining.poll()
             if epoch is not None:
                 return epoch
@@ -138,8 +154,19 @@ class Recorder:
             recording.presence(*change)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
+        ending_ns: int | None = None
         while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
             since_ns = self._clock.monotonic_ns()
+            if ending_ns is None and self._is_ending():
+                ending_ns = since_ns
+                self._say(
+                    f"recorder: asks for the records that are missing, {END_NS // NS_PER_S} s at most; "
+                    "Ctrl-C a second time ends it at once"
+                )
+            if ending_ns is not None and (
+                since_ns - ending_ns > END_NS or recording.is_up_to_date(ending_ns, since_ns)
+            ):
+                return
             self._publisher.answer_queries()
             recording.write(self._queue, since_ns)
             self._watch_presence(recording)
@@ -196,7 +223,9 @@ def record_session(
         )
         if bus is None:
             return interrupt.exit_code
-        recorder = Recorder(bus, clock, session, boot, storage, interrupt.requested, say)
+        recorder = Recorder(
+            bus, clock, session, boot, storage, interrupt.insists, say, is_ending=interrupt.requested
+        )
         process.freeze_gc()  # in a session its pauses would be time that a crash can lose
         epoch = recorder.join(join_timeout_s)
         if epoch is None:

@@ -25,6 +25,10 @@ from .site_reception import InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""
+RECONNECT_NS = 10_000_000_000
+"""Time for a site that has ended and keeps records that are missing, if its connection broke."""
+HEARD_NS = 500_000_000
+"""A site that was heard within this time is there."""
 UNDER_WAY_NS = 100_000_000
 """A message that arrives within this time of the end of its site's token was under way."""
 AWAY_NS = 15_000_000_000
@@ -259,7 +263,27 @@ class Recording:
         patience_ns = SETTLE_NS
         if self._sites[site].made is None:
             patience_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
+        elif not self._sites[site].full:
+            patience_ns = RECONNECT_NS
         return now_ns - since_ns > patience_ns
+
+    def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
+        """True once nothing more can be had of any site, since the recorder was asked to end.
+
+        A site that goes on is one that is heard `SETTLE_NS` after that, without an end, and lacks nothing.
+
+        Args:
+            ending_ns: when the recorder was asked to end, on its monotonic clock.
+            now_ns: the time on that clock.
+        """
+        for name, site in self._sites.items():
+            if self._has_left(name, now_ns):
+                continue
+            heard_ns = site.heard_ns or 0
+            is_running = site.made is None and now_ns - heard_ns < HEARD_NS and not site.wanted
+            if not (is_running and now_ns - ending_ns > SETTLE_NS):
+                return False
+        return True
 
     def flush(self) -> None:
         """Hands everything so far to the operating system."""
@@ -290,7 +314,7 @@ class Recording:
         for name, site in self._sites.items():
             account = site.accounts[topics.STATE]
             total = (
-                " records of a number that it never said"
+                " records, its end is unknown"
                 if site.made is None
                 else f" of {account.expected} records"
             )

@@ -262,9 +262,14 @@ class SiteReception:
                 self.expect(channel, count_messages(channel, content.ticks, self._rate_hz))
 
     @property
+    def wanted(self) -> bool:
+        """True while a message is missing that can still be had."""
+        return any(account.wanted() for account in self.accounts.values())
+
+    @property
     def full(self) -> bool:
         """True once it has ended and no missing message can still be had."""
-        return self.made is not None and not any(account.wanted() for account in self.accounts.values())
+        return self.made is not None and not self.wanted
 
     def give_up(self) -> None:
         """Counts all missing messages as lost for good."""

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
@@ -46,8 +47,11 @@ START_S = 10
 """Time for a site to start, s, where many share a few processors."""
 JOIN_S, WAIT_S = 60, 600
 """For so long sites wait for each other and for the recorder, s; the second where people begin a session."""
-END_TIMEOUT_NS = 15 * NS_PER_S
-"""Time for a child to end after its signal; then it is killed."""
+END_TIMEOUT_NS = 45 * NS_PER_S
+"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the recorder, and as long
+again after every question of one that was behind."""
+RECORDER_NS = 2 * NS_PER_S
+"""Time for the recorder to write what is under way, once all sites have ended."""
 
 
 @dataclass(slots=True)
@@ -193,7 +197,7 @@ def run_demo(
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
                     starter.poll()
         finally:
-            _end_all(starter, (sites, recorder), clock)
+            _end_all(starter, sites, recorder, clock, interrupt, display.say)
         result.interrupted = interrupt.number
     for child in [*sites, *recorder]:
         problem = child.problem()
@@ -250,18 +254,59 @@ def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     return bool(result.problems) or all(child.code == 0 for child in children)
 
 
-def _end_all(starter: ProcessStarter, groups: Sequence[list[SessionProcess]], clock: Clock) -> None:
-    """Ends the sites, then the recorder, which by then has all their messages."""
-    for group in groups:
-        for child in group:
-            child.end(signal.SIGINT)
-        give_up_ns = clock.monotonic_ns() + END_TIMEOUT_NS
-        while any(child.code is None for child in group):
-            if clock.monotonic_ns() > give_up_ns:
-                for child in group:
-                    child.end(signal.SIGKILL)
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
-            starter.poll()
+def _end_all(
+    starter: ProcessStarter,
+    sites: list[SessionProcess],
+    recorder: list[SessionProcess],
+    clock: Clock,
+    interrupt: Interrupt,
+    say: Callable[[str], None],
+) -> None:
+    """Ends the sites, then the recorder, which by then has all their messages.
+
+    A second signal of the user's reaches all of them, and ends them at once.
+    """
+    tell = partial(
+        say,
+        "the sites keep their last records until the recorder has them, 10 s at most; "
+        "Ctrl-C a second time ends it at once",
+    )
+    _end_group(starter, sites, clock, interrupt.insists, tell)
+    sites_left_ns = clock.monotonic_ns()
+
+    def may_insist() -> bool:
+        """True once the recorder has had its time: without sites there is nothing that it could ask for."""
+        return interrupt.insists() or clock.monotonic_ns() - sites_left_ns > RECORDER_NS
+
+    _end_group(starter, recorder, clock, may_insist, lambda: None)
+
+
+def _end_group(
+    starter: ProcessStarter,
+    group: list[SessionProcess],
+    clock: Clock,
+    insists: Callable[[], bool],
+    tell: Callable[[], None],
+) -> None:
+    """Ends processes in order, and at once as soon as `insists` returns True; `tell` says why it takes long."""
+    for process in group:
+        process.end(signal.SIGINT)
+    begun_ns = clock.monotonic_ns()
+    is_told = has_insisted = False
+    while any(process.code is None for process in group):
+        waited_ns = clock.monotonic_ns() - begun_ns
+        if insists() and not has_insisted:
+            has_insisted = True
+            for process in group:
+                process.end(signal.SIGINT)
+        if waited_ns > NS_PER_S and not is_told:
+            is_told = True
+            tell()
+        if waited_ns > END_TIMEOUT_NS:
+            for process in group:
+                process.end(signal.SIGKILL)
+        clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
+        starter.poll()
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:

@@ -58,10 +58,11 @@ NOBODY = -1
 """No start of a peer that is not there yet."""
 STATUS_TICKS_S = 5
 """Between two lines that say how a site does, s."""
-LINGER_NS = 5 * NS_PER_S
-"""Longest wait after the last query of a recorder."""
-LAST_EVENT_NS = 100_000_000
-"""Wait for the last event of a recorder that is gone."""
+LINGER_NS = 10 * NS_PER_S
+"""Longest wait after the last query of a recorder. One whose process was frozen, or whose connection broke,
+needs seconds to connect again: that takes the lease of Zenoh, 5 s, and one attempt after that."""
+TELL_NS = NS_PER_S
+"""A wait of this length is announced to the user."""
 LEAVE_TIMEOUT_NS = 2 * NS_PER_S
 """Wait after a recorder that has everything is gone: its process ends."""
 QUERIED_NS = NS_PER_S
@@ -456,20 +457,35 @@ class RunningSite:
         self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
-        """Waits until every recorder present has stored all, then for `stay_s` until they are gone."""
+        """Waits until every recorder present has stored all, then for `stay_s` until they are gone.
+
+        A signal does not shorten the first wait, since records that are not stored are lost with this process;
+        a second signal ends it.
+        """
         parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
-        interrupted = parts.interrupt.requested
-        give_up_ns, queried_ns = clock.monotonic_ns() + LINGER_NS, 0
-        while clock.monotonic_ns() < give_up_ns and not (monitor.all_stored and interrupted()):
-            while parts.buffer.answer_query():
+        begun_ns = clock.monotonic_ns()
+        give_up_ns, queried_ns = begun_ns + LINGER_NS, 0
+        is_announced = False
+        while clock.monotonic_ns() < give_up_ns and not self._may_leave():
+            while not parts.interrupt.insists() and parts.buffer.answer_query():
                 queried_ns = clock.monotonic_ns()
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
             self._publisher.answer_queries()
             monitor.watch(self._publisher, self._t_ns)
-            gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
-            if gone and (monitor.stored or interrupted()):  # else one may come back whose connection broke
-                patience_ns = LEAVE_TIMEOUT_NS if monitor.stored else LAST_EVENT_NS
-                give_up_ns = min(give_up_ns, clock.monotonic_ns() + patience_ns)
+            is_gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
+            if is_gone and monitor.stored:  # one that has not stored all may come back
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
             if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+            if not (is_announced or monitor.all_stored) and clock.monotonic_ns() - begun_ns > TELL_NS:
+                is_announced = True
+                parts.say(
+                    f"keeps its last records until the recorder has them, {LINGER_NS // NS_PER_S} s at most; "
+                    "Ctrl-C a second time ends it at once"
+                )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+
+    def _may_leave(self) -> bool:
+        """True if the user insists, or wants the end and every recorder present has stored all."""
+        interrupt = self._parts.interrupt
+        return interrupt.insists() or (self._parts.monitor.all_stored and interrupt.requested())

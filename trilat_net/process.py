@@ -93,12 +93,14 @@ ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) 
 class Interrupt:
     """A context that records the first signal that ends a program, as `number` (else 0).
 
+    The first signal asks for an orderly end, which may take seconds; a second one `insists` on an end at once.
     Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it `compiles`, and nothing else
     is to be ended in order, a signal ends the process at once while the compiler runs.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
         self.number, self.compiles = 0, compiles
+        self._arrived = 0
         self._before: dict[int, Any] = {}
         self.raises = False
 
@@ -119,6 +121,7 @@ class Interrupt:
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number
+        self._arrived += 1
         if self.raises:
             raise KeyboardInterrupt
 
@@ -139,6 +142,10 @@ class Interrupt:
     def requested(self) -> bool:
         """True once a signal has arrived."""
         return self.number != 0
+
+    def insists(self) -> bool:
+        """True once a second signal has arrived."""
+        return self._arrived > 1
 
     @property
     def exit_code(self) -> int:
