@@ -107,7 +107,7 @@ class Asked:
 
     step: Step
     from_ns: int = 0
-    replies: dict[str, tuple[dict[str, float], int]] = field(default_factory=dict)
+    replies: dict[str, tuple[dict[str, float | None], int]] = field(default_factory=dict)
 
 
 class Stage:
@@ -223,5 +223,5 @@ class Stage:
             if step.kind == "consent":
                 found["text"] = protocol.consent
             if step.form is not None:
-                found["form"] = msgspec.to_builtins(step.form)
+                found["form"] = {**msgspec.to_builtins(step.form), "forced": step.form.is_forced}
         return found

@@ -128,11 +128,11 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
     Attributes:
         key: of the step, as the page was shown it.
-        answers: of a questionnaire, in the order of its items.
+        answers: of a questionnaire, in the order of its items; None for an item that was left out.
     """
 
     key: Name
-    answers: Annotated[list[float], Meta(max_length=40)] = []
+    answers: Annotated[list[float | None], Meta(max_length=40)] = []
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):

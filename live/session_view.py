@@ -27,7 +27,7 @@ from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
 from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
-from trilat_net.scenario.run_changes import LinkTables
+from trilat_net.scenario.run_changes import LinkTables, find_orderer
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
@@ -64,6 +64,7 @@ class SiteView:
         record, stats: the newest; None before the first.
         holds_from: its first tick that was seen.
         holder: who took hold of its arm last.
+        stopped_by: who ordered its last stop, as far as its events say.
         bodies: poses of its plant's bodies by tick, as far back as the window reaches; {} without bodies.
         layout: of its records, if it may go on without a lost one of its peers; else None.
     """
@@ -77,6 +78,7 @@ class SiteView:
         self.hand = scenario.sites[name].find_live_hand(is_open=True)
         self.reception, self.window = SiteReception(scenario, name, boot), window
         self.holder = ""
+        self.stopped_by = ""
         self.bodies: dict[int, list[float]] = {}
         self.dropped: Counter[str] = Counter()
         self.repair = GapRepair(bus, session, self.reception, self.dropped)
@@ -90,7 +92,10 @@ class SiteView:
         if record is None or not self.glides or self.ended:
             return None
         lost = self.layout.find_lost(record.mem, self.peers) if self.layout is not None else ()
-        return find_alarm(session, name, record.mode, record.mem, len(record.q_des), lost)
+        alarm = find_alarm(session, name, record.mode, record.mem, len(record.q_des), lost)
+        if alarm is not None and alarm.order == "enable" and self.stopped_by:
+            return alarm._replace(reason=f"ordered by {self.stopped_by}")
+        return alarm
 
     @property
     def ended(self) -> bool:
@@ -276,6 +281,8 @@ class SessionView:
             words, took_hold, _ = content.text.partition(f" {TAKEN} ")
             if content.kind == "hand" and took_hold:
                 site.holder = words.removeprefix(f"{name}: ")
+            if content.kind == "change":
+                site.stopped_by = find_orderer(content.text) or site.stopped_by
             if content.command and content.kind == "change":
                 self._change(name, content.command)
 

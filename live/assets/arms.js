@@ -258,9 +258,12 @@ export class Arms {
     const sites = Object.entries(hello.sites);
     this.cards = sites.map(([name, about], n) => new ArmCard(parent, name, about, n, sites.length));
     this.byName = Object.fromEntries(this.cards.map((card) => [card.name, card]));
-    const main = hello.as || sites.find(([, about]) => about.role === "slave")?.[0] || sites.at(-1)[0];
-    this.byName[main].card.classList.add("main"); // a user's own arm, or where the work is done
-    parent.classList.toggle("three", sites.length === 3);
+    const slave = sites.find(([, about]) => about.role === "slave")?.[0];
+    const main = (hello.stage && slave) || hello.as || slave || sites.at(-1)[0];
+    this.byName[main].card.classList.add("main"); // where an experiment's task is, a user's own arm, or where the work is done
+    parent.classList.toggle("three", sites.length === 3 && !hello.stage);
+    parent.classList.toggle("task", Boolean(hello.stage) && sites.length > 1);
+    parent.style.setProperty("--others", Math.max(1, sites.length - 1));
     this.parent = parent;
     this.shared = null;
     for (const kind of ["pointermove", "pointerdown"]) parent.addEventListener(kind, (event) => this.raise(event), true);

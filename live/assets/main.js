@@ -25,7 +25,7 @@ export function send(message) {
 
 const FINGERS = matchMedia("(pointer: coarse)");
 const LATE_MS = 1000;
-const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages, #alarms button";
+const CONTROLS = "#link-form input, #link-form select, #link-form button, #mark, #mark-text, #end, #ages";
 const stage = new Stage(send); // of an experiment; without one it shows nothing
 
 let hidesAt = 0;
@@ -48,6 +48,10 @@ function enable() { // controls act as long as the session runs and the page tak
   const ended = Boolean(page.frame?.ended);
   const able = page.takesPart && !late && !ended;
   for (const control of document.querySelectorAll(CONTROLS)) control.disabled = !able;
+  for (const button of document.querySelectorAll("#alarms button")) { // who does not take part yet begins with that
+    button.disabled = late || ended;
+    button.textContent = page.takesPart ? RELEASES[button.dataset.order] : page.asks ? "asking ..." : "Take part";
+  }
   $("part").disabled = late || ended;
   $("stop").disabled = !page.stops || ended || socket?.readyState !== WebSocket.OPEN;
   document.body.classList.toggle("ended", ended);
@@ -68,7 +72,7 @@ function advise(frame) {
   if (frame.silent_s) return tell(`No site has been heard for ${Math.floor(frame.silent_s)} s: what this page shows is old. It waits, and goes on as soon as they are heard.`, "late");
   const still = Object.values(frame.sites).some(({ alarm }) => alarm?.order);
   if (still && hello.role !== "experimenter") return tell("Arms are stopped; the experimenter lets them follow again.");
-  if (still && !frame.takes_part) return tell("Arms are stopped. Press “take part” to let them follow again.");
+  if (still && !frame.takes_part) return tell("Arms are stopped. Take part to let them follow again.");
   if (still) return tell("Arms are stopped. The button beside the reason lets them follow again.");
   if (held.length) return tell(`You hold ${held.join(" and ")}: lead the end where it shall go, and let go when you are there.`);
   const where = hello.as ? "your arm" : able.length > 1 ? "an arm" : able[0];
@@ -238,8 +242,11 @@ function raise({ word, reason, advice, order, names }) {
   if (order && page.hello.role === "experimenter") {
     const button = add("button", RELEASES[order]);
     button.type = "button";
-    button.dataset.tip = order === "enable" ? "these arms follow their peers again" : "end the fault; these arms follow their peers again";
-    button.addEventListener("click", () => { if (!send({ do: "release", order, sites: names })) notice("not connected: nothing was ordered"); });
+    button.dataset.order = order;
+    button.addEventListener("click", () => {
+      const message = page.takesPart ? { do: "release", order, sites: names } : { do: "control", want: true };
+      if (!send(message)) notice("not connected: nothing was ordered");
+    });
   }
   return block;
 }

@@ -169,27 +169,44 @@ export class Stage {
     make(card, "p", waits.length ? `Waiting for ${waits.join(" and ")}.` : "Thank you.", "waits");
   }
 
-  form(card, shown) {
+  form(card, shown) { // an item that nobody touches has no answer: it is sent as null, once people were told
     const { form } = shown;
     make(card, "h2", form.title || form.name);
     if (shown.done) return this.others(card, shown);
     const answers = new Map();
     const sheet = make(card, "form");
     const items = Object.entries(form.items);
-    const done = () => { send.disabled = answers.size < items.length; };
+    const fields = new Map();
+    let told = false;
     for (const [name, text] of items) {
       const field = make(sheet, "fieldset");
+      fields.set(name, field);
       make(field, "legend", text);
       const [low, high] = form.ends[name] || [form.low, form.high];
       const row = make(field, "div", "", "scale");
       const count = (form.most - form.least) / form.step + 1;
+      const set = (value) => { answers.set(name, value); show(); };
       make(row, "span", low, "soft");
-      if (count > MOST_BUTTONS) this.slider(row, name, form, (value) => { answers.set(name, value); done(); });
-      else this.buttons(row, name, form, (value) => { answers.set(name, value); done(); });
+      if (count > MOST_BUTTONS) this.slider(row, text, form, set);
+      else this.buttons(row, name, form, set);
       make(row, "span", high, "soft");
     }
-    const send = button(sheet, "that is my answer", () => this.send({ do: "step", key: shown.key, answers: items.map(([name]) => answers.get(name)) }));
-    done();
+    const left = make(sheet, "p", "", "left-out");
+    left.setAttribute("role", "status");
+    const send = button(sheet, "", () => {
+      const missing = items.length - answers.size;
+      if (missing && !told) { told = true; return show(); }
+      this.send({ do: "step", key: shown.key, answers: items.map(([name]) => answers.get(name) ?? null) });
+    });
+    const show = () => {
+      const missing = items.length - answers.size;
+      const count = missing === 1 ? "1 item has no answer" : `${missing} items have no answer`;
+      left.textContent = missing ? `${count} yet.${told ? " You may leave them out." : ""}` : "";
+      send.textContent = missing && told ? `send without ${missing} of ${items.length} answers` : "that is my answer";
+      send.disabled = Boolean(form.forced && missing);
+      for (const [name, field] of fields) field.classList.toggle("missing", told && !answers.has(name));
+    };
+    show();
   }
 
   buttons(row, name, { least, most, step }, set) {
@@ -203,13 +220,19 @@ export class Stage {
     }
   }
 
-  slider(row, name, { least, most, step }, set) { // without a place until somebody gives it one
+  slider(row, text, { least, most, step }, set) { // empty, without a place, until somebody gives it one
     const input = make(row, "input", "", "unset");
-    Object.assign(input, { type: "range", min: least, max: most, step, name });
-    input.setAttribute("aria-label", name);
-    const place = () => { input.className = ""; set(input.valueAsNumber); };
+    Object.assign(input, { type: "range", min: least, max: most, step });
+    input.setAttribute("aria-label", text);
+    input.setAttribute("aria-valuetext", "no answer yet");
+    const place = () => {
+      input.className = "";
+      input.removeAttribute("aria-valuetext");
+      set(input.valueAsNumber);
+    };
     input.addEventListener("input", place);
     input.addEventListener("click", place);
+    input.addEventListener("keydown", ({ key }) => { if (key === "Enter" || key === " ") place(); });
   }
 
   corridor(card, { at }, { from, width_m: width }, g) {

@@ -43,8 +43,10 @@ def test_a_link_says_what_was_stated_and_what_was_seen():
 
 def test_what_happened_is_told_once():
     lines = format_run_lines(logs.busy().log)
-    assert "change at 3 s, ordered at tick 500: c->a: uniform 30 +- 17.3 ms" in lines
-    assert "change at 4 s: shares of c: a 0.9, b 0.1 within 1 s" in lines
+    link = "the link c->a was set to uniform 30 +- 17.3 ms, from 3 s on"
+    shares = "the shares of c were set to a 0.9, b 0.1 within 1 s, from 4 s on"
+    assert f"change: {link} (taken in at tick 500)" in lines
+    assert f"change: {shares} (by the scenario)" in lines
     assert "b: braked 2.200-3.053 s, returned 3.053-3.553 s" in lines
     (link,) = (line for line in lines if line.startswith("link b->a"))
     assert "loss 20 % in bursts of 5" in link
@@ -53,8 +55,8 @@ def test_what_happened_is_told_once():
 
 def test_arm_that_was_stopped_is_told_first_and_in_large():
     log = stopped_log()
-    assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to"
-    assert "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to" in render_alarms(log)
+    assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to stop"
+    assert "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to stop" in render_alarms(log)
     assert render_alarms(logs.simulated("two_sites")) == ""
 
 

@@ -95,9 +95,9 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     session.stranger(look)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    stop = LifeAlarm("STOPPED", "it was ordered to", f"trilat enable --session {SESSION} s", "enable")
+    stop = LifeAlarm("STOPPED", "it was ordered to stop", f"trilat enable --session {SESSION} s", "enable")
     assert ("s", stop) in raised
-    on_page = {"word": "STOPPED", "reason": "it was ordered to", "advice": "", "order": "enable"}
+    on_page = {"word": "STOPPED", "reason": "ordered by the operator", "advice": "", "order": "enable"}
     assert on_page in [frame["sites"]["s"]["alarm"] for frame in frames]
     assert frames[-1]["sites"]["s"]["alarm"] is None
     assert "s STOPPED" in screen.getvalue()
@@ -111,7 +111,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     assert set(log["s"].mode[tick:back]) == {"stopped"}
     assert log["s"].mode[back] == "return"
     assert "stopped" not in set(log["m"].mode)
-    assert any(event.text.startswith("s is STOPPED: it was ordered to") for event in log.events)
+    assert any(event.text.endswith("s: it was ordered to stop") for event in log.events)
     assert verify(log).identical == 8000
 
 

@@ -18,7 +18,7 @@ from ..log.site_log import SiteLog
 from ..net.messages import MODES, ModeMeaning
 from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
-from ..scenario.run_changes import describe_change
+from ..scenario.run_changes import describe_change, find_orderer
 from ..scenario.scenario_types import Change
 
 
@@ -141,7 +141,8 @@ class RaisedAlarm(NamedTuple):
 
 
 def list_alarms(log: Log) -> list[RaisedAlarm]:
-    """Returns the alarms of all sites, in the order of their beginnings."""
+    """Returns the alarms of all sites, in the order of their beginnings; of a stop with who ordered it."""
+    orderers = {(one.site, one.taken_at_tick): find_orderer(one.sentence) for one in list_changes(log)}
     found = []
     for site in log.sites:
         part = log[site]
@@ -150,5 +151,7 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
             state = part.states[int(np.searchsorted(part.t_s, from_s))]
             alarm = find_alarm(log.scenario.name, site, mode, state.mem, len(state.q_des))
             if alarm is not None:
-                found.append(RaisedAlarm(site, alarm.word, alarm.reason, from_s, to_s))
+                orderer = orderers.get((site, state.tick), "")
+                reason = f"ordered by {orderer}" if orderer else alarm.reason
+                found.append(RaisedAlarm(site, alarm.word, reason, from_s, to_s))
     return sorted(found, key=lambda one: one.from_s)

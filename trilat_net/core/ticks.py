@@ -278,7 +278,7 @@ _REASONS = {
     LifeReason.LIMIT_Q: "a joint is beyond q_min_rad or q_max_rad",
     LifeReason.LIMIT_QD: "a joint is faster than qd_limit_rad_s",
     LifeReason.NOT_FINITE: "a number is no longer finite",
-    LifeReason.STOP: "it was ordered to",
+    LifeReason.STOP: "it was ordered to stop",
     LifeReason.ENABLE: "it was enabled",
     LifeReason.RESET: "its fault was reset",
     LifeReason.OVERRUN: "it missed ticks",
@@ -360,7 +360,7 @@ def describe_mode(
     doing = {
         Mode.RUN: "follows its peers",
         Mode.HOLD: "holds its reference",
-        Mode.BRAKE: "holds its pose: a peer is stale",
+        Mode.BRAKE: "holds its pose",
         Mode.RETURN: "returns to its peers",
         Mode.WAITING: "waits for its peers",
         Mode.FAULT: "is in FAULT",
@@ -371,9 +371,9 @@ def describe_mode(
         why = str(law_failure)
     regrouped = glides and find_life_reason(output) in (LifeReason.DROPPED, LifeReason.RESTORED)
     aligns = output.mode is Mode.RETURN and not regrouped
-    if aligns or output.mode is Mode.RUN or (output.mode is Mode.BRAKE and not glides):
+    if aligns or output.mode is Mode.RUN:
         why = ""
-    return f"{site} {doing[output.mode]}{': ' * bool(why)}{why} from t = {output.t_ns * 1e-9:.3f} s"
+    return f"{site} {doing[output.mode]} from t = {output.t_ns * 1e-9:.3f} s{': ' * bool(why)}{why}"
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:

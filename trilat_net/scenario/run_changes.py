@@ -4,6 +4,7 @@ Invariant: a change is completed upon the state before it, and its text in a rec
 every reader derives the same `CoreChange` from it.
 """
 
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -111,6 +112,12 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
     shares = ", ".join(f"{peer} {share:g}" for peer, share in change.to.items() if share)
     within = f" within {change.ramp_s:g} s" if change.ramp_s else ""
     return f"the shares of {change.dominance} were set to {shares or 'nobody'}{within}{by}, from {at} on"
+
+
+def find_orderer(sentence: str) -> str:
+    """Returns who ordered a stop, by the sentence of `describe_change`; "" if it does not say."""
+    stopped = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
+    return "" if stopped is None else stopped[1]
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:

@@ -67,7 +67,7 @@ def test_methods_paragraph_has_delays_as_measured(folder: Path) -> None:
 def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -> None:
     found = tn.analyse_experiment(folder, tmp_path / "there", exclude={"P2": "stopped in block 2"})
     assert found.methods.startswith(
-        "The data of 1 participants were analysed; 1 more were excluded (P2: stopped in block 2)."
+        "The data of 1 participant were analysed; 1 more was excluded (P2: stopped in block 2)."
     )
     assert {row["participant"] for row in found.rows} == {"P1"}
     with pytest.raises(UsageError, match="there is no participant P9: there are P1, P2"):

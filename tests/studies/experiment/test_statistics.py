@@ -14,6 +14,7 @@ from trilat_net.errors import UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.studies.experiment.condition_figures import draw_conditions
 from trilat_net.studies.experiment.statistics import (
+    COMPUTED,
     Row,
     average_trials,
     bootstrap_interval,
@@ -137,7 +138,7 @@ def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
     assert second.bootstrap[0] < second.mean < second.bootstrap[1]
     assert (second.mean - second.bootstrap[0]) == pytest.approx(second.mean - second.interval[0], rel=0.25)
     (alone,) = summarise_conditions(tidy({"a": [2.0]}), "time_s")
-    assert alone == ("a", 1, 2.0, None, None, None)
+    assert alone == ("a", 1, 2.0, None, None, None, 0)
 
 
 def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
@@ -311,6 +312,7 @@ FACTS: dict[str, Any] = {
     "measures": ["completion_time_s", "path_m", "sparc"],
     "correction": "Holm",
     "alpha": 0.05,
+    "computed": COMPUTED,
     "program": "0.1.0",
     "digest": "9f2c",
 }

@@ -4,21 +4,26 @@ Invariant: every participant is shown, a point per condition that they have, joi
 their intervals stand on top. Equal rows give equal bytes.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ...fields import split_unit
 from ...reporting import style
 from ...reporting.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
+from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
 _FORM, _HEIGHT_IN = make_print_size(COLUMN_IN), 2.6
 _USER: dict[str, Any] = {"color": style.FAINT, "linewidth": 0.5, "marker": "o", "markersize": 2.5}
 _COURSE: dict[str, Any] = {"linewidth": 1.2, "marker": "o", "markersize": 3.0}
 _MEAN: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6, "marker": "D", "markersize": 5.0}
+
+_LIMIT: dict[str, Any] = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
@@ -44,14 +49,67 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
     return figure
 
 
-def draw_learning(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
+def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
+    """Returns the figure of completion times of which some are longer than the limit.
+
+    Points are the medians of every unit and condition; open ones on the line of the limit were not reached.
+
+    Args:
+        rows: as of `completion_times`.
+        limit_s: after which a trial was ended.
+        unit: "participant" or "pair".
+    """
+    medians = find_unit_medians(rows, unit)
+    with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
+        axes = _add_panel(figure, COMPLETION)
+        axes.axhline(limit_s, **_LIMIT)
+        for one in dict.fromkeys(who for each in medians.values() for who in each):
+            places = [n for n, each in enumerate(medians.values()) if one in each]
+            times_s = [list(medians.values())[n][one] for n in places]
+            axes.plot(places, [min(time_s, limit_s) for time_s in times_s], **_USER)
+            _plot_censored(axes, places, times_s, limit_s, _USER)
+        for n, time in enumerate(summarise_times(rows, limit_s, unit=unit)):
+            low, high = time.interval or (None, None)
+            if low is not None:
+                axes.plot([n, n], [low, limit_s if high is None else high], **{**_MEAN, "marker": "_"})
+            axes.plot([n], [limit_s if time.median is None else time.median], zorder=3, **_MEAN)
+            _plot_censored(axes, [n], [math.inf if time.median is None else time.median], limit_s, _MEAN)
+        labels = [f"{name}\nn = {len(each)}" for name, each in medians.items()]
+        axes.set_xticks(range(len(medians)), labels)
+        axes.set_xlim(-0.4, len(medians) - 0.6)
+        shown = [
+            (f"a {unit}'s median", _USER),
+            ("median, 95 % interval", _MEAN),
+            ("time limit; open: not reached", _LIMIT),
+        ]
+        style.add_legend(figure, shown)
+    return figure
+
+
+def _plot_censored(
+    axes: Axes, places: Sequence[float], times_s: Sequence[float], limit_s: float, look: dict[str, Any]
+) -> None:
+    """Draws an open marker on the limit for every time that is longer."""
+    longer = [place for place, time_s in zip(places, times_s, strict=True) if math.isinf(time_s)]
+    marker = {"marker": look["marker"], "markersize": look["markersize"] + 1.0, "linestyle": "none"}
+    colours = {"markerfacecolor": "white", "markeredgecolor": look["color"]}
+    axes.plot(longer, [limit_s] * len(longer), zorder=4, **marker, **colours)
+
+
+def draw_learning(
+    rows: Sequence[Row], measure: str, *, unit: str = "participant", limit_s: float | None = None
+) -> Figure:
     """Returns the course of a measure over the trials of a block, a line for each condition.
 
     Args:
         rows: tidy rows, as of `statistics`, with the number of each `trial` in its block.
         measure: its name in the rows.
         unit: "participant" or "pair".
+        limit_s: given of completion times of which some are longer: then medians are drawn, and open markers
+            on the line of the limit were not reached.
     """
+    if limit_s is not None:
+        return _draw_learning_times(rows, limit_s, unit)
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes, shown = _add_panel(figure, measure), []
         for n, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
@@ -70,7 +128,31 @@ def draw_learning(rows: Sequence[Row], measure: str, *, unit: str = "participant
             axes.plot(list(found), [mean.mean for mean in found.values()], **look)
             shown.append((condition, look))
         axes.set_xlabel("trial of the block")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         style.add_legend(figure, shown)
+    return figure
+
+
+def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
+    """Returns the course of completion times of which some are longer than the limit."""
+    with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
+        axes, shown = _add_panel(figure, COMPLETION), []
+        axes.axhline(limit_s, **_LIMIT)
+        for n, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
+            look = {**_COURSE, "color": SITE_COLOURS[n % len(SITE_COLOURS)]}
+            by_trial: dict[Any, list[Row]] = {}
+            for row in rows:
+                if row["condition"] == condition:
+                    by_trial.setdefault(row["trial"], []).append(row)
+            trials = sorted(by_trial)
+            units = [find_unit_medians(by_trial[trial], unit)[condition] for trial in trials]
+            times_s = [find_median(list(each.values())) for each in units]
+            axes.plot(trials, [min(time_s, limit_s) for time_s in times_s], **look)
+            _plot_censored(axes, trials, times_s, limit_s, look)
+            shown.append((condition, look))
+        axes.set_xlabel("trial of the block")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        style.add_legend(figure, [*shown, ("time limit; open: not reached", _LIMIT)])
     return figure
 
 

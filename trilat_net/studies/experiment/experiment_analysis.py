@@ -1,15 +1,21 @@
 """What an experiment found: means by condition, comparisons, a mixed model, figures, a methods paragraph.
 
-Invariant: it is a function of the journals. Practice and catch trials do not count; a trial that failed does,
-with the time that it had. Every number of a figure or a sentence is in a table.
+Invariant:
+- It is a function of the journals. Practice and catch trials do not count.
+- A trial that was not completed counts, and its completion time is censored: longer than any (see
+  `completion_times`).
+- Every measure that trials have is summarised, also where all values are equal; every one that is missing
+  somewhere says how often. Every number of a figure or a sentence is in a table.
+- The methods paragraph describes the analyses that were computed, and no others.
 """
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,7 +26,17 @@ from ...reporting import style
 from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
 from ..study_folder import encode_csv
-from .condition_figures import draw_conditions, draw_learning
+from .completion_times import (
+    COMPLETION,
+    CompletionComparison,
+    CompletionTime,
+    compare_times,
+    find_unit_medians,
+    is_completed,
+    summarise_times,
+    to_table,
+)
+from .condition_figures import draw_conditions, draw_learning, draw_times
 from .experiment_run import Experiment, open_experiment
 from .movement_measures import measure_throughput
 from .statistics import (
@@ -42,10 +58,33 @@ from .statistics import (
 MEASURES = (
     "completion_s", "throughput_bits_s", "error_end_mm", "error_rms_mm", "path_m", "sparc", "force_mean_n",
     "force_mean_user1_n", "force_mean_user2_n", "wall_force_n", "error_force_n", "error_handover_mm",
-    "first_settled", "succeeded",
+    "first_settled", "internal_rms_n", "useful_rms_n", "internal_share", "first_effort_share", "first_work_j",
+    "second_work_j", "first_taken_j", "second_taken_j", "succeeded",
 )  # fmt: skip
-"""What is compared, as far as trials have it, and differ in it."""
+"""What is compared, as far as trials have it."""
 FOLDER = "analysis"
+NOT_REACHED = "not reached"
+"""Said of a median if half of the trials or more were not completed."""
+
+
+class MissingAnswers(NamedTuple):
+    """How many items of a questionnaire were left out under a condition.
+
+    Attributes:
+        questionnaire: its name.
+        condition: its block's; "" of a questionnaire after the experiment.
+        asked: how many items were asked, of all who were asked.
+        missing: how many of them have no answer.
+        forms: how many questionnaires that is.
+        unscored: how many of these have no score because an answer is missing.
+    """
+
+    questionnaire: str
+    condition: str
+    asked: int
+    missing: int
+    forms: int
+    unscored: int
 
 
 class ExperimentAnalysis(Result):
@@ -54,8 +93,12 @@ class ExperimentAnalysis(Result):
     Attributes:
         rows: the trials that count, after a training if there is one; `learning_rows` has all of its phases.
         throughput_rows, gain_rows, threshold_rows: a row for each participant, or pair, and condition.
-        means: by measure, for each condition.
+        means: by measure, for each condition; `completion_s` is among them if every trial was completed.
         comparisons: by measure, of every two conditions.
+        times: of a task with a time limit, the completion time for each condition.
+        time_comparisons: of every two conditions, if trials were not completed.
+        missing_answers: of every questionnaire and condition.
+        absent: measures that this experiment could have and that no trial has a number for, with the reasons.
         methods: the paragraph of a paper.
         paths: the files that were written.
     """
@@ -85,12 +128,68 @@ class ExperimentAnalysis(Result):
         self.comparisons: dict[str, list[Comparison]] = {}
         once = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         own = [key for key in once if key.startswith(("gain_", "threshold_"))]
+        self.times: list[CompletionTime] = []
+        self.time_comparisons: list[CompletionComparison] = []
+        if protocol.task.has_limit:
+            self._summarise_times()
+        self.absent = self._find_absent(forms)
+        censored = any(time.censored for time in self.times)
         for measure in (*MEASURES, *forms, *own):
             rows = self.of(measure)
-            if len({row.get(measure) for row in rows}) > 1:
+            is_measured = any(row.get(measure) not in (None, "") for row in rows)
+            if is_measured and not (measure == COMPLETION and censored):
                 self.means[measure] = summarise_conditions(rows, measure, unit=self.unit)
                 self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
+        self.missing_answers = list(self._count_missing_answers())
+        self.models = list(self.fit_models())
         self.methods, self.paths = self._write_methods(), list[Path]()
+
+    @property
+    def _limit_s(self) -> float:
+        return self._experiment.plan.protocol.task.longest_s
+
+    def _summarise_times(self) -> None:
+        """Summarises the completion times, and compares them if trials were not completed."""
+        self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
+        if any(time.censored for time in self.times):
+            self.time_comparisons = compare_times(self.rows, unit=self.unit)
+
+    def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
+        """Returns the measures that this experiment could have and lacks, each with the reason."""
+        absent = {}
+        for name in forms:
+            scores = [row.get(name) for row in self.of(name)]
+            if not scores:
+                absent[name] = "nobody has answered it"
+            elif all(score is None for score in scores):
+                absent[name] = "every questionnaire lacks an answer"
+        is_reaching = self._experiment.plan.protocol.task.words.startswith("reaching")
+        if is_reaching and not self.throughput_rows:
+            absent["throughput_bits_s"] = f"no {self.unit} has enough completed trials under a condition"
+        return absent
+
+    def _count_missing_answers(self) -> Iterator[MissingAnswers]:
+        """Yields how many items were left out, for each questionnaire and condition."""
+        protocol = self._experiment.plan.protocol
+        after = {form.name: form.after for form in protocol.questionnaires}
+        groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for row in self._experiment.list_answers():
+            name = row["questionnaire"]
+            if name in after and row[self.unit] not in self._exclude:
+                condition = row["condition"] if after[name] == "block" else ""
+                groups.setdefault((name, condition), []).append(row)
+        for (name, condition), rows in groups.items():
+            answers: dict[tuple[str, int], list[float | None]] = {}
+            for row in rows:
+                answers.setdefault((row["participant"], row["block"]), []).append(row["value"])
+            yield MissingAnswers(
+                questionnaire=name,
+                condition=condition,
+                asked=len(rows),
+                missing=sum(row["value"] is None for row in rows),
+                forms=len(answers),
+                unscored=sum(None in values for values in answers.values()),
+            )
 
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows that have a measure."""
@@ -121,12 +220,30 @@ class ExperimentAnalysis(Result):
         learnt, means = self._experiment.plan.protocol.task.learnt, dict[str, Any]()
         for phase in ("before", "after", "retention"):
             if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
-                means[phase] = average_trials(rows, learnt, self.unit)
+                means[phase] = self._average_learnt(rows, learnt)
         for condition, each in means.pop("before", {}).items():
             for who, before in each.items():
                 of = {phase: found.get(condition, {}).get(who) for phase, found in means.items()}
                 gains = {f"gain_{phase}_{learnt}": before - mean for phase, mean in of.items() if mean}
                 yield {self.unit: who, "condition": condition, **gains}
+
+    def _is_censored(self, measure: str) -> bool:
+        """Whether a measure is the completion time of trials of which some were not completed."""
+        has_limit = self._experiment.plan.protocol.task.has_limit
+        return measure == COMPLETION and has_limit and not all(map(is_completed, self.learning_rows))
+
+    def _average_learnt(self, rows: Sequence[Row], learnt: str) -> dict[str, dict[str, float]]:
+        """Returns what is learnt by condition and unit: means, or medians of times that may be censored.
+
+        A median that is longer than the limit is left out.
+        """
+        if not self._is_censored(learnt):
+            return average_trials(rows, learnt, self.unit)
+        medians = find_unit_medians(rows, self.unit)
+        return {
+            condition: {who: median for who, median in each.items() if math.isfinite(median)}
+            for condition, each in medians.items()
+        }
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the threshold of each participant and condition, of a staircase that turned often enough."""
@@ -172,13 +289,64 @@ class ExperimentAnalysis(Result):
             "measures": list(self.means),
             "unit": self.unit,
             "correction": "Holm",
+            "computed": self._list_computed(),
+            "completion": self._describe_times(),
+            "answers": self._describe_missing_answers(),
         }
         return write_methods(facts)
+
+    def _list_computed(self) -> list[str]:
+        """Returns which analyses were computed, of those that a methods paragraph describes."""
+        compared = [one for found in self.comparisons.values() for one in found]
+        summarised = [one for found in self.means.values() for one in found]
+        computed = {
+            "intervals": any(one.interval is not None for one in summarised),
+            "bootstrap": any(one.bootstrap is not None for one in summarised),
+            "t tests": any(one.p is not None for one in compared),
+            "wilcoxon": any(one.p_wilcoxon is not None for one in compared),
+            "effect sizes": any(one.d_z is not None for one in compared),
+            "sign tests": any(one.p is not None for one in self.time_comparisons),
+            "mixed models": bool(self.models),
+        }
+        return [name for name, was in computed.items() if was]
+
+    def _describe_times(self) -> str:
+        """Returns the sentence on trials that were not completed; "" if all were."""
+        trials = sum(time.trials for time in self.times)
+        censored = sum(time.censored for time in self.times)
+        if not censored:
+            return ""
+        timed_out = sum(time.timed_out for time in self.times)
+        sooner = censored - timed_out
+        failed = f" and {sooner} failed sooner" if sooner else ""
+        return (
+            f"{timed_out} of {trials} trials ran into the time limit of {self._limit_s:g} s{failed}; their "
+            "completion times are right-censored, and completion is summarised by the median of Kaplan and "
+            f"Meier per {self.unit} and condition"
+        )
+
+    def _describe_missing_answers(self) -> str:
+        """Returns the sentence on answers that are missing; "" if none is."""
+        missing = sum(one.missing for one in self.missing_answers)
+        asked = sum(one.asked for one in self.missing_answers)
+        unscored = sum(one.unscored for one in self.missing_answers)
+        if not missing:
+            return ""
+        plural = "questionnaire has" if unscored == 1 else "questionnaires have"
+        return f"{missing} of {asked} answers are missing; {unscored} {plural} no score for that reason"
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
         """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
         made = make_folder(folder)
-        tables = {"conditions.csv": self._list_means(), "comparisons.csv": self.to_rows()}
+        tables = {
+            "conditions.csv": self._list_means(),
+            "comparisons.csv": self.to_rows(),
+            "completion_times.csv": to_table(self.times),
+            "completion_comparisons.csv": to_table(self.time_comparisons),
+            "missing_answers.csv": [one._asdict() for one in self.missing_answers],
+        }
+        optional = ("completion_times.csv", "completion_comparisons.csv", "missing_answers.csv")
+        tables = {name: rows for name, rows in tables.items() if rows or name not in optional}
         texts = {name: encode_csv([dict(_flatten(row)) for row in rows]) for name, rows in tables.items()}
         whole = json.dumps(self.to_dict(), indent=1)
         texts |= {"methods.txt": f"{self.methods}\n", "analysis.json": f"{whole}\n"}
@@ -186,10 +354,13 @@ class ExperimentAnalysis(Result):
             write_whole(made / name, text, force=True)
         self.paths = [made / name for name in texts]
         figures = {name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means}
+        if self.time_comparisons:
+            figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
         if len({row["trial"] for row in self.learning_rows}) > 1:
             protocol = self._experiment.plan.protocol
             learnt = "difference" if protocol.staircase else protocol.task.learnt
-            figures["learning"] = draw_learning(self.learning_rows, learnt, unit=self.unit)
+            limit_s = self._limit_s if self._is_censored(learnt) else None
+            figures["learning"] = draw_learning(self.learning_rows, learnt, unit=self.unit, limit_s=limit_s)
         for name, figure in figures.items():
             self.paths.append(made / f"{name}.png")
             style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
@@ -197,7 +368,8 @@ class ExperimentAnalysis(Result):
 
     def fit_models(self) -> Iterator[MixedModel]:
         """Yields mixed models of the forces of users within pairs, where statsmodels is installed."""
-        if self.unit == "participant" or find_spec("statsmodels") is None:
+        pairs = {row[self.unit] for row in self.rows}
+        if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
             return
         for measure in ("force_mean", "force_peak"):
             rows = [
@@ -218,18 +390,94 @@ class ExperimentAnalysis(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat experiment analyse --json`."""
         facts = {"name": self._experiment.plan.protocol.name, "digest": self._experiment.plan.digest}
-        models = {model.measure: model._asdict() for model in self.fit_models()}
+        models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
-        whole = {"conditions": self._list_means(), "comparisons": self.to_rows(), "mixed_models": models}
-        return {**facts, **whole, "methods": self.methods}
+        return {
+            **facts,
+            "conditions": self._list_means(),
+            "comparisons": self.to_rows(),
+            "completion_times": to_table(self.times),
+            "completion_comparisons": to_table(self.time_comparisons),
+            "missing_answers": [one._asdict() for one in self.missing_answers],
+            "absent": self.absent,
+            "mixed_models": models,
+            "methods": self.methods,
+        }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text: a table of conditions and one of comparisons for each measure."""
+        """Yields its text: completion, the measures, what is missing, and the paragraph.
+
+        With one unit there is nothing to compare it with, and all measures stand in one table.
+        """
+        yield from self._write_time_blocks()
+        units = {row[self.unit] for row in self.rows}
+        if len(units) > 1:
+            yield from self._write_measure_blocks()
+        else:
+            yield from self._write_single_unit_block(next(iter(units)))
+        yield from self._write_model_blocks()
+        for one in self.missing_answers:
+            under = f", {one.condition}" if one.condition else ""
+            without = f"; {one.unscored} of {one.forms} have no score for that reason" if one.missing else ""
+            yield f"{one.questionnaire}{under}: {one.missing} of {one.asked} answers are missing{without}"
+        yield from (f"{name}: no number, because {reason}" for name, reason in self.absent.items())
+        if self.missing_answers or self.absent:
+            yield ""
+        yield self.methods
+
+    def _write_time_blocks(self) -> Iterator[Block]:
+        """Yields how many trials were completed, and how long that took."""
+        if not self.times:
+            return
+        yield f"{COMPLETION}, median over {self.unit}s of the median of each {self.unit}'s trials"
+        yield "a trial that was not completed counts as longer than any"
+        rows = [
+            (
+                time.condition,
+                str(time.trials),
+                str(time.timed_out),
+                str(time.censored - time.timed_out),
+                str(time.number),
+                NOT_REACHED if time.median is None else f"{time.median:.4g}",
+                _span(time.interval),
+            )
+            for time in self.times
+        ]
+        heads = ("condition", "trials", "timed out", "failed sooner", "n", "median", "interval")
+        yield TextTable(heads, rows, align="lrrrrrl")
+        yield ""
+        if self.time_comparisons:
+            found = [
+                (
+                    f"{one.second} - {one.first}",
+                    f"{one.longer} of {one.number}",
+                    f"{one.shorter} of {one.number}",
+                    format_number(one.difference),
+                    format_number(one.p),
+                    format_number(one.p_holm),
+                )
+                for one in self.time_comparisons
+            ]
+            heads = ("difference", "longer", "shorter", "median", "p, sign test", "p, Holm")
+            yield TextTable(heads, found, align="lrrrrr")
+            yield ""
+
+    def _write_measure_blocks(self) -> Iterator[Block]:
+        """Yields a table of conditions and one of comparisons for each measure."""
         for measure, means in self.means.items():
             yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
-            rows = [(one.condition, str(one.number), f"{one.mean:.4g}", _span(one.interval)) for one in means]
-            yield TextTable(("condition", "n", "mean", "interval"), rows, align="lrrl")
+            rows = [
+                (
+                    one.condition,
+                    str(one.number),
+                    str(one.missing),
+                    f"{one.mean:.4g}",
+                    _span(one.interval),
+                )
+                for one in means
+            ]
+            yield TextTable(("condition", "n", "missing", "mean", "interval"), rows, align="lrrrl")
             yield ""
             found = [
                 (
@@ -242,10 +490,38 @@ class ExperimentAnalysis(Result):
                 )
                 for one in self.comparisons[measure]
             ]
-            heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
-            yield TextTable(heads, found, align="lrlrrr")
+            if found:
+                heads = ("difference", "mean", "interval", "t", "p, Holm", "d_z")
+                yield TextTable(heads, found, align="lrlrrr")
+                yield ""
+
+    def _write_model_blocks(self) -> Iterator[Block]:
+        """Yields a table of effects for each mixed model."""
+        for model in self.models:
+            yield f"{model.measure} of each user, mixed model against {model.reference}"
+            rows = [
+                (
+                    effect.condition,
+                    f"{effect.estimate:.4g}",
+                    _span(effect.interval),
+                    format_number(effect.t),
+                    format_number(effect.p),
+                )
+                for effect in model.effects
+            ]
+            yield TextTable(("condition", "effect", "interval", "t", "p"), rows, align="lrlrr")
             yield ""
-        yield self.methods
+
+    def _write_single_unit_block(self, who: str) -> Iterator[Block]:
+        """Yields one table of all measures, a column for each condition."""
+        conditions = list(dict.fromkeys(row["condition"] for row in self.rows))
+        yield f"means over the trials of a condition; one {self.unit}, {who}, allows no interval and no test"
+        rows = []
+        for measure, means in self.means.items():
+            by_condition = {one.condition: _describe_mean(one) for one in means}
+            rows.append((measure, *(by_condition.get(name, "-") for name in conditions)))
+        yield TextTable(("measure", *conditions), rows, align="l" + "r" * len(conditions))
+        yield ""
 
 
 def analyse_experiment(
@@ -336,8 +612,17 @@ def compute_experiment_power(
     return PowerOfExperiment(effect, participants, seed)
 
 
-def _span(interval: tuple[float, float] | None) -> str:
-    return "-" if interval is None else f"[{interval[0]:.4g}, {interval[1]:.4g}]"
+def _describe_mean(mean: ConditionMean) -> str:
+    """Returns a mean, with how many numbers are missing if any are."""
+    return f"{mean.mean:.4g}" + (f" ({mean.missing} missing)" if mean.missing else "")
+
+
+def _span(interval: tuple[float, float | None] | None) -> str:
+    """Returns an interval, whose upper end may not have been reached."""
+    if interval is None:
+        return "-"
+    low, high = interval
+    return f"[{low:.4g}, {NOT_REACHED if high is None else format(high, '.4g')}]"
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

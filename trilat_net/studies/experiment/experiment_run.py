@@ -6,6 +6,7 @@ killed. The tables are a function of the journals. People and synthetic particip
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from importlib import resources
 from pathlib import Path
@@ -20,9 +21,10 @@ from ...results import Result
 from ...scenario import parse_scenario
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..study_folder import RunJournal, build_resume_hint, encode_csv
+from .completion_times import COMPLETION, find_median, is_completed
 from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
-from .questionnaires import find_form
-from .staircase import CHOICE, COMPARISON, Staircase
+from .questionnaires import CHOICE, find_form
+from .staircase import COMPARISON, Staircase
 from .trial_run import TrialEntry, run_trial
 
 PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, NOTES_FILE, TRIALS_FILE = (
@@ -41,7 +43,7 @@ class Note(msgspec.Struct, frozen=True):
         number: of the trial that it is, comes before, or comes after.
         unix_s: when, by the machine's clock.
         text: of a questionnaire its name; why a trial was aborted.
-        answers: by item.
+        answers: by item; None for an item that was left out.
     """
 
     cell: str
@@ -50,7 +52,7 @@ class Note(msgspec.Struct, frozen=True):
     number: int
     unix_s: float
     text: str = ""
-    answers: dict[str, float] = {}
+    answers: dict[str, float | None] = {}
     seed: int = 0
 
 
@@ -112,7 +114,8 @@ class Experiment(Result):
     def list_choices(self) -> Choices:
         """Returns what was chosen of the pairs of a staircase so far."""
         notes = self.read_notes() if self.plan.protocol.staircase else ()
-        return {note.number: note.answers[CHOICE] for note in notes if note.text == CHOICE}
+        chosen = ((note.number, note.answers[CHOICE]) for note in notes if note.text == CHOICE)
+        return {number: choice for number, choice in chosen if choice is not None}
 
     def _choose(self, stairs: Staircase) -> None:
         """Notes what synthetic participants choose, of all pairs: a function of the plan."""
@@ -125,7 +128,7 @@ class Experiment(Result):
                 right, more = self.plan.judge_choices(last, chosen), 1 + (last.phase == COMPARISON)
                 choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
                 chosen[last.number] = choice
-                answers: dict[str, float] = {CHOICE: choice}
+                answers: dict[str, float | None] = {CHOICE: choice}
                 notes.add(Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, answers))
 
     def status(self) -> ExperimentStatus:
@@ -184,7 +187,7 @@ class Experiment(Result):
         return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns a row for each item that somebody has answered."""
+        """Returns a row for each item that somebody was asked; the value of a missing answer is None."""
         return [
             {**row, "questionnaire": note.text, "item": item, "value": value, "unix_s": note.unix_s}
             for row, note in self._list_answered()
@@ -192,7 +195,10 @@ class Experiment(Result):
         ]
 
     def list_scores(self) -> list[dict[str, Any]]:
-        """Returns a row for each questionnaire that somebody has answered, with its score by its name."""
+        """Returns a row for each questionnaire that somebody was asked, with its score by its name.
+
+        The score is None if an answer is missing.
+        """
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
         return [
             {**row, note.text: forms[note.text].score(note.answers)}
@@ -244,16 +250,23 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text: a row for each condition."""
+        """Yields its text: a row for each condition.
+
+        A trial that was not completed has no completion time: of those there is a median, in which it counts
+        as longer than any.
+        """
         status, rows = self.status(), [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
         yield f"{self.plan.protocol.name}: {status.done} of {status.total} trials, in {self.folder}"
         table = []
         for condition in self.plan.protocol.conditions:
             of = [row for row in rows if row["condition"] == condition]
             if of:
+                completed = sum(map(is_completed, of))
                 means = [sum(row[key] for row in of) / len(of) for key in _SHOWN]
-                table.append((condition, str(len(of)), *(f"{mean:.3g}" for mean in means)))
-        yield TextTable(("condition", "trials", *_SHOWN), table, align="l" + "r" * (1 + len(_SHOWN)))
+                counts = str(len(of)), str(completed), _describe_median(of)
+                table.append((condition, *counts, *(f"{mean:.3g}" for mean in means)))
+        heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN)
+        yield TextTable(heads, table, align="l" + "r" * (len(heads) - 1))
         if status.next is not None:
             yield f"next: trial {status.next.number}, {', '.join(status.next.group)}, {status.next.condition}"
         yield from (
@@ -263,7 +276,14 @@ class Experiment(Result):
         )
 
 
-_SHOWN = ("succeeded", "completion_s", "error_end_mm", "error_rms_mm", "path_m", "sparc")
+def _describe_median(rows: list[dict[str, Any]]) -> str:
+    """Returns the median completion time of trials, s, or that it was not reached."""
+    times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
+    median_s = find_median(times_s)
+    return f"{median_s:.3g}" if math.isfinite(median_s) else "not reached"
+
+
+_SHOWN = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:

@@ -1,6 +1,9 @@
 """Questionnaires that people answer on the page: the published ones that ship, and one's own.
 
-Invariant: an answer is a number of the form's scale, or it is refused.
+Invariant:
+- An answer is a number of the form's scale or None, or it is refused. None is an item that was left out, as a
+  slider that nobody touched; it is stored and counted as missing.
+- A questionnaire with a missing answer has no score: nobody knows what the answer would have been.
 """
 
 import tomllib
@@ -20,6 +23,12 @@ from .movement_measures import raw_tlx, sus_score
 
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 Words = Annotated[str, Meta(max_length=300)]
+
+
+CHOICE = "choice"
+"""The form after a pair of trials of a staircase: a forced choice, which nobody can leave out."""
+Answers = Mapping[str, float | None]
+"""Answers by item; None is a missing one."""
 
 
 class Questionnaire(Frozen, frozen=True):
@@ -46,24 +55,37 @@ class Questionnaire(Frozen, frozen=True):
     most: int = 7
     step: Annotated[int, Meta(ge=1)] = 1
 
-    def read(self, values: Sequence[float]) -> dict[str, float]:
-        """Returns answers by item, in the order of these.
+    @property
+    def is_forced(self) -> bool:
+        """Whether no answer can be left out."""
+        return self.name == CHOICE
+
+    def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
+        """Returns the answers by item.
+
+        Args:
+            values: in the order of the items; None for one that was left out.
 
         Raises:
-            UsageError: an answer is missing, or is none of the scale.
+            UsageError: there are more or fewer values than items, a value is not on the scale, or one is
+                left out where none can be.
         """
         scale = range(self.least, self.most + 1, self.step)
-        if len(values) != len(self.items) or any(value not in scale for value in values):
+        valid = [value in scale if value is not None else not self.is_forced for value in values]
+        if len(values) != len(self.items) or not all(valid):
             raise UsageError(f"{self.name}: {len(self.items)} answers of {self.least} to {self.most}")
         return dict(zip(self.items, values, strict=True))
 
-    def score(self, answers: Mapping[str, float]) -> float:
-        """Returns one number: raw NASA-TLX, the score of SUS, else the mean."""
+    def score(self, answers: Answers) -> float | None:
+        """Returns one number: raw NASA-TLX, the score of SUS, else the mean; None if an answer is missing."""
+        given = {item: value for item, value in answers.items() if value is not None}
+        if len(given) < len(answers):
+            return None
         if self.name == "tlx":
-            return raw_tlx(answers)
+            return raw_tlx(given)
         if self.name == "sus":
-            return sus_score([int(value) for value in answers.values()])
-        return float(np.mean(list(answers.values())))
+            return sus_score([int(value) for value in given.values()])
+        return float(np.mean(list(given.values())))
 
 
 @cache

@@ -16,9 +16,9 @@ import numpy as np
 from msgspec import Meta
 
 from ...fields import Frozen, Positive
-from .questionnaires import Questionnaire, Words
+from .questionnaires import CHOICE, Questionnaire, Words
 
-CHOICE, STANDARD, COMPARISON = "choice", "standard", "comparison"
+STANDARD, COMPARISON = "standard", "comparison"
 SKIPPED = 2
 """So many reversals come before the difference is about where it settles."""
 

@@ -9,9 +9,11 @@ What the numbers cannot tell is None. Equal rows and seeds give equal numbers.
 """
 
 import math
+import re
 import warnings
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -33,7 +35,8 @@ _ROUNDING = 1e-12
 """Of the largest value: a smaller spread is none."""
 
 
-def _scipy() -> Any:
+def import_scipy_stats() -> Any:
+    """Returns the statistics of SciPy."""
     from scipy import stats  # takes half a second, which most commands can do without
 
     return stats
@@ -61,7 +64,7 @@ def average_trials(
             raise UsageError(f"a row without {' and '.join(missing)}: tidy rows have a key for each")
         each = found.setdefault(str(row["condition"]), {})
         if (value := row.get(measure)) not in (None, ""):
-            each.setdefault(str(row[unit]), []).append(_read_number(value, measure, row))
+            each.setdefault(str(row[unit]), []).append(read_number(value, measure, row))
     means = {name: {u: math.fsum(v) / len(v) for u, v in each.items()} for name, each in found.items()}
     if not any(means.values()):
         names = sorted({key for row in rows for key in row} - {"participant", "pair", "condition"})
@@ -71,7 +74,12 @@ def average_trials(
     return means
 
 
-def _read_number(value: Any, measure: str, row: Row) -> float:
+def read_number(value: Any, measure: str, row: Row) -> float:
+    """Returns the value of a measure in a row, which may be the text of a CSV file.
+
+    Raises:
+        UsageError: the value is no finite number.
+    """
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -92,6 +100,7 @@ class ConditionMean(NamedTuple):
         deviation: their standard deviation; None for fewer than two.
         interval: of 95 % by Student's t; None likewise.
         bootstrap: of 95 % by the bias-corrected and accelerated bootstrap (BCa); None likewise.
+        missing: how many trials, or questionnaires, have no number; they are counted and not averaged.
     """
 
     condition: str
@@ -100,6 +109,7 @@ class ConditionMean(NamedTuple):
     deviation: float | None
     interval: tuple[float, float] | None
     bootstrap: tuple[float, float] | None
+    missing: int = 0
 
 
 def summarise_conditions(
@@ -107,7 +117,12 @@ def summarise_conditions(
 ) -> list[ConditionMean]:
     """Returns mean, spread and intervals of every condition with a number, in the order of the rows."""
     means = average_trials(rows, measure, unit)
-    return [_summarise(name, list(each.values()), seed) for name, each in means.items() if each]
+    lacking = Counter(str(row["condition"]) for row in rows if row.get(measure) in (None, ""))
+    return [
+        _summarise(name, list(each.values()), seed)._replace(missing=lacking[name])
+        for name, each in means.items()
+        if each
+    ]
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
@@ -130,7 +145,7 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
     if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
         return float(sample.mean()), float(sample.mean())
     generator = np.random.default_rng(seed)
-    found = _scipy().bootstrap(
+    found = import_scipy_stats().bootstrap(
         (sample,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="BCa", rng=generator
     )
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
@@ -194,7 +209,7 @@ def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[
     mean, spread = float(differences.mean()), float(differences.std(ddof=1))
     if spread <= _ROUNDING * max(np.abs(one).max(), np.abs(other).max()):
         return empty._replace(difference=mean, interval=(mean, mean))
-    stats = _scipy()
+    stats = import_scipy_stats()
     test = stats.ttest_rel(other, one)
     low, high = test.confidence_interval(CONFIDENCE)
     average = float(one.std(ddof=1) + other.std(ddof=1)) / 2.0
@@ -313,7 +328,7 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    stats, name = _scipy(), f"condition[T.{condition}]"
+    stats, name = import_scipy_stats(), f"condition[T.{condition}]"
     estimate, error = float(fit.fe_params[name]), float(fit.bse_fe[name])
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
     p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
@@ -330,7 +345,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(f"{number} units, alpha {alpha}: give two units or more, and alpha between 0 and 1")
-    stats, shift, freedom = _scipy(), abs(d_z) * math.sqrt(number), number - 1
+    stats, shift, freedom = import_scipy_stats(), abs(d_z) * math.sqrt(number), number - 1
     critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
     # the lower tail by its mirror image: of small ones `nct.cdf` returns NaN
     return float(sum(stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)))
@@ -442,18 +457,18 @@ _METHODS = (
     ("digest", "; the digest of the protocol is {}"),
     ("measures", ". Measures were {}, averaged"),
     ("unit", " per {}"),
-    ("correction", " over the trials of a condition. Conditions were compared by two-sided paired t tests, "
-     "with p corrected by {} over all comparisons of a measure,"),
-    ("alpha", " at alpha = {},"),
-    ("confidence", " and by Wilcoxon's signed-rank test beside them. Effect sizes are Cohen's d_z and d_av; "
-     "intervals are of {} %, by Student's t"),
-    ("resamples", " and by the bootstrap (BCa, {} resamples)."),
 )  # fmt: skip
 """Facts, in the order of the paragraph, and what is said of each."""
+COMPUTED = (
+    "t tests", "wilcoxon", "effect sizes", "intervals", "bootstrap", "sign tests", "mixed models",
+)  # fmt: skip
+"""Analyses that the paragraph describes if they were computed."""
+_ENDING = ("correction", "alpha", "completion", "answers", "computed")
+"""Facts of the last sentences."""
 _WELCOME = (
     "pairs", "exclusions", "blocks", "training", "staircase", "rate_hz", "program", "digest", "unit", "alpha",
+    "completion", "answers", "computed",
 )  # fmt: skip
-_OWN = {"confidence": 100 * CONFIDENCE, "resamples": RESAMPLES}
 
 
 def write_methods(facts: Mapping[str, Any]) -> str:
@@ -464,25 +479,60 @@ def write_methods(facts: Mapping[str, Any]) -> str:
             `design`; `blocks`; `trials` of a participant under a condition; `training` or `staircase`, what
             they were; `conditions`, by name what each was, with its delay as measured (`delay_ms`); `law`;
             `gains`; `rate_hz`; `seeds`; `measures`; `correction` of p; `unit`; `alpha`; `program`, its
-            version; `digest` of the protocol. Keys end in their unit.
+            version; `digest` of the protocol; `computed`, which of `COMPUTED` were, by default none;
+            `completion` and `answers`, sentences on trials that were not completed and on missing answers.
+            Keys end in their unit.
 
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.
     """
-    known = [key for key, _ in _METHODS if key not in _OWN]
+    known = [*(key for key, _ in _METHODS), *_ENDING]
     if missing := [key for key in known if key not in facts and key not in _WELCOME]:
         raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
     if unknown := [key for key in facts if key not in known]:
         raise UsageError(f"{', '.join(unknown)}: facts are {', '.join(known)}")
+    if odd := [name for name in facts.get("computed", ()) if name not in COMPUTED]:
+        raise UsageError(f"{', '.join(odd)}: analyses are {', '.join(COMPUTED)}")
     for name, condition in facts["conditions"].items():
         if not any(key.startswith("delay") for key in condition):
             raise UsageError(
                 f"condition {name} has no delay: give delay_ms, as measured, 0 if there was none"
             )
-    told = {key: _tell(value, key) for key, value in {**facts, **_OWN}.items()}
+    told = {key: _tell(value, key) for key, value in facts.items()}
     told["conditions"] = "; ".join(f"{name} ({_tell(each)})" for name, each in facts["conditions"].items())
     told["measures"] = ", ".join(" in ".join(filter(None, split_unit(name))) for name in facts["measures"])
-    return "".join(text.format(told[key]) for key, text in _METHODS if told.get(key))
+    first = "".join(text.format(told[key]) for key, text in _METHODS if told.get(key))
+    sentences = [f"{first} over the trials of a condition", told.get("completion"), told.get("answers")]
+    sentences += _describe_computed(frozenset(facts.get("computed", ())), told)
+    text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
+    singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
+    return singular.replace("; 1 more were excluded", "; 1 more was excluded")
+
+
+def _describe_computed(computed: Collection[str], told: Mapping[str, str]) -> Iterator[str]:
+    """Yields a sentence for each analysis that was computed, or that conditions were not compared."""
+    correction = f"with p corrected by {told['correction']} over all comparisons of a measure"
+    level = f", at alpha = {told['alpha']}" if told.get("alpha") else ""
+    if "t tests" in computed:
+        wilcoxon = " and by Wilcoxon's signed-rank test beside them" if "wilcoxon" in computed else ""
+        yield f"conditions were compared by two-sided paired t tests, {correction}{level}{wilcoxon}"
+    if "sign tests" in computed:
+        rule = "in which one that was not reached is longer than any that was"
+        by_sign = f"by exact two-sided sign tests on the medians, {rule}"
+        yield f"completion times were compared {by_sign}, {correction}{level}"
+    if "mixed models" in computed:
+        yield "forces of users were compared by mixed models, with pair and user as random effects (REML)"
+    if not {"t tests", "sign tests", "mixed models"} & {*computed}:
+        yield "conditions were not compared by tests"
+    if "effect sizes" in computed:
+        yield "effect sizes are Cohen's d_z and d_av"
+    if "intervals" in computed:
+        bootstrap = f" and by the bootstrap (BCa, {RESAMPLES} resamples)" if "bootstrap" in computed else ""
+        yield f"intervals are of {100 * CONFIDENCE:g} %, by Student's t{bootstrap}"
+
+
+def _capitalise(sentence: str) -> str:
+    return sentence[0].upper() + sentence[1:]
 
 
 def _tell(value: Any, key: str = "") -> str:

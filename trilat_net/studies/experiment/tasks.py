@@ -39,6 +39,11 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
         raise NotImplementedError
 
     @property
+    def has_limit(self) -> bool:
+        """Whether a trial that is not completed by `longest_s` has failed; else each lasts as long."""
+        return True
+
+    @property
     def needs_pair(self) -> bool:
         """Whether it is of two users."""
         return False
@@ -315,6 +320,11 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     duration_s: Seconds = 10.0
     width_m: Metres = 0.04
     apart_m: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+
+    @property
+    def has_limit(self) -> bool:
+        """False: tracking has no end but its own."""
+        return False
 
     @property
     def needs_pair(self) -> bool:
