@@ -140,12 +140,13 @@ def zoom_in(page: Page) -> None:
 def toggle_lines(page: Page) -> None:
     """Hides every line by its name below its chart, and shows it again."""
     names = ".u-series:not(:first-child) th"
+    hidden_names = ".u-series.u-off"
     page.locator(names).first.click()
-    assert page.locator(".u-off").count() == 1
+    assert page.locator(hidden_names).count() == 1
     page.locator(names).first.click()
     for hidden in (page.locator(names).count(), 0):
         page.evaluate("(names) => document.querySelectorAll(names).forEach((name) => name.click())", names)
-        assert page.locator(".u-off").count() == hidden
+        assert page.locator(hidden_names).count() == hidden
 
 
 CERTIFIED = ("live change", "diverged", "shipped paper", "shipped contact", "everything")
@@ -158,8 +159,11 @@ def test_whole_report_with_its_certificate_is_drawn(name: str, browser: Browser,
     """As the command writes it: with the certificate, its pictures, and the twin without operators."""
     log = VARIED[name]()
     twin = logs.twin("paper") if name == "shipped paper" else None
-    path, _ = write_report(log, tmp_path, certificate=certify(log), twin=twin)
+    certificate = certify(log)
+    path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
+    observed, twins = certificate.observed, certificate.twins
+    shown = [certificate.balance, observed and observed.curves, twins and twins.pushes]
     with watched_page(browser, **SCREEN) as watched:
         watched.page.goto(path.as_uri())
         watched.assert_whole()
-        assert watched.page.locator("img.picture").count() > 0
+        assert watched.page.locator("img.picture").count() == sum(map(bool, shown))
