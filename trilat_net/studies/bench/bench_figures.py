@@ -36,12 +36,27 @@ _NONE = "#a23b53"
 """Where there is no number: no contact, no rest, or a run that diverged."""
 
 
-def draw_bench(results: BenchResults, name: str) -> Figure:
-    """Returns a figure by its name in `FIGURES_OF_BENCH`."""
-    label, quantity = FIGURES_OF_BENCH[name]
+def list_figures_with_values(results: BenchResults) -> list[str]:
+    """Returns the names of those figures for which the results have a number."""
+    return [
+        name
+        for name in FIGURES_OF_BENCH
+        if any(np.isfinite(field).any() for field in _collect_fields(results, name).values())
+    ]
+
+
+def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
+    """Returns the numbers of a figure: by task an array of shape (laws, links)."""
+    _, quantity = FIGURES_OF_BENCH[name]
     tasks = [task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"]
+    return {task: _collect(results, task, quantity) for task in tasks}
+
+
+def draw_bench(results: BenchResults, name: str) -> Figure:
+    """Returns a figure by its name in `FIGURES_OF_BENCH`; `list_figures_with_values` has the names."""
+    label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
-    fields = {task: _collect(results, task, quantity) for task in tasks}
+    fields = _collect_fields(results, name)
     known = np.concatenate([field[np.isfinite(field)].ravel() for field in fields.values()])
     scale: Any = Normalize(0.0, 1.0)
     if quantity:
@@ -51,7 +66,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     form = make_print_size(_WIDTH_IN)
     with style.styled_figure(form, height) as figure:
         ratios = [len(field) for field in fields.values()]
-        grid = style.add_panels(figure, len(tasks), 1, sharex=True, height_ratios=ratios)[:, 0]
+        grid = style.add_panels(figure, len(fields), 1, sharex=True, height_ratios=ratios)[:, 0]
         for axes, (task, field) in zip(grid, fields.items(), strict=True):
             image = axes.imshow(field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest")
             _mark(axes, results, task)
@@ -92,14 +107,16 @@ def _mark(axes: Axes, results: BenchResults, task: str) -> None:
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
     """Writes the page, the tables and the figures of a suite, and returns their paths."""
+    names = list_figures_with_values(results)
+    pictures = {f"bench-{name}.png": FIGURES_OF_BENCH[name][0] for name in names}
     texts = {
-        "bench.md": build_bench_page(results, command),
+        "bench.md": build_bench_page(results, command, pictures),
         "places.csv": encode_csv(results.to_rows()),
         "runs.csv": encode_runs(results),
     }
     for name, text in texts.items():
         write_whole(folder / name, text)
-    figures = {folder / f"bench-{name}.png": name for name in FIGURES_OF_BENCH}
+    figures = {folder / f"bench-{name}.png": name for name in names}
     for path, name in figures.items():
         style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
     return [*(folder / name for name in texts), *figures]

@@ -4,7 +4,7 @@ Invariant: a function of the runs alone, without a clock: equal results give equ
 seeds has its 95 % interval, and every run that is not stable shows. No law is ranked.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -366,8 +366,14 @@ def tabulate_gains(results: BenchResults) -> TextTable:
     return TextTable(("law", "tuned at, ms", "gains", "stable", "without margin"), rows, align="lrlrr")
 
 
-def build_bench_page(results: BenchResults, command: str) -> str:
-    """Returns the results in Markdown, under the command that makes them."""
+def build_bench_page(results: BenchResults, command: str, pictures: Mapping[str, str] = {}) -> str:
+    """Returns the results in Markdown, under the command that makes them.
+
+    Args:
+        results: the results.
+        command: the command that makes them.
+        pictures: by the name of a picture's file beside the page, what the picture shows.
+    """
     parts = [
         f"# The suite: {results.plan.study}",
         f"    {command}",
@@ -375,6 +381,7 @@ def build_bench_page(results: BenchResults, command: str) -> str:
         tabulate_verdicts(results).markdown(),
         f"{OPEN_MARK}: a run is open, {UNSTABLE_MARK}: one is not stable; +-: 95 % over seeds of one link.",
     ]
+    parts += [f"![{text}]({name})" for name, text in pictures.items()]
     for task in results.plan.tasks:
         parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
     for task, key in list_quantities(results):

@@ -23,7 +23,7 @@ import numpy as np
 from ...errors import UsageError
 from ...files import find_version, make_folder, make_subfolder, write_whole
 from ...reporting import style
-from ...reporting.result_text import Block, TextTable, format_number
+from ...reporting.result_text import Block, TextTable, compose, format_number
 from ...results import Result
 from ..study_folder import encode_csv
 from .completion_times import (
@@ -361,10 +361,27 @@ class ExperimentAnalysis(Result):
             learnt = "difference" if protocol.staircase else protocol.task.learnt
             limit_s = self._limit_s if self._is_censored(learnt) else None
             figures["learning"] = draw_learning(self.learning_rows, learnt, unit=self.unit, limit_s=limit_s)
+        page = made / "report.md"
+        write_whole(page, self.compose_page(list(figures)), force=True)
+        self.paths.append(page)
         for name, figure in figures.items():
             self.paths.append(made / f"{name}.png")
             style.write_figure(figure, self.paths[-1], style.REPORT_DPI)
         return self
+
+    def compose_page(self, figures: Sequence[str]) -> str:
+        """Returns the text of the analysis with its figures, as Markdown.
+
+        Args:
+            figures: names of the PNG files beside the page.
+        """
+        protocol = self._experiment.plan.protocol
+        parts = [f"# {protocol.title or protocol.name}"]
+        for block in compose(self):
+            text = block.markdown() if isinstance(block, TextTable) else "\n".join(block.lines())
+            parts += [text] if text.strip() else []
+        parts += [f"![{name}]({name}.png)" for name in figures]
+        return "\n\n".join(parts) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
         """Yields mixed models of the forces of users within pairs, where statsmodels is installed."""
