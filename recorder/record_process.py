@@ -48,7 +48,8 @@ class Recorder:
         storage: where the log goes.
         stopped: returns True once it is to end at once.
         say: prints a line for the user.
-        is_ending: returns True once it is to end as soon as it has what the sites hold, after `END_NS` at most.
+        is_ending: returns True once it is to end as soon as it has what the sites hold, after `END_NS`
+            at most.
     """
 
     def __init__(

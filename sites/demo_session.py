@@ -48,8 +48,8 @@ START_S = 10
 JOIN_S, WAIT_S = 60, 600
 """For so long sites wait for each other and for the recorder, s; the second where people begin a session."""
 END_TIMEOUT_NS = 45 * NS_PER_S
-"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the recorder, and as long
-again after every question of one that was behind."""
+"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the recorder, and as
+long again after every question of one that was behind."""
 RECORDER_NS = 2 * NS_PER_S
 """Time for the recorder to write what is under way, once all sites have ended."""
 
@@ -288,7 +288,7 @@ def _end_group(
     insists: Callable[[], bool],
     tell: Callable[[], None],
 ) -> None:
-    """Ends processes in order, and at once as soon as `insists` returns True; `tell` says why it takes long."""
+    """Ends processes in order, at once when `insists` returns True; `tell` says why it takes long."""
     for process in group:
         process.end(signal.SIGINT)
     begun_ns = clock.monotonic_ns()

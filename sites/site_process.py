@@ -459,8 +459,8 @@ class RunningSite:
     def _await_recorders(self) -> None:
         """Waits until every recorder present has stored all, then for `stay_s` until they are gone.
 
-        A signal does not shorten the first wait, since records that are not stored are lost with this process;
-        a second signal ends it.
+        A signal does not shorten the first wait, since records that are not stored are lost with this
+        process; a second signal ends it.
         """
         parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
         begun_ns = clock.monotonic_ns()

@@ -93,7 +93,8 @@ ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) 
 class Interrupt:
     """A context that records the first signal that ends a program, as `number` (else 0).
 
-    The first signal asks for an orderly end, which may take seconds; a second one `insists` on an end at once.
+    The first signal asks for an orderly end, which may take seconds; a second one `insists` on an end at
+    once.
     Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it `compiles`, and nothing else
     is to be ended in order, a signal ends the process at once while the compiler runs.
     """

@@ -236,7 +236,7 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
     assert desk.over()
     assert desk.recording.problem() == "s disappeared after 20 records"
-    assert "20 records of a number that it never said" in desk.recording.summary()[1]
+    assert "s: 20 records, its end is unknown" in desk.recording.summary()[1]
     log = desk.log()
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
 

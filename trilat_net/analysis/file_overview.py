@@ -231,6 +231,7 @@ def describe_session(log: Log) -> JsonObject:
         "epoch_unix_ns": epoch_ns,
         "recorded_s": max(seconds, default=0.0),
         "ended": {event.member: event.ticks for event in log.events if event.kind == "end"},
+        "unknown_ends": list(log.unknown_ends),
         "scenario": {
             "name": scenario.name,
             "title": scenario.title,
@@ -329,7 +330,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "assumed": list(scenario.assumed),
             "arms": list_arm_notes(scenario),
         },
-        "session": {**log.session, "complete": log.complete},
+        "session": {**log.session, "complete": log.complete, "unknown_ends": list(log.unknown_ends)},
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),
         "settle_s": settling_time_of_all_s(settled),
         "settle_below_rad": SETTLED_ERROR_RAD,

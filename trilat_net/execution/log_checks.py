@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import ScenarioError
-from ..log.accounting import MIN_COVERAGE
+from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
@@ -139,13 +139,11 @@ def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress
 
 def _records_line(log: Log, result: VerifyResult) -> Finding:
     have, coverage = sum(len(log[name]) for name in result.coverage.expected), result.coverage
-    made = {event.member for event in log.events if event.kind == "end"}
-    silent = [name for name in log.sites if name not in made]
     text = f"{have}/{sum(coverage.expected.values())} in the file"
     text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
     text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""
-    if silent:
-        text += f"; {', '.join(silent)} did not report the number of its ticks"
+    if log.unknown_ends:
+        text += f"; {describe_unknown_ends(log.unknown_ends)}"
     if log.damaged:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:

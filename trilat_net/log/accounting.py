@@ -9,7 +9,7 @@ a file decode events only, and count a later part of a log from its first messag
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -237,6 +237,12 @@ class StartGap:
             self._begin = made
 
 
+def describe_unknown_ends(sites: Sequence[str]) -> str:
+    """Returns the sentence for sites whose event at their end never arrived."""
+    whose = " and ".join([", ".join(sites[:-1]), sites[-1]] if len(sites) > 1 else sites)
+    return f"the end of {whose} is unknown: later records may be missing"
+
+
 def parse_counts(account: str) -> dict[str, int]:
     """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
@@ -446,6 +452,21 @@ class SessionAccounts:
                 gaps = account.gap_texts(SHOWN_GAPS, self._bases.get(topic, 0))
                 more = " ..." if len(account.gaps) > len(gaps) else ""
                 yield f"{site}: {account.missing} of {account.expected} records: {' '.join(gaps)}{more}"
+
+    @property
+    def unknown_ends(self) -> list[str]:
+        """The sites whose event at their end is not there."""
+        return [site for site in self._rates_hz if site not in self._ends]
+
+    def describe_tails(self) -> Iterator[str]:
+        """Yields a text per site whose end is unknown and whose records end before the scenario does."""
+        for site in self.unknown_ends:
+            topic = self._topic(site, topics.STATE)
+            account = self._accounts.get(topic)
+            count = 0 if account is None else self._bases.get(topic, 0) + account.expected
+            if count < self._ticks[site]:
+                last = f"tick {count - 1}" if count else "none"
+                yield f"{site}: its end is unknown; its last record is {last}, of {self._ticks[site]} ticks"
 
 
 def open_session_accounts(

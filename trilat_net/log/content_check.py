@@ -14,6 +14,7 @@ than a message.
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from ..core.ticks import tick_ns
@@ -24,11 +25,40 @@ from ..net.wire import decode
 from ..scenario import Scenario
 from ..scenario.run_changes import count_skipped_ticks
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
-from .mcap_records import UnreadableRecord
+from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
 from .message_identity import AnyMessage, MessageIdentity, identify_message
 
 CDR_HEAD = b"\x00\x01"
 """First bytes of a message of a channel for viewers."""
+
+
+_SAMPLED_MESSAGES = 200
+
+
+def find_epochs_ns(data: bytes) -> set[int]:
+    """Returns the epochs, Unix ns, that the first messages of an unpacked chunk imply or state.
+
+    An event states the epoch that it announces. Records and statistics state when they were sent since the
+    epoch, and are stored with the Unix time of that; a session in virtual time has the epoch 0.
+    """
+    epochs_ns: set[int] = set()
+    found = 0
+    for opcode, begin, end in iterate_records(data):
+        if opcode != OP_MESSAGE or end - begin < MESSAGE_HEAD.size or found >= _SAMPLED_MESSAGES:
+            continue
+        found += 1
+        publish_ns = MESSAGE_HEAD.unpack_from(data, begin)[3]
+        payload = data[begin + MESSAGE_HEAD.size : end]
+        kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
+        for kind in kinds:
+            with suppress(WireError):
+                message = decode(payload, kind, messages.READABLE)
+                sent_ns = identify_message(message, 1).sent_ns
+                if isinstance(message, messages.Event):
+                    epochs_ns |= {message.epoch_unix_ns} if message.epoch_unix_ns else set()
+                elif sent_ns is not None and publish_ns:
+                    epochs_ns.add(publish_ns - sent_ns)
+    return epochs_ns
 
 
 class ContentCheck:

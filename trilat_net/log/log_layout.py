@@ -102,6 +102,11 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
     return ChannelFilter(*(tuple(text.strip("/") for text in texts) for texts in (include, exclude)))
 
 
+def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
+    """Returns the filter that the metadata of a session state, see `ChannelFilter.facts`."""
+    return ChannelFilter(tuple(about.get("include", "").split()), tuple(about.get("exclude", "").split()))
+
+
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
 
 

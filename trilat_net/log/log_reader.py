@@ -38,7 +38,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.sample_uses import PictureDelay
-from .accounting import LAST, SessionAccounts
+from .accounting import LAST, SessionAccounts, describe_unknown_ends
 from .data_tables import (
     EVENTS_TABLE,
     SITE_TABLE_KINDS,
@@ -50,7 +50,14 @@ from .data_tables import (
     to_data_frame,
     to_pandas_frame,
 )
-from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, describe_unfinished
+from .log_layout import (
+    ACCOUNTS,
+    EXECUTED_SITES_KEY,
+    PART,
+    RERUN_DRIVER,
+    describe_unfinished,
+    parse_filter_facts,
+)
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import identify_session, merge_parts
 from .record_columns import Ints
@@ -110,6 +117,7 @@ class Log(Result, Mapping[str, SiteLog]):
             records = sum(len(self[name]) for name in self.sites)
             missing = sum(map(self.missing, self.sites)) or "none"
             holds = f"{seconds:.3f} s, {records} records, {missing} missing"
+            holds += f"; {describe_unknown_ends(self.unknown_ends)}" if self.unknown_ends else ""
             holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
         except LogError:
             holds = "with records that cannot be read"
@@ -126,6 +134,7 @@ class Log(Result, Mapping[str, SiteLog]):
             "seed": self.scenario.seed,
             "duration_s": self.scenario.duration_s,
             "complete": self.complete,
+            "unknown_ends": list(self.unknown_ends),
             "diverged": [event.member for event in self.events if event.kind == "diverged"],
             "sites": {str(row.pop("site")): row for row in self.to_rows()},
         }
@@ -262,6 +271,19 @@ class Log(Result, Mapping[str, SiteLog]):
     def account(self, site: str) -> str:
         """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
         return self.accounts.get(self._topic(site, topics.STATE), "")
+
+    @cached_property
+    def unknown_ends(self) -> tuple[str, ...]:
+        """The sites whose event at their end never arrived: nobody knows how many ticks they made.
+
+        None of a part that others follow or of a log that takes no events: there it is not to be expected.
+        """
+        choice = parse_filter_facts(self.session)
+        key = {site: topics.key(self.session["session"], site, topics.EVENT) for site in self.sites}
+        is_part = bool(self.part) and len(self.sources) == 1
+        ended = {event.member for event in self.events if event.kind == "end"}
+        silent = [site for site in self.sites if site not in ended and choice.takes(key[site])]
+        return () if is_part else tuple(silent)
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:

@@ -373,10 +373,11 @@ def read_contents(
         if channel is not None:
             channel.add(payload, log_ns, publish_ns)
     session = reader.metadata.get(SESSION, {})
-    lacking = {"session", "driver"} - session.keys() or {SCENARIO} - reader.attachments.keys()
+    lacking = [key for key in ("session", "driver") if key not in session]
+    lacking += [] if SCENARIO in reader.attachments else [SCENARIO]
     if lacking:
         why = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
-        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking.pop()}"
+        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking[0]}"
         raise LogError(f"{problem}; {why}" if why else problem)
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"

@@ -177,6 +177,7 @@ class RecordScanner:
         size: bytes of the file.
         begins, ends: True if it begins as an MCAP file does, and ends as a finished one: with the end mark.
         finished: True once all was read, to the end of a file that was finished.
+        trailing: bytes that follow its end mark, once that was read.
         damaged: parts that could not be read, so far; a torn end is none of them.
         torn: the end that was cut off, once all before it was read; None if there is none.
     """
@@ -189,6 +190,7 @@ class RecordScanner:
         end = self.read(max(0, self.size - FOOTER_BYTES), FOOTER_BYTES)
         self.ends = end.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and end.endswith(MAGIC)
         self.finished = False
+        self.trailing = 0
         self.damaged: list[Damage] = []
         self.torn: Damage | None = None
 
@@ -218,6 +220,7 @@ class RecordScanner:
             yield frame
             if frame.opcode == Opcode.FOOTER:
                 self.finished = self.read(frame.end, len(MAGIC)) == MAGIC
+                self.trailing = max(0, self.size - frame.end - len(MAGIC)) if self.finished else 0
                 if not self.finished:
                     self.torn = Damage(frame.end, self.size - frame.end, "its last mark is cut off")
                 return

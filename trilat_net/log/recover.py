@@ -297,7 +297,7 @@ class _FileCopy:
         is_made_again = self._accounts is not None and entry.name in (ACCOUNTS, DIGESTS)
         if entry.name == RECOVERED or is_made_again:
             return
-        if entry.name == SESSION and entry.metadata != self._survey.metadata[SESSION]:
+        if entry.name == SESSION and entry.metadata != self._survey.metadata.get(SESSION):
             raise UnreadableRecord("metadata of another session")
         self._out.add_metadata(entry.name, entry.metadata)
 
@@ -498,8 +498,10 @@ class _FileCopy:
             result.lose(f"the definition of {topic}; its messages name it, and it was made again")
         for number in self._contradicted:
             result.lose(f"what channel or schema {number} is: the file says it in two ways")
-        if self._content is None and self._survey.names_members:
-            lacks = "the session's metadata" if SESSION not in self._survey.metadata else "the scenario"
+        if self._content is None and (self._survey.names_members or self._survey.is_foreign_session):
+            lacks = "the scenario" if SESSION in self._survey.metadata else "the session's metadata"
+            if self._survey.is_foreign_session:
+                lacks += ", in whose place are those of another session"
             result.lose(
                 f"{lacks}; other MCAP programs open the new file, commands of trilat-net do not. If the file "
                 f"that was run stands beside the log as {SCENARIO}, recover puts it in"
@@ -515,6 +517,8 @@ class _FileCopy:
             result.chain = self._judge_source()
         if accounts is not None:
             result.missing = list(accounts.missing())
+            if not (result.finished and PART in self._survey.metadata):  # else the end is in a later part
+                result.missing += accounts.describe_tails()
             result.coverage = accounts.coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
             alone = self._scanner.finished and result.lossless and PART not in self._survey.metadata
@@ -534,7 +538,8 @@ class _FileCopy:
     def _judge_source(self) -> DigestState:
         """Returns the agreement of the source with its digest chain.
 
-        A definition that is damaged among the data, and stands in the index with a checksum, changes no message.
+        A definition that is damaged among the data, and stands in the index with a checksum, changes no
+        message.
         """
         state = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
         is_repaired = self._survey.is_redefined and self._reader.agrees_on_messages

@@ -2,7 +2,8 @@
 
 Invariant:
 - Of two definitions of a number, the one covered by a valid checksum wins, else the first.
-- Of several sessions and scenarios in a file those count that name each other.
+- Of several sessions and scenarios in a file those count that name each other; one whose epoch contradicts
+  all messages with a checksum is of another log, and does not count.
 - A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a finished file
   the index tells, which has a checksum of its own; in a log that was not finished the times of the chunks do,
   which never go back.
@@ -17,13 +18,17 @@ from typing import Any
 
 from mcap.opcode import Opcode
 
+from ..net import topics
 from . import mcap_records
+from .content_check import find_epochs_ns
 from .log_layout import SCENARIO, SESSION
 from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 
 Definition = tuple[int, bytes]
 """A schema or a channel: opcode and content."""
-_TOPIC_ROOT = b"/trilat/"
+_TOPIC_ROOT = f"/{topics.ROOT}/".encode()
+_SAMPLED_CHUNKS = 16
+"""Chunks whose messages are compared with the epoch of the session."""
 
 
 class RecoverySurvey:
@@ -39,6 +44,7 @@ class RecoverySurvey:
         attachments: the first of each name; of scenarios the one that the session names.
         count: how many messages the file states; None if no checksum covers that.
         is_redefined: True if a definition among the data is not what the index says, which has a checksum.
+        is_foreign_session: True if the session that the file names is not that of its messages.
         misplaced: what is wrong with chunks that are not where they were written, by offset.
         is_chunked: True if the file has chunks.
         names_members: True if channels are named as those of a session.
@@ -83,6 +89,8 @@ class RecoverySurvey:
         self.names_members = any(_TOPIC_ROOT in content for _, content in self.definitions)
         self.is_chunked = bool(self._chunks)
         self._choose_session()
+        self.is_foreign_session = False
+        self._reject_foreign_session()
         self.misplaced = self._find_misplaced_chunks()
         is_torn_chunk = scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
         self.is_chunked |= is_torn_chunk
@@ -123,6 +131,30 @@ class RecoverySurvey:
                 return
         if self._sessions:
             self.metadata[SESSION] = self._sessions[0]
+
+    def _reject_foreign_session(self) -> None:
+        """Leaves out a session, its scenario and its channels if the messages are of another session."""
+        session = self.metadata.get(SESSION)
+        if session is None:
+            return
+        epochs_ns = self._find_epochs_ns()
+        if not epochs_ns or session.get("epoch_unix_ns") in map(str, epochs_ns):
+            return
+        self.is_foreign_session = True
+        del self.metadata[SESSION]
+        self.attachments.pop(SCENARIO, None)
+        names = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
+        self.definitions = [entry for entry in self.definitions if names not in entry[1]]
+
+    def _find_epochs_ns(self) -> set[int]:
+        """Returns the epochs that messages under a checksum state, in the first chunks that have any."""
+        epochs_ns: set[int] = set()
+        for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
+            with suppress(UnreadableRecord):
+                if head.crc:
+                    data = mcap_records.unpack_chunk(self._scanner.content(frame))
+                    epochs_ns |= find_epochs_ns(data)
+        return epochs_ns
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
         if self._indexes:

@@ -23,9 +23,18 @@ from ..net import messages, topics
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
-from .accounting import Account, SessionAccounts, parse_counts
+from .accounting import Account, SessionAccounts, describe_unknown_ends, parse_counts
 from .findings import CheckReport, Finding, Findings
-from .log_layout import ACCOUNTS, CHANNEL_TYPES, MAX_TIME_NS, PART, SCENARIO, SESSION, VIZ_ROOT
+from .log_layout import (
+    ACCOUNTS,
+    CHANNEL_TYPES,
+    MAX_TIME_NS,
+    PART,
+    SCENARIO,
+    SESSION,
+    VIZ_ROOT,
+    parse_filter_facts,
+)
 from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
@@ -250,6 +259,7 @@ class SessionCheck:
         self._counted = SessionAccounts("", None)
         self._accounts: dict[str, str] = {}  # of the last file
         self._first_part = False  # the files begin with the session
+        self._files = self._parts = 0  # files of the session, and those that are parts of a log
         self._views = self._version = 0
         self._file = self._chain_text = ""
 
@@ -306,6 +316,8 @@ class SessionCheck:
             raise LogError(f"{self._file}: is of another session; look at it alone")
         is_new, self.ours = not self.ours, True
         self._about, self._version = about, _parse_number(about, "schema_version")
+        self._files += 1
+        self._parts += PART in reader.metadata
         self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
         self._check_scenario(reader.attachments[SCENARIO])
         if is_new:
@@ -399,10 +411,21 @@ class SessionCheck:
             text += f"; {finding.summary()}"
         if reordered:
             text += f"; {reordered} came late"
+        if self._takes_events and (silent := self._counted.unknown_ends):
+            text += f"; {describe_unknown_ends(silent)}"
         for gap in gaps:
             finding.add("", None, f"missing {gap}")
         finding.text = text
         return finding
+
+    @property
+    def _takes_events(self) -> bool:
+        """True if the files must tell how the sites ended: all of a log that leaves no events out."""
+        session, choice = self._about["session"], parse_filter_facts(self._about)
+        names = self._scenario.names if self._scenario else ()
+        takes = all(choice.takes(topics.key(session, name, topics.EVENT)) for name in names)
+        is_single_part = self._files == self._parts == 1
+        return takes and not is_single_part
 
     def _check_accounts(self) -> Finding:
         finding = self._findings["accounts"]

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from ..analysis.file_overview import FileOverview
+from ..log.accounting import describe_unknown_ends
 from ..results import JsonObject
 from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
@@ -63,6 +64,8 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
     finished = "finished" if all(file["finished"] for file in facts["files"]) else "not finished"
     damaged = sum(len(file["damaged"]) for file in facts["files"])
     places = f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""
+    silent: list[str] = session["unknown_ends"]
+    tails = f"; {describe_unknown_ends(silent)}" if silent else ""
     title = f": {scenario['title']}" if scenario["title"] else ""
     yield from _rows(
         ("session", f"{session['session']}, {session['driver']}{began}"),
@@ -70,7 +73,7 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
         ("", f"seed {scenario['seed']}, sha256 {scenario['sha256'][:16]}{changed}"),
         *(("", f"note: {note}") for note in scenario.get("arms", ())),
         ("duration", f"{session['recorded_s']:.3f} s of {scenario['duration_s']:g} s"),
-        ("records", f"{records}, {missing or 'none'} missing; {finished}{places}"),
+        ("records", f"{records}, {missing or 'none'} missing{tails}; {finished}{places}"),
     )
 
 

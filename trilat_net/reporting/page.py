@@ -23,6 +23,7 @@ from ..analysis.site_signals import shared_unit
 from ..analysis.timeline import list_alarms
 from ..analysis.twin_growth import PushedTwins
 from ..files import make_folder, write_whole
+from ..log.accounting import describe_unknown_ends
 from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
@@ -231,6 +232,8 @@ def _render_description(scenario: Scenario) -> str:
 
 def _render_run_facts(log: Log, facts: JsonObject) -> str:
     scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
+    if log.unknown_ends:
+        torn += f"; {describe_unknown_ends(log.unknown_ends)}"
     unit = shared_unit(log)
     settled = "not within the run"
     if facts["settle_s"] is not None:

@@ -226,17 +226,28 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Warns of a file that was not finished, with the command that mends it.
+    """Warns of a file that does not end as a finished one does, with the command that mends it, if one can.
 
     Raises:
         LogError: it cannot be read.
     """
     from ..files import reading
     from ..log.mcap_records import RecordScanner
+    from ..log.recovery_survey import RecoverySurvey
 
     with reading(path) as stream:
-        whole = RecordScanner(stream).ends
-    if not whole:
+        scanner = RecordScanner(stream)
+        if scanner.ends:
+            return
+        survey = RecoverySurvey(scanner)
+    if scanner.finished:
+        print_note(
+            f"{path}: was finished, and {scanner.trailing} bytes follow its end mark, which other "
+            f"programs may refuse; make a file without them with: trilat log recover {path}"
+        )
+    elif survey.why_empty:
+        print_note(f"{path}: nothing in it can be recovered: {survey.why_empty}")
+    else:
         print_note(
             f"{path}: was not finished: its end and its index are missing; make it whole with: "
             f"trilat log recover {path}"
