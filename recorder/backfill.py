@@ -43,7 +43,7 @@ class GapRepair:
     def __init__(
         self, bus: Bus, session: str, reception: SiteReception, dropped: Counter[str], now_ns: int = 0
     ) -> None:
-        self._progress_ns = now_ns
+        self._progress_ns = self._polled_ns = now_ns
         self._bus, self._key = bus, topics.key(session, reception.name, topics.PAST)
         self._reception, self._dropped = reception, dropped
         self._turns = list(SITE_CHANNELS)
@@ -63,6 +63,9 @@ class GapRepair:
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
         """Yields missing messages that have arrived; requests more."""
+        if now_ns - self._polled_ns > SILENT_NS:  # this process was frozen, not the site
+            self._progress_ns = now_ns
+        self._polled_ns = now_ns
         if self._open is not None:
             yield from self._read_answers(*self._open, now_ns)
         if alive:

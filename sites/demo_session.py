@@ -39,6 +39,7 @@ from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.operators.program_hand import place_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 
+from .machine_load import describe_load, measure_busy_share
 from .monitor import SessionDisplay, SessionMonitor
 from .site_parts import warm_up
 
@@ -178,6 +179,8 @@ def run_demo(
     session, clock = scenario.name, SystemClock()
     with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
         compile_core(scenario, display.say, interrupt)
+        if warning := describe_load(measure_busy_share(clock)):
+            display.say(f"warning: {warning}")
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         patience_s = JOIN_S if begins is None else WAIT_S
         starter, sites, start_recorder = _start(scenario, folder, reserved, endpoints, patience_s)

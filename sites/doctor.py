@@ -41,6 +41,7 @@ from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 
+from .machine_load import describe_load, measure_busy_share
 from .session_ping import ping_session
 from .site_loop import PeerInbox, StateBlock, run_loop
 from .site_parts import warm_up
@@ -357,7 +358,9 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     cores = process.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{cores} processors, of which {load:.1f} are busy"
-    yield DoctorFinding("processors", "warn" if cores < 2 or load >= cores else "ok", text)
+    warning = describe_load(measure_busy_share(SystemClock()))
+    is_short = cores < 2 or load >= cores or bool(warning)
+    yield DoctorFinding("processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text)
     cached, late = is_core_cached(), "not yet compiled: the first session here begins half a minute later"
     yield DoctorFinding("core", "ok" if cached else "warn", "compiled" if cached else late)
 

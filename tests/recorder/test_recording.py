@@ -9,7 +9,7 @@ import pytest
 
 from recorder import site_reception as tap_module
 from recorder.record_process import Recorder
-from recorder.session_recording import AWAY_NS, LAST_NS, SETTLE_NS
+from recorder.session_recording import AWAY_NS, LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
 from tests.sites.relay import Relay, RelayClock
@@ -241,7 +241,7 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
 
 
-@pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, SETTLE_NS), (False, AWAY_NS)])
+@pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)])
 def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
     """Even if it is the recorder that is cut off: then all sites are gone at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))

@@ -10,7 +10,7 @@ Invariant:
 """
 
 import hashlib
-from bisect import bisect_right
+from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
@@ -161,7 +161,7 @@ class RecoverySurvey:
             return self._find_unnamed_chunks()
         misplaced = {}
         if SESSION in self.metadata:  # files of other programs may be in any order
-            ordered = _find_longest_ordered([head.start_ns for _, head in self._chunks])
+            ordered = _find_longest_ordered([(head.start_ns, head.end_ns) for _, head in self._chunks])
             for place, (frame, _) in enumerate(self._chunks):
                 if place not in ordered:
                     misplaced[frame.offset] = "a chunk that is older or newer than those around it"
@@ -199,15 +199,18 @@ def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
     return index.chunk_length, index.uncompressed_size, *times
 
 
-def _find_longest_ordered(times_ns: Sequence[int]) -> set[int]:
-    """Returns the places of the longest sequence of times that never go back (patience sorting)."""
-    ends: list[int] = []  # the earliest end of a sequence, by its length
+def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
+    """Returns the places of the longest sequence of spans of time of which each is later than the one before.
+
+    That is patience sorting. Equal spans are of a chunk that stands in the file twice.
+    """
+    ends: list[tuple[int, int]] = []  # the earliest end of a sequence, by its length
     places: list[int] = []  # where that sequence ends
     before: list[int] = []  # of each place the place before it in its sequence, -1 for none
-    for place, time_ns in enumerate(times_ns):
-        length = bisect_right(ends, time_ns)
+    for place, span_ns in enumerate(spans_ns):
+        length = bisect_left(ends, span_ns)
         before.append(places[length - 1] if length else -1)
-        ends[length : length + 1] = [time_ns]
+        ends[length : length + 1] = [span_ns]
         places[length : length + 1] = [place]
     ordered = set()
     place = places[-1] if places else -1

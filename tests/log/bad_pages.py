@@ -1,0 +1,172 @@
+"""Files whose pages a disk lost, kept from before, or wrote to the wrong place; and what recovery makes of them."""
+
+import io
+import random
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from tests.log.dealt import Message, messages
+from tests.log_editing import recorded
+from trilat_net.errors import LogError, NothingSaved
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.recover import recover
+from trilat_net.log.torn_chunk import PAGE_BYTES
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+DAMAGES = ("none", "zeroed", "stale", "misdirected", "random")
+
+
+def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
+    """A log as another program writes it: its definitions in the first chunk, without a digest chain."""
+    reader, stream = make_reader(io.BytesIO(data)), io.BytesIO()
+    writer = Writer(stream, chunk_size=chunk_bytes, **options)  # type: ignore[arg-type]
+    writer.start()
+    metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
+    metadata.pop("trilat.chain", None)
+    session = metadata.pop("trilat.session")
+    session.pop("digest_chain", None)
+    writer.add_metadata("trilat.session", session)
+    for attachment in reader.iter_attachments():
+        writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+    schemas: dict[str, int] = {}
+    channels: dict[str, int] = {}
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        assert schema is not None
+        if schema.name not in schemas:
+            schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        if channel.topic not in channels:
+            channels[channel.topic] = writer.register_channel(
+                channel.topic, channel.message_encoding, schemas[schema.name], channel.metadata
+            )
+        number = channels[channel.topic]
+        writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+    for name, entries in metadata.items():
+        writer.add_metadata(name, entries)
+    writer.finish()
+    return stream.getvalue()
+
+
+def shelf() -> dict[str, bytes]:
+    """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
+    long = recorded("paper", {"duration_s": 3.0})
+    live = (GOLDEN / "live-paper.mcap").read_bytes()
+    return {
+        "short": recorded("paper"),
+        "long": long,
+        "another run": recorded("paper", {"duration_s": 3.0, "seed": 5}),
+        "live": live,
+        "live elsewhere": (GOLDEN / "live-4g.mcap").read_bytes(),
+        "unpacked": rewritten(long, 50_000, compression=CompressionType.NONE),
+        "lz4": rewritten(long, 400_000, compression=CompressionType.LZ4),
+        "zstd": rewritten(live, 400_000),
+        "without checksums": rewritten(live, 50_000, enable_crcs=False),
+        "without chunks": rewritten(recorded("paper"), 0, use_chunking=False),
+    }
+
+
+@dataclass(frozen=True)
+class DamagedFile:
+    """A damaged file: which log it was, its bytes, whether its end was cut off, and the damaged pages."""
+
+    name: str
+    data: bytes
+    is_cut: bool
+    pages: tuple[tuple[str, int], ...]
+
+
+def damaged(files: Mapping[str, bytes], names: Sequence[str], draw: random.Random) -> DamagedFile:
+    """One of some logs with up to two bad pages, in six of ten cases cut off anywhere."""
+    name = draw.choice(names)
+    whole = files[name]
+    data = bytearray(whole)
+    is_cut = draw.random() < 0.6
+    if is_cut:
+        del data[draw.randrange(PAGE_BYTES, len(whole)) :]
+    pages = []
+    for _ in range(draw.choice([1, 1, 1, 2])):
+        kind, page = draw.choice(DAMAGES), draw.randrange(-(-len(data) // PAGE_BYTES))
+        pages.append((kind, page))
+        offset = page * PAGE_BYTES
+        length = len(data[offset : offset + PAGE_BYTES])
+        content = bytes(data[offset : offset + PAGE_BYTES])
+        if kind == "zeroed":
+            content = bytes(length)
+        elif kind == "stale":
+            older = files[draw.choice([one for one in names if one != name])]
+            content = (older * (offset // len(older) + 2))[offset : offset + length]
+        elif kind == "misdirected":
+            place = draw.randrange(max(1, len(whole) // PAGE_BYTES)) * PAGE_BYTES
+            content = whole[place : place + length].ljust(length, b"\0")
+        elif kind == "random":
+            content = draw.randbytes(length)
+        data[offset : offset + length] = content
+    return DamagedFile(name, bytes(data), is_cut, tuple(pages))
+
+
+@dataclass
+class RecoveryTally:
+    """What became of damaged files.
+
+    Attributes:
+        outcomes: files by outcome.
+        invented: files with messages that the undamaged file does not have.
+        silent: files that do not pass `verify` although recovery names nothing that is missing.
+        closed: files that no command opens although recovery does not say so.
+        false: files with records that are not what their inputs give.
+    """
+
+    outcomes: Counter[str]
+    invented: list[DamagedFile]
+    silent: list[DamagedFile]
+    closed: list[DamagedFile]
+    false: list[DamagedFile]
+
+    @property
+    def faultless(self) -> bool:
+        return not (self.invented or self.silent or self.closed or self.false)
+
+
+def recovered_all(
+    files: Mapping[str, bytes], cases: Sequence[DamagedFile], folder: Path, *, verified: bool = True
+) -> RecoveryTally:
+    """Recovers files one after the other, and compares what is in them with the undamaged ones."""
+    truth = {name: Counter(messages(data)) for name, data in files.items()}
+    tally = RecoveryTally(Counter(), [], [], [], [])
+    for case in cases:
+        outcome = _recovered(case, truth[case.name], folder, tally, verified)
+        tally.outcomes[outcome] += 1
+    return tally
+
+
+def _recovered(
+    case: DamagedFile, truth: Counter[Message], folder: Path, tally: RecoveryTally, verified: bool
+) -> str:
+    source, output = folder / "damaged.mcap", folder / "recovered.mcap"
+    source.write_bytes(case.data)
+    try:
+        result = recover(source, output, force=True)
+    except NothingSaved:
+        return "nothing to save"
+    if Counter(messages(output.read_bytes())) - truth:
+        tally.invented.append(case)
+    try:
+        log = open_log(output)
+    except LogError:
+        if not any("commands of trilat-net do not" in text for text in result.lost):
+            tally.closed.append(case)
+        return "its session or scenario is lost"
+    if not verified:
+        return "opens"
+    verdict = verify(log)
+    if verdict.first is not None:
+        tally.false.append(case)
+    is_stated = bool(result.lost or result.missing)
+    if not verdict.passed and not is_stated:
+        tally.silent.append(case)
+    return "verifies" if verdict.passed else "opens and states what is missing"

@@ -1,0 +1,184 @@
+"""Pages that are zeroed, stale or in the wrong place: recovery invents nothing, and says what it could not save."""
+
+import io
+import random
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType
+
+from tests.log.bad_pages import GOLDEN, damaged, recovered_all, rewritten, shelf
+from tests.log.dealt import messages
+from tests.log_editing import recorded
+from trilat_net.errors import LogError
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_layout import SCENARIO
+from trilat_net.log.log_reader import open_log
+from trilat_net.log.mcap_records import RecordScanner
+from trilat_net.log.recover import Recovery, recover
+from trilat_net.log.running_digest import DigestState
+from trilat_net.log.session_check import check_file
+from trilat_net.log.torn_chunk import PAGE_BYTES
+
+LZ4 = CompressionType.LZ4
+
+pytestmark = pytest.mark.usefixtures("unsynced")
+
+
+def test_no_message_is_invented(tmp_path: Path) -> None:
+    draw, whole = random.Random(2), recorded("paper")
+    files = {
+        "packed": whole,
+        "loose": rewritten(whole, 30_000),
+        "lz4": rewritten(whole, 30_000, compression=LZ4),
+    }
+    cases = [damaged(files, list(files), draw) for _ in range(12)]
+    assert recovered_all(files, cases, tmp_path, verified=False).faultless
+
+
+@pytest.mark.long
+def test_of_2000_damaged_files_none_invents_a_message(tmp_path: Path) -> None:
+    draw, files = random.Random(53), shelf()
+    cases = [damaged(files, list(files), draw) for _ in range(2000)]
+    tally = recovered_all(files, cases, tmp_path)
+    print(dict(tally.outcomes))
+    assert tally.faultless, tally
+    assert tally.outcomes["verifies"] > 100
+    assert tally.outcomes["its session or scenario is lost"] < 200
+
+
+def recovered(data: bytes, folder: Path) -> tuple[Recovery, bytes]:
+    (folder / "z.mcap.active").write_bytes(data)
+    result = recover(folder / "z.mcap.active", folder / "zz.mcap", force=True)
+    return result, (folder / "zz.mcap").read_bytes()
+
+
+@pytest.mark.long
+def test_a_torn_chunk_with_a_zeroed_page_adds_nothing(tmp_path: Path) -> None:
+    """The attack that gained nine messages."""
+    data = recorded("paper", {"duration_s": 3.0})
+    truth, draw = Counter(messages(data)), random.Random(1)
+    salvaged = 0
+    for _ in range(40):
+        torn = bytearray(data[: draw.randrange(PAGE_BYTES, len(data))])
+        offset = draw.randrange(len(torn) // PAGE_BYTES) * PAGE_BYTES
+        torn[offset : offset + PAGE_BYTES] = bytes(PAGE_BYTES)
+        result, saved = recovered(bytes(torn), tmp_path)
+        assert not Counter(messages(saved)) - truth
+        salvaged += result.salvaged
+        if offset:
+            assert verify(open_log(tmp_path / "zz.mcap")).agreed
+    assert salvaged > 1000
+
+
+def chunk_offsets(data: bytes) -> list[tuple[int, int]]:
+    scanner = RecordScanner(io.BytesIO(data))
+    return [(frame.offset, frame.end) for frame in scanner.frames() if frame.opcode == Opcode.CHUNK]
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_whole_chunk_in_the_wrong_place_is_refused(finished: bool, tmp_path: Path) -> None:
+    """Its checksum is right; the index tells, and without an index the order of the times."""
+    live = (GOLDEN / "live-paper.mcap").read_bytes()
+    places = chunk_offsets(live)
+    begin, end = places[5]
+    first, _ = places[7]
+    data = bytearray(live if finished else live[: live.index(b"trilat.accounts") - 13])
+    data[first : first + end - begin] = live[begin:end]
+    result, saved = recovered(bytes(data), tmp_path)
+    assert not Counter(messages(saved)) - Counter(messages(live))
+    assert not result.lossless
+
+
+def test_a_lost_definition_is_made_again(tmp_path: Path) -> None:
+    """A message names its member and its kind itself."""
+    live = (GOLDEN / "live-paper.mcap").read_bytes()
+    torn = bytearray(live[: chunk_offsets(live)[-1][0]])
+    start = torn.index(b"/trilat/paper-demo/m2/state") + len(b"/trilat/paper-demo/m")
+    torn[start : start + 1] = b"3"
+    result, saved = recovered(bytes(torn), tmp_path)
+    assert not Counter(messages(saved)) - Counter(messages(live))
+    assert any("the definition of /trilat/paper-demo/m2/state" in text for text in result.lost)
+    log = open_log(tmp_path / "zz.mcap")
+    assert len(log["m2"]) > 500
+
+
+def test_a_damaged_definition_leaves_the_log_intact(tmp_path: Path) -> None:
+    """The index has all definitions, under a checksum."""
+    data = bytearray(recorded("paper"))
+    data[PAGE_BYTES : 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
+    result, _ = recovered(bytes(data), tmp_path)
+    assert result.chain is DigestState.OPEN
+    assert verify(open_log(tmp_path / "zz.mcap")).passed
+
+
+def test_a_session_of_another_log_is_not_believed(tmp_path: Path) -> None:
+    live = bytearray((GOLDEN / "live-4g.mcap").read_bytes())
+    other = (GOLDEN / "live-paper.mcap").read_bytes()
+    live[:PAGE_BYTES] = other[:PAGE_BYTES]
+    result, _ = recovered(bytes(live), tmp_path)
+    assert any("commands of trilat-net do not" in text for text in result.lost)
+    with pytest.raises(LogError, match="no log of trilat-net"):
+        open_log(tmp_path / "zz.mcap")
+
+
+def without_scenario(data: bytes) -> bytes:
+    damaged_data = bytearray(data)
+    place = data.index(b"[[", data.index(SCENARIO.encode()))
+    damaged_data[place : place + 2] = b"]]"
+    return bytes(damaged_data)
+
+
+def test_a_lost_scenario_is_taken_from_beside_the_log(tmp_path: Path) -> None:
+    data = recorded("paper")
+    result, saved = recovered(without_scenario(data), tmp_path)
+    assert any("commands of trilat-net do not" in text for text in result.lost)
+    assert b"scenario.toml.damaged" in saved  # kept, and not under a name that promises a right checksum
+    (tmp_path / SCENARIO).write_bytes(open_log(io.BytesIO(data)).scenario_text.encode())
+    recovered(without_scenario(data), tmp_path)
+    assert verify(open_log(tmp_path / "zz.mcap")).agreed
+    (tmp_path / SCENARIO).write_text("another = 1")
+    recovered(without_scenario(data), tmp_path)
+    with pytest.raises(LogError):
+        open_log(tmp_path / "zz.mcap")
+
+
+@pytest.mark.parametrize("place", ["head", "chunk", "accounts", "index"])
+def test_check_names_a_zeroed_page(place: str, tmp_path: Path) -> None:
+    data = bytearray(recorded("paper"))
+    (begin, end), *_ = chunk_offsets(bytes(data))
+    offset = {
+        "head": data.index(b"scenario.toml"),
+        "chunk": (begin + end) // 2,
+        "accounts": data.index(b"trilat.accounts"),
+        "index": len(data) - 2000,
+    }[place]
+    data[offset : offset + 400] = bytes(400)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    assert not check_file(path).passed
+
+
+def test_a_cut_run_names_the_ticks_behind_its_last_record(tmp_path: Path) -> None:
+    """A file that was cut off between two chunks looks as if nothing were lost."""
+    live = (GOLDEN / "live-paper.mcap").read_bytes()
+    result, _ = recovered(live[: chunk_offsets(live)[6][0]], tmp_path)
+    assert result.lost == []
+    assert [text.partition(":")[0] for text in result.missing] == ["m1", "m2", "s"]
+    assert all("its end is unknown" in text for text in result.missing)
+
+
+def test_a_block_with_one_bad_message_is_left_out(tmp_path: Path) -> None:
+    """Packed bytes that are damaged falsify any part of their block, before and behind what shows."""
+    data = recorded("paper", {"duration_s": 3.0})
+    (begin, _), *_ = chunk_offsets(data)
+    torn = bytearray(data[: begin + 120_000])
+    whole, _ = recovered(bytes(torn), tmp_path)
+    torn[begin + 60_000 : begin + 60_040] = bytes(40)
+    result, saved = recovered(bytes(torn), tmp_path)
+    assert 0 < result.salvaged < whole.salvaged
+    assert not Counter(messages(saved)) - Counter(messages(data))
+    assert zstandard.frame_header_size(data[begin + 9 + 44 : begin + 9 + 60]) > 0  # the chunk is packed
