@@ -168,7 +168,7 @@ class BodyTurns:
         poses = np.reshape(bodies, (-1, PLACE + len(QUATERNION_AXES)))
         for body, pose in enumerate(poses):
             pose[PLACE:] = self._signs[body].follow(pose[PLACE:].tolist())
-        return _rounded(poses)
+        return _rounded(poses.ravel())
 
 
 class SessionFrames:

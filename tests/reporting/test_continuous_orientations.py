@@ -1,0 +1,288 @@
+"""Orientations leave the program without a jump: every export, topic and page, against SciPy's rotations.
+
+A motion may pass half a turn about any axis, and turn several times. The records then have rotation vectors
+that jump; whatever a user reads moves at most `ALLOWED` times as far as the arm from one row to the next.
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.io
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+import trilat_net as tn
+from live.session_frames import BodyTurns
+from sites.ros2_topics import Ends, SiteTopics
+from tests.turning import (
+    ALLOWED,
+    CASE,
+    MOTIONS,
+    RECORDS,
+    Motion,
+    count_wraps,
+    largest_step,
+    make_log,
+    place_links,
+    turn,
+)
+from trilat_net.core.vectors import Array
+from trilat_net.log.data_tables import to_pandas_frame
+from trilat_net.log.log_reader import Log
+from trilat_net.log.orientations import (
+    align_signs,
+    bring_nearer,
+    expand_poses,
+    find_quaternions,
+    find_six_numbers,
+    find_steady_vectors,
+)
+from trilat_net.log.ros2.topic_names import read_topic_table
+
+ROS = get_typestore(Stores.ROS2_JAZZY)
+EVERY = [0, *(pytest.param(number, marks=pytest.mark.long) for number in MOTIONS if number)]
+"""One motion on every push, all of them in the long tests."""
+Series = tuple[str, Array, Rotation]
+"""A series of numbers by what it is, shape (K, 4) of w, x, y, z or (K, 6), and the true orientations."""
+
+
+def read_rotation(series: Array) -> Rotation:
+    """The orientations of quaternions or of the first two columns of matrices."""
+    if series.shape[1] == 4:
+        return Rotation.from_quat(series, scalar_first=True)
+    columns = series[:, :3], series[:, 3:], np.cross(series[:, :3], series[:, 3:])
+    return Rotation.from_matrix(np.stack(columns, axis=2))
+
+
+def assert_follows(what: str, series: Array, truth: Rotation, accuracy: float = 1e-6) -> None:
+    """The series has the orientations, and no step larger than `ALLOWED` times that of the motion."""
+    assert (read_rotation(series) * truth.inv()).magnitude().max() < accuracy, what
+    largest = np.linalg.norm(np.diff(series, axis=0), axis=1).max()
+    assert largest <= ALLOWED * largest_step(truth), what
+
+
+def test_motions_pass_half_a_turn() -> None:
+    """Without that the other tests would show nothing."""
+    wraps = [count_wraps(turn(number)) for number in MOTIONS]
+    assert sum(count > 0 for count in wraps) >= 25
+    assert max(wraps) >= 3
+
+
+@pytest.mark.parametrize("number", MOTIONS)
+def test_numbers_of_a_turning_body_never_jump(number: int) -> None:
+    truth = turn(number, 1000)
+    vectors = truth.as_rotvec()
+    assert_follows("quaternions", find_quaternions(vectors), truth, 1e-12)
+    assert_follows("six numbers", find_six_numbers(vectors), truth, 1e-12)
+    pose = np.hstack([np.ones((1000, 3)), vectors])
+    assert np.array_equal(expand_poses(pose)[:, 3:], find_six_numbers(vectors))
+    assert expand_poses(pose[7]).shape == (9,)
+    flipped = truth.as_quat(canonical=True, scalar_first=True)
+    assert_follows("signs", align_signs(flipped), truth, 1e-12)
+    nearer = bring_nearer(vectors[1:], vectors[:-1])
+    assert (Rotation.from_rotvec(nearer) * truth[1:].inv()).magnitude().max() < 1e-9
+    assert np.linalg.norm(nearer - vectors[:-1], axis=1).max() < 3.0
+    steady = Rotation.from_rotvec(find_steady_vectors(vectors))
+    assert (steady * truth.inv()).magnitude().max() < 1e-9
+
+
+def list_table_series(
+    read: Callable[[str, str], Any], motions: dict[str, Motion], records: int = RECORDS
+) -> Iterator[Series]:
+    """The orientations in a table of states; `read` returns a column of a site."""
+    for site, motion in motions.items():
+        for field, truth in (("x", motion.turned), ("q_des", motion.reference)):
+            columns = [np.asarray(read(site, f"{field}_{axis}")) for axis in ("qw", "qx", "qy", "qz")]
+            yield f"{site} {field}", np.stack(columns, axis=1)[:records], truth
+
+
+def list_csv(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "csv", folder / "out")
+    frames = {site: pl.read_csv(folder / "out" / f"{site}_state.csv") for site in motions}
+    about = json.loads((folder / "out" / "about.json").read_text())["tables"]["m_state.csv"]["columns"]
+    assert "unit quaternion" in about["x_qw"]["meaning"]
+    assert about["x_qw"]["source"] == "x[3:6]"
+    assert not [name for name in about if "_rx_rad" in name and "rad_s" not in name]
+    return list_table_series(lambda site, name: frames[site][name], motions)
+
+
+def list_parquet(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "parquet", folder / "out")
+    frames = {site: pl.read_parquet(folder / "out" / f"{site}_state.parquet") for site in motions}
+    return list_table_series(lambda site, name: frames[site][name], motions)
+
+
+def list_npz(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "npz", folder / "out.npz")
+    arrays = np.load(folder / "out.npz")
+    return list_table_series(lambda site, name: arrays[f"{site}/{name}"], motions)
+
+
+def list_mat(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "mat", folder / "out.mat")
+    structs = scipy.io.loadmat(folder / "out.mat", simplify_cells=True)
+    return list_table_series(lambda site, name: structs[site][name], motions)
+
+
+def list_python(log: Log, motions: dict[str, Motion], _folder: Path) -> Iterator[Series]:
+    frames = {site: to_pandas_frame(log.table(site)) for site in motions}
+    yield from list_table_series(lambda site, name: frames[site][name], motions)
+    for site, motion in motions.items():
+        yield f"{site} orientation", log[site].orientation, motion.turned
+        yield f"{site} orientation_des", log[site].orientation_des, motion.reference
+
+
+def list_lerobot(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "lerobot", folder / "out", fps=1000)
+    frames = pl.read_parquet(folder / "out" / "data" / "chunk-000" / "file-000.parquet")
+    features = json.loads((folder / "out" / "meta" / "info.json").read_text())["features"]
+    assert features["action"]["names"] == [
+        *(f"{axis}.pos" for axis in "xyz"),
+        *(f"{entry}.rot" for entry in ("r11", "r21", "r31", "r12", "r22", "r32")),
+    ]
+    assert "rotation matrix" in json.loads((folder / "out" / "about.json").read_text())["meanings"]["r11.rot"]
+    for column in ("action", "action.m"):
+        yield column, frames[column].to_numpy()[:, 3:].astype(np.float64), motions["m"].turned
+
+
+def read_turn(found: Any) -> list[float]:
+    return [found.w, found.x, found.y, found.z]
+
+
+def list_ros_series(
+    poses: dict[str, list[Any]], frames: list[Any], log: Log, motions: dict[str, Motion], prefix: str
+) -> Iterator[Series]:
+    """The orientations in messages of poses, by topic, and of frames."""
+    for site, motion in motions.items():
+        for topic, truth in (("tip_pose", motion.turned), ("reference_pose", motion.reference)):
+            messages = poses[f"{prefix}/{site}/{topic}"]
+            turns = np.array([read_turn(one.pose.orientation) for one in messages])
+            yield f"{site} {topic}", turns, truth
+    links = defaultdict(list)
+    for message in frames:
+        for one in message.transforms:
+            links[one.header.frame_id, one.child_frame_id].append(read_turn(one.transform.rotation))
+    for site, motion in motions.items():
+        turned = [Rotation.identity(RECORDS), *place_links(log.scenario, site, motion.q)]
+        moving = [
+            np.array(turns)
+            for (_, child), turns in links.items()
+            if child.startswith(f"{site}/") and np.ptp(turns, axis=0).max() > 1e-12
+        ]
+        assert len(moving) == len(turned) - 1
+        for n, turns in enumerate(moving):
+            yield f"{site} link {n + 1}", turns, turned[n].inv() * turned[n + 1]
+
+
+def list_bag(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
+    tn.export(log, "ros2", folder / "out.mcap")
+    poses, frames = defaultdict(list), []
+    with AnyReader([folder / "out.mcap"]) as bag:
+        for connection, _, data in bag.messages():
+            if connection.msgtype == "geometry_msgs/msg/PoseStamped":
+                poses[connection.topic].append(bag.deserialize(data, connection.msgtype))
+            elif connection.topic == "/tf":
+                frames.append(bag.deserialize(data, connection.msgtype))
+    return list_ros_series(poses, frames, log, motions, "/tool_down")
+
+
+class Topic(list[bytes]):
+    """A topic to which somebody listens."""
+
+    heard = True
+    put = list.append
+
+
+class Graph:
+    """A graph of ROS that keeps what is published."""
+
+    def __init__(self) -> None:
+        self.published: dict[str, Topic] = defaultdict(Topic)
+
+    def publisher(self, topic: str, *_: object) -> Topic:
+        return self.published[topic]
+
+
+def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Iterator[Series]:
+    graph = Graph()
+    ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+    for site in motions:
+        shown = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
+        for record in log[site].states:
+            shown.show(record, 1000.0)
+    kind = "geometry_msgs/msg/PoseStamped"
+    poses = {
+        topic: [ROS.deserialize_cdr(data, kind) for data in messages]
+        for topic, messages in graph.published.items()
+        if topic.endswith("_pose")
+    }
+    frames = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.published["tf"]]
+    return list_ros_series(poses, frames, log, motions, "t")
+
+
+@pytest.mark.parametrize(
+    "list_series",
+    [list_csv, list_parquet, list_npz, list_mat, list_python, list_lerobot, list_bag, list_live_topics],
+)
+@pytest.mark.parametrize("number", EVERY)
+def test_every_export_and_topic_turns_as_the_arm_does(
+    tmp_path: Path, number: int, list_series: Callable[..., Iterator[Series]]
+) -> None:
+    log, motions = make_log(number)
+    count = 0
+    for what, series, truth in list_series(log, motions, tmp_path):
+        assert len(series) == RECORDS, what
+        assert_follows(what, series, truth)
+        count += 1
+    assert count >= 2
+
+
+@pytest.mark.parametrize("number", MOTIONS)
+def test_bodies_on_the_page_turn_as_the_plant_says(number: int) -> None:
+    """A plant may give its quaternions any sign."""
+    truth, bodies = turn(number), BodyTurns()
+    canonical = truth.as_quat(canonical=True, scalar_first=True)
+    frames = [bodies.align([1.0, 2.0, 3.0, *one, 0.0, 0.0, 0.0, *-one]) for one in canonical]
+    poses = np.array(frames).reshape(RECORDS, 2, 7)
+    assert_follows("first body", poses[:, 0, 3:], truth, 1e-4)
+    assert_follows("second body", poses[:, 1, 3:], truth, 1e-4)
+    assert poses[0, 0, :3].tolist() == [1.0, 2.0, 3.0]
+    assert BodyTurns().align([]) == []
+
+
+def test_an_environment_observes_orientations_that_never_jump() -> None:
+    """Arms whose tools point down, as the user and as its peer."""
+    env = tn.make_env(CASE.read_text(encoding="utf-8"), user="s", leads="m", rate_hz=100, duration_s=2.0)
+    observed = [env.reset(seed=1)[0]]
+    shared = []
+    for _ in range(190):
+        way = np.array([0.0, 0.02, 0.0])
+        observed.append(env.step(observed[-1]["pose"] + way)[0])
+        view = env.unwrapped._look().view
+        shared.append(np.concatenate([view.q_des, view.peers[0].q]))
+    assert env.observation_space.contains(observed[-1])
+    for what, column in (("q_des", 3), ("peer_q", 9)):
+        vectors = np.array(shared)[:, column : column + 3]
+        series = np.array([one[what].ravel()[3:] for one in observed[1:]])
+        assert series.shape[1] == 6
+        turned = Rotation.from_rotvec(vectors)
+        assert count_wraps(turned) > 0
+        assert_follows(what, series, turned)
+
+
+def test_a_dataset_of_a_tool_that_points_down_has_no_jump(tmp_path: Path) -> None:
+    log = tn.simulate(str(CASE))
+    tn.export(log, "lerobot", tmp_path / "out")
+    frames = pl.read_parquet(tmp_path / "out" / "data" / "chunk-000" / "file-000.parquet")
+    rows = (np.arange(len(frames)) * 1000) // 30
+    turned = Rotation.from_rotvec(log["m"].x[rows, 3:])
+    assert count_wraps(turned) > 0
+    assert largest_step(turned) < 0.2
+    assert_follows("action", frames["action"].to_numpy()[:, 3:].astype(np.float64), turned)
