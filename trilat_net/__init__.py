@@ -50,6 +50,7 @@ if _TYPE_CHECKING:
     from .log.log_reader import open_log as open_log
     from .log.log_signature import create_signing_keys as create_signing_keys
     from .log.log_signature import sign_log as sign_log
+    from .log.orientations import expand_poses as expand_poses
     from .log.recover import recover as recover
     from .log.session_check import check_file as check_file
     from .net.arm_client import ArmClient as ArmClient
@@ -100,6 +101,7 @@ _NAMES = {
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
     "trilat_net.log.log_signature": "create_signing_keys sign_log",
+    "trilat_net.log.orientations": "expand_poses",
     "trilat_net.log.recover": "recover",
     "trilat_net.log.session_check": "check_file",
     "trilat_net.net.arm_client": "ArmClient SwitchClient",

@@ -1,5 +1,6 @@
 """A policy and a person in one session, through the interfaces of LeRobot."""
 
+import json
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,6 +8,8 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
+import polars as pl
 import pytest
 
 import trilat_net
@@ -56,6 +59,35 @@ def test_features_follow_from_the_scenario_before_any_connection(found: dict[str
     assert not robot.is_connected
     with pytest.raises(ConnectionError, match="not connected"):
         robot.get_observation()
+
+
+SPACE = Path(__file__).parents[1] / "reporting" / "cases" / "tool_down.toml"
+
+
+@pytest.mark.parametrize(("actions", "mode"), [("tip", "tip"), ("joints", "joint")])
+@pytest.mark.parametrize("space", [False, True])
+def test_a_dataset_has_the_actions_that_the_plugin_accepts(
+    found: dict[str, ModuleType], tmp_path: Path, actions: str, mode: str, space: bool
+) -> None:
+    """Names and order are the plugin's features, and the numbers where the hand of the user was."""
+    site, slave = ("m", "s") if space else ("m2", "s")
+    hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
+    scenario = load_scenario(str(SPACE) if space else "play", hands)
+    (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
+    config = found[ROBOT].TrilatRobotConfig(scenario=str(tmp_path / "held.toml"), site=site, slave=slave)
+    features = make_device(config).action_features
+    log = trilat_net.simulate(scenario)
+    trilat_net.export(log, "lerobot", tmp_path / "set", actions=actions, fps=100)
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text(encoding="utf-8"))
+    about = json.loads((tmp_path / "set" / "about.json").read_text(encoding="utf-8"))
+    assert info["features"]["action"]["names"] == list(features)
+    assert info["features"][f"action.{site}"]["shape"] == [len(features)]
+    assert about["actions"] == actions
+    frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
+    q = log[site].q[:: log[site].rate_hz // 100].tolist()
+    place = scenario.arms[site].end_effector if actions == "tip" else tuple
+    wanted = np.array([place(row) for row in q], dtype=np.float32)
+    assert frames[f"action.{site}"].to_numpy() == pytest.approx(wanted[: len(frames)], abs=1e-6)
 
 
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])

@@ -16,7 +16,7 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from tests.task_arms import planar_task
+from tests.task_arms import planar_task, posed_arms
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
@@ -212,3 +212,18 @@ def test_a_form_without_settings_says_so(tmp_path: Path) -> None:
         Exporter("csv", tmp_path / "set", settings={"fps": 30})
     with pytest.raises(UsageError, match="of one log"):
         Exporter("csv", tmp_path / "set").export(log(), log())
+
+
+def test_other_actions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="actions are tip or joints, not 'arms'"):
+        exported(tmp_path, log(), actions="arms")
+    with pytest.raises(UsageError, match="csv has no setting 'actions'"):
+        Exporter("csv", tmp_path / "csv", settings={"actions": "tip"})
+
+
+def test_users_with_other_joints_are_told_to_use_tips(tmp_path: Path) -> None:
+    source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
+    with pytest.raises(LogError, match=r"joints of m2 are not those of m1, .*: use --actions tip"):
+        exported(tmp_path, source, actions="joints")
+    folder = exported(tmp_path, source, actions="tip")
+    assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]

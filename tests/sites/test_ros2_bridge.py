@@ -37,6 +37,7 @@ from tests.log.standard_files import made
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
+from tests.task_arms import posed_arms
 from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.core.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
@@ -281,7 +282,9 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
     return [where for name, where in found.items() if name.startswith(f"{site}/")] + [found["world"]]
 
 
-@pytest.mark.parametrize("name", ["paper", "six_joints", "unlike_arms", "wall_in_space"])
+@pytest.mark.parametrize(
+    "name", ["paper", "six_joints", "unlike_arms", "wall_in_space", pytest.param(posed_arms(), id="posed")]
+)
 def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:

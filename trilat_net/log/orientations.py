@@ -67,9 +67,19 @@ def find_six_numbers(turns: Array) -> Array:
 
 
 def expand_poses(x: Array) -> Array:
-    """Returns what sites share with six numbers for an orientation: shape (..., 9) of poses (..., 6).
+    """Returns poses with six numbers in place of their rotation vectors.
 
-    Joint angles and places without an orientation are returned as they are; use it for task space alone.
+    An environment observes poses so, and a hand of one's own gets the same numbers from `HandView`:
+
+    >>> tn.expand_poses(np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])).round(6).tolist()
+    [0.5, 0.0, 0.2, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0]
+
+    Args:
+        x: what sites share in task space: places, shape (..., 3), m, or places and rotation vectors,
+            shape (..., 6), m and rad.
+
+    Returns:
+        Places and the first two columns of the rotation matrices, shape (..., 9); places alone as they are.
     """
     if x.shape[-1] != POSE:
         return x

@@ -164,8 +164,8 @@ def _read_commands(
         return poses, [*places, *turned][: poses[0].shape[1]]
     joints = {user: [f"{name}.pos" for name in log.scenario.arms[user].joint_names] for user in users}
     if other := next((user for user in users if joints[user] != joints[users[0]]), None):
-        text = f"the joints of {other} are not those of {users[0]}, so that no action is of either"
-        raise LogError(f"{log.source}: {text}: export --actions tip")
+        text = f"the joints of {other} are not those of {users[0]}, so that an action cannot stand for both"
+        raise LogError(f"{log.source}: {text}: use --actions tip")
     return [log[user].q[rows[user]] for user in users], joints[users[0]]
 
 
