@@ -46,9 +46,7 @@ class DeviceHand:
         trips_ns: from the place of the device to the force that it has caused.
     """
 
-    def __init__(
-        self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: Reach
-    ) -> None:
+    def __init__(self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: Reach) -> None:
         self._hand, self._device, self._how, self._clock = hand, device, how, clock
         self._reach = reach
         self._rows = how.rows(len(hand.pose))

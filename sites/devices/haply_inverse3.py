@@ -47,7 +47,9 @@ class HaplyInverse3:
 
     def __enter__(self) -> Self:
         if not self._was_there:
-            check_hosts([self._address])  # a misspelt name never answers; one that did may be away for a while
+            check_hosts(
+                [self._address]
+            )  # a misspelt name never answers; one that did may be away for a while
         try:
             self._socket = self._open.enter_context(connect(self._address, open_timeout=2.0, **_PLAIN))
         except (OSError, ValueError, WebSocketException) as error:

@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 
 from tests.core.chain_references import chain_references
 from tests.scenario.chains import SIX, six
+import trilat_net
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_embedded
+from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
@@ -24,6 +26,23 @@ WALL = {"kind": "wall", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "
 PULSE = {"kind": "pulse", "start_s": 1.0, "end_s": 2.0, "peak_nm": 3.0}
 TIP_SPRING = {"kind": "tip_spring", "stiffness_n_m": 100.0}
 Overrides = dict[str, Any]
+
+
+def two_joints(**master: Any) -> dict[str, Any]:
+    """Returns the tables of two arms of the robot with a finger."""
+    text = (Path(__file__).parent / "robots/finger_inertia.urdf").read_text()
+    return {
+        "name": "two_joints",
+        "duration_s": 3.0,
+        "rate_hz": 500,
+        "arm": {"urdf": "robot.urdf", "tip": "lower", "armature_kg_m2": 0.1},
+        "urdf": {"robot.urdf": text},
+        "control": {"law": "p_d", "K": 2.0, "d": 2.0},
+        "limits": {"qd_limit_rad_s": 50.0},
+        "link": {"delay_ms": 20.0},
+        "sites": {"m": master, "s": {"role": "slave"}},
+        "dominance": {"m": {"s": 1.0}, "s": {"m": 1.0}},
+    }
 
 
 def refusal(changes: Overrides) -> ScenarioError:
@@ -196,6 +215,46 @@ def test_limits_are_those_of_file_unless_author_says_others() -> None:
 
 def test_start_beyond_limits_is_free_where_there_are_no_stops() -> None:
     six(**{"sites.s.arm.stops": False, "sites.s.q0_rad": [7.0, 0, 0, 0, 0, 0]})
+
+
+def test_an_arm_may_start_a_little_beyond_a_stop() -> None:
+    """No spring pushes where it starts, the stop of other sites stays, and farther away it is refused."""
+    start = [6.34, -0.3, 0.5, 0.0, 0.0, 0.0]
+    scenario = six(**{"sites.s.q0_rad": start})
+    m1, s = (scenario.arms[name].chain.joints[0] for name in ("m1", "s"))
+    assert (m1.upper, s.upper) == (2.0 * math.pi, 6.34)
+    assert m1.lower == s.lower == -2.0 * math.pi
+    assert any(
+        "s starts 0.0568 rad beyond a stop of joint shoulder_pan" in x for x in list_arm_notes(scenario)
+    )
+    error = refusal({"sites.s.q0_rad": [-6.44, -0.3, 0.5, 0.0, 0.0, 0.0]})
+    assert error.path == "sites.s.q0_rad[0]"
+    assert "start at most 0.15 rad beyond" in error.problem
+
+
+def test_an_arm_beyond_its_stop_moves_back_inside(tmp_path: Path) -> None:
+    """It begins at rest, and its peers, who stand within, lead it there; the run repeats bit for bit."""
+    scenario = load_scenario(two_joints(q0_rad=[2.1, 0.0]))
+    log = trilat_net.simulate(scenario)
+    m = log["m"]
+    q = m.q[:, 0]
+    assert q[0] == 2.1
+    assert np.abs(np.diff(q[:3])).max() < 1e-4  # a stop of 1000 N m/rad would throw it by 1e-3
+    assert q.max() <= 2.1 + 1e-6
+    assert q[-1] < 2.0
+    path = tmp_path / "run.mcap"
+    log.save(path)
+    assert verify(open_log(path)).passed
+
+
+def test_limits_of_position_give_way_to_a_start_a_little_beyond() -> None:
+    limits = {"limits.q_max_rad": 2.0, "limits.q_min_rad": -2.0, "on_stale.action": "glide"}
+    scenario = load_scenario("play", {**limits, "sites.m1.q0_rad": [2.1, 0.5]})
+    assert scenario.setup("m1").limits.q_max == (2.15, 2.0)
+    assert scenario.setup("s").limits.q_max == 2.0
+    assert any("q_max_rad of joint q1: the limit lies at 2.15 rad" in x for x in list_arm_notes(scenario))
+    with pytest.raises(ScenarioError, match="start at most 0.15 rad"):
+        load_scenario("play", {**limits, "sites.m1.q0_rad": [2.16, 0.5]})
 
 
 def test_gravity_along_axis_or_across_it_is_only_its_direction() -> None:

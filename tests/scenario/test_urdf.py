@@ -317,7 +317,7 @@ def test_a_mistake_is_refused_with_its_place_and_the_remedy(old: str, new: str, 
         (robot(link("a")), {}, ["link 'a'", "no joint"]),
         (robot(), {}, ["no links"]),
         (GRIPPER, {"tip": "thumb"}, ["joint 'right'", "mimic", "'palm'"]),
-        (GRIPPER.replace("prismatic", "planar"), {"tip": "tcp"}, ["joint 'left'", "planar"]),
+        (GRIPPER.replace("prismatic", "planar"), {"tip": "finger"}, ["joint 'left'", "planar"]),
     ],
 )
 def test_ends_that_make_no_arm_are_refused_by_name(text: str, ends: dict, words: list[str]) -> None:

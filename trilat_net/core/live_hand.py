@@ -362,9 +362,7 @@ def _take_command(
 
 def _aim(rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int) -> HandMemory:
     goal = rules.reach.find_nearest(command.target)
-    return memory._replace(
-        number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
-    )
+    return memory._replace(number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns)
 
 
 def _let_go(memory: HandMemory, number: int) -> HandMemory:

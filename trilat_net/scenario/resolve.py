@@ -303,7 +303,9 @@ def _resolve_arm(
 def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
     """Returns the masses and inertias that an arm gives its links, drawn and checked one by one."""
     links: TomlTable = {}
-    for name, entry in check_keys(written, list(written), path).items():
+    if not isinstance(written, dict):
+        raise ScenarioError("must be a table of links", path=path)
+    for name, entry in written.items():
         place = f"{path}.{name}"
         check_keys(entry, field_names(LinkInertia), place)
         links[name] = draws.draw_numbers(entry, place)

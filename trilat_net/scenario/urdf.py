@@ -456,14 +456,13 @@ def _read_bodies(
             raise ScenarioError(problem, path=f"{_key(name)}.{key}")
         if name in leading and problem:
             _refuse(_link(name), f"{problem}; {_advise_key(name, 'mass_kg')}")
-        if name in leading and inertial.lacks_tensor and given is None:
-            _refuse(
-                _link(name), f"its <inertial> has no <inertia>; {_advise_key(name, 'inertia_kg_m2')}"
-            )
+        if name in leading and inertial.lacks and given is None:
+            advice = _advise_key(name, "inertia_kg_m2")
+            _refuse(_link(name), f"its <inertial> has no <inertia>; {advice}")
         if problem:
             notes.append(f"{_link(name)} does not lead to the end link and is left out: {problem}")
             continue
-        if inertial.lacks_tensor:
+        if inertial.lacks:
             notes.append(f"{_link(name)} states a mass and no inertia: a point of {inertial.mass:g} kg")
         yield _read_body(name, pose, inertial, path, inertias, notes)
 
@@ -623,15 +622,19 @@ def _read_origin(parent: Element, place: str) -> _Pose:
 
 
 class _Inertial(NamedTuple):
-    """The mass of a link, its frame of inertia in the link's frame, and the tensor there.
+    """The inertia of a link in the link's frame.
 
-    `lacks_tensor`: neither the file nor the scenario states a tensor, so that it is zero.
+    Attributes:
+        mass: kg; 0 if none is stated.
+        centre: the centre of mass, with the axes of the tensor.
+        tensor: about the centre of mass, kg m^2; zero if none is stated.
+        lacks: what neither the file nor the scenario states: "mass", "inertia" or "".
     """
 
     mass: float
     centre: _Pose
     tensor: Matrix
-    lacks_tensor: bool
+    lacks: str
 
 
 _TENSOR_KEYS = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
@@ -660,7 +663,8 @@ def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Iner
     if given.com_m is not None:
         x, y, z = given.com_m
         centre = _Pose(centre.rotation, (x, y, z))
-    return _Inertial(mass or 0.0, centre, _POINT if tensor is None else tensor, tensor is None)
+    lacks = "mass" if mass is None else "inertia" if tensor is None else ""
+    return _Inertial(mass or 0.0, centre, _POINT if tensor is None else tensor, lacks)
 
 
 def _read_stated_inertial(
@@ -682,6 +686,8 @@ def _read_stated_inertial(
 
 def _find_mass_problem(inertial: _Inertial) -> str:
     """Returns why a mass cannot be, or ""."""
+    if inertial.lacks == "mass":
+        return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
         return f"its mass is {inertial.mass:g} kg, must not be negative"
     if inertial.mass == 0.0 and any(map(any, inertial.tensor)):
