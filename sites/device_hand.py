@@ -1,13 +1,13 @@
 """A device at the arm of a site: its motion leads the arm, and it renders what the arm gives back.
 
 Invariant:
-    - Only changes of the device's place move the target, and only while its clutch is pressed: a state that is
-      not finite, or a jump, moves nothing, and neither does a device that comes back.
-    - The target stays within the arm's reach, however often the clutch is pressed: a motion of the device
-      that leads out of it is lost, and one that leads back in acts at once.
+    - Only changes of the device's place move the target, and only while its clutch is pressed: a state
+      that is not finite, or a jump, moves nothing, and neither does a device that comes back.
+    - The target stays within the arm's reach, however often the clutch is pressed: a motion of the
+      device that leads out of it is lost, and one that leads back in acts at once.
     - Whoever has let go, by the device's silence too, takes hold again by pressing the clutch anew.
-    - The force is that of the newest record, turned, scaled and limited as the scenario says; it is zero while
-      the clutch is open, or the record is old.
+    - The force is that of the newest record, turned, scaled and limited as the scenario says; it is
+      zero while the clutch is open, or the record is old.
     - The hand has no heartbeat but the device's: a loop that hangs is a silent hand.
 """
 

@@ -105,7 +105,7 @@ def test_no_link_off_the_way_makes_an_arm_unusable(body: str, kind: str, mass_kg
     assert chain.joints[1].inertia[0] == mass_kg
     assert any(note in one for one in chain.notes)
     least, middle, most = body_moments(chain, 1)
-    assert 0.0 < least
+    assert least > 0.0
     assert most <= (least + middle) * (1.0 + 1e-6)
 
 

@@ -4,23 +4,24 @@ Invariant: `advance_hand` is the whole state machine, a pure function of what it
 messages that came in before a tick. What is in force in a tick is an input of the tick and stands in its
 record, so a log repeats people without their messages.
 
-Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`; while
-a grip still fades, from that grip, its target and the target's velocity. A target glides to its newest goal in
-a straight line, over a quarter more than the time between the last two messages, so that it does not stop
-where one is a little late. A hand that is silent for `SILENCE_NS` lets go: the target comes to rest and the
-grip fades within `GRIP_NS`.
+Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`;
+while a grip still fades, from that grip, its target and the target's velocity. A target glides to its
+newest goal in a straight line, over a quarter more than the time between the last two messages, so that
+it does not stop where one is a little late. A hand that is silent for `SILENCE_NS` lets go: the target
+comes to rest and the grip fades within `GRIP_NS`.
 
-Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to tick the velocity
-of a target changes by at most its acceleration limit times the period, whatever messages come and however
-unevenly, and its speed never exceeds the largest one from which it can stop at its goal, Eq. (L1):
+Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to tick the
+velocity of a target changes by at most its acceleration limit times the period, whatever messages come
+and however unevenly, and while it glides its speed does not exceed the largest one from which it can
+stop at its goal, Eq. (L1):
 
-    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)        (L1)
+    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)       (L1)
 
-with d the distance to the goal, a the acceleration limit and h the period. A target at that speed needs n more
-ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d exactly. A target that begins at rest
-therefore moves in a straight line and comes to rest at a still goal without overshoot. If the goal comes back
-along that line, the target passes it by no more than the way in which it can stop, at most
-V^2 / (2 a) + V h / 2 at the speed limit V.
+with d the distance to the goal, a the acceleration limit and h the period. A target at that speed needs
+n more ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d exactly. A target that
+begins at rest therefore moves in a straight line and comes to rest at a still goal without overshoot. If
+the goal comes back along that line, the target passes it by no more than the way in which it can stop,
+at most V^2 / (2 a) + V h / 2 at the speed limit V.
 """
 
 import math

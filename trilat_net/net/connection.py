@@ -110,7 +110,7 @@ class Connection:
         """Opens it; see `ZenohBus`.
 
         Raises:
-            UnknownHost: an endpoint names a host that does not resolve, to which Zenoh would connect for ever.
+            UnknownHost: an endpoint names a host that does not resolve, which Zenoh would try for ever.
         """
         listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
         check_hosts(find_endpoint_addresses([*listen, *connect]))

@@ -1,10 +1,10 @@
 """The Zenoh configuration of a session member, what each may send and hear, and checks of a user's own file.
 
 Invariant:
-    - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never meet by
-      accident.
-    - No setting of a user's file is overruled silently: it is taken, or refused with its key, its value and
-      the value required. A setting that a session makes itself is taken if it has the session's value.
+    - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never
+      meet by accident.
+    - No setting of a user's file is overruled silently: it is taken, or refused with its key, its value
+      and the value required. A setting that a session makes itself is taken if it has the session's value.
     - A file is refused once, with all its settings that contradict a session.
 
 Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here, for bursts of
@@ -212,8 +212,8 @@ def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str
     """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing settings, or "".
 
     Raises:
-        UsageError: it is no Zenoh configuration, or contradicts a requirement of a session; with every key that
-            does so.
+        UsageError: it is no Zenoh configuration, or contradicts requirements of a session; the message
+            has every key that does so.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")

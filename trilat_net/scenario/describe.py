@@ -191,8 +191,8 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
                 beyond = max(joint.lower - start, start - joint.upper)
                 if beyond > 0.0:
                     notes.append(
-                        f"{name} starts {beyond:.3g} {units[n]} beyond a stop of joint {joint.name}: the stop "
-                        "lies where the arm starts"
+                        f"{name} starts {beyond:.3g} {units[n]} beyond a stop of joint {joint.name}: "
+                        "the stop lies where the arm starts"
                     )
         given, in_force = spec.limits.motion, scenario.motion_limits(name)
         for key, before, after in (
