@@ -221,7 +221,7 @@ export class Stage {
   }
 
   slider(row, text, { least, most, step }, set) { // empty, without a place, until somebody gives it one
-    const input = make(row, "input", "", "unset");
+    const input = make(make(row, "span", "", "slider"), "input", "", "unset");
     Object.assign(input, { type: "range", min: least, max: most, step });
     input.setAttribute("aria-label", text);
     input.setAttribute("aria-valuetext", "no answer yet");

@@ -52,12 +52,16 @@ class RecordedSession:
     Attributes:
         user: site of the user's page.
         cut: true: pages get nothing more.
+        sent: what pages have sent besides that they have drawn a frame.
+        last: the frame that a page gets again and again; a test may change it.
     """
 
     user: str = "m1"
     hellos: dict[str, Json] = field(default_factory=dict)
     frames: dict[str, list[Json]] = field(default_factory=lambda: {role: [] for role in ROLES})
     cut: bool = False
+    sent: list[Json] = field(default_factory=list)
+    last: Json = field(default_factory=dict)
 
     @contextmanager
     def shown(
@@ -77,11 +81,15 @@ class RecordedSession:
     ) -> Iterator[WatchedPage]:
         """The same page with the means to check it; at its end it has had no error."""
         *before, end = self.frames[role]
-        frames = chain(before, repeat({**end, **last, "points": [], "energies": [], "events": []}))
+        self.last = {**end, **last, "points": [], "energies": [], "events": []}
+        frames = chain(before, repeat(self.last))
+        self.sent.clear()
 
         def send(route: WebSocketRoute) -> None:
             def answer(message: Any) -> None:
-                if json.loads(message)["do"] == "seen" and not self.cut:
+                if json.loads(message)["do"] != "seen":
+                    self.sent.append(json.loads(message))
+                elif not self.cut:
                     route.send(json.dumps(next(frames)))
 
             route.on_message(answer)
