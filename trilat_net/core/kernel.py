@@ -110,7 +110,7 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
             return_to_law(t_ns, s)
     limit_torque_rate(s)
     if resting:
-        advance_rest(t_ns, s)
+        advance_rest(s)
 
 
 @leaf
@@ -173,6 +173,7 @@ def _advance(
     Constant over the period are the control torque at its middle, and the sampled sources.
     """
     h_s = 1.0 / s.rate_hz
+    adapts = _adapts(s)  # of this tick: whether an arm at rest is fast depends on its speed
     put(s.q_before, s.q)
     if s.external == 0:
         for i in range(s.u.shape[0]):
@@ -182,13 +183,12 @@ def _advance(
             s.u[i] = torque + s.held[i]
         if not _advance_arm(t_ns * 1e-9, h_s, s, chain, actors, table):
             s.mode = _DIVERGED
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and _adapts(s):
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
         _advance_estimate(s, chain, h_s, s.Yr)
     for i in range(s.tau.shape[0]):
         s.tau_before[i] = s.tau[i]
-    adapts = _adapts(s)
     for p in range(s.Yr.shape[0]):
-        s.Yr_before[p] = s.Yr[p] if adapts else 0.0
+        s.Yr_before[p] = s.Yr[p] if adapts and s.mode != _DIVERGED else 0.0
 
 
 @leaf

@@ -19,7 +19,7 @@ from math import isfinite
 
 from .chain import add, put_three, scale, subtract, three
 from .jit import leaf
-from .resting import begin_rest, put_rest_reference, rests
+from .resting import advance_rest_reference, begin_rest, put_rest_reference, rests
 from .rotation import (
     add_turn,
     length,
@@ -106,7 +106,7 @@ def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> N
 @leaf
 def _leave_rest(t_ns: int, site: Row, reason: int) -> None:
     """Begins to align from the reference of an arm at rest."""
-    put_rest_reference(t_ns, site, site.q_followed, site.qd_followed)
+    put_rest_reference(site, site.q_followed, site.qd_followed)
     _begin_aligning(t_ns, site, reason, site.q_followed, site.qd_followed)
 
 
@@ -214,13 +214,16 @@ def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
         return
     if t_ns == tick_ns(site.first, site.rate_hz):
         begin_rest(t_ns, _WAITING, _START, site)
+    ticks = 1 + site.skipped
     if site.order != 0 or site.skipped != 0:
         _obey(t_ns, site)
+    if rests(site):
+        advance_rest_reference(t_ns, ticks, site)
     _update_mode(t_ns, site, links)
     if site.mode == _ALIGN:
         _put_aligning(t_ns, site)
     elif rests(site):
-        put_rest_reference(t_ns, site, site.q_des, site.qd_des)
+        put_rest_reference(site, site.q_des, site.qd_des)
 
 
 @leaf
