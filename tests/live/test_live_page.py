@@ -15,6 +15,7 @@ from websockets.sync.client import connect
 from live.page_server import PageOptions, PageServer
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
+from tests.page.whole_pages import watched_page
 from trilat_net.analysis.arm_rows import joint_positions_m
 from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
 from trilat_net.log.log_reader import Log, open_log
@@ -96,6 +97,24 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
     first = next(event.text for event in log.events if event.kind == "hand")
     assert first.startswith("m1: page 1 takes hold")
     assert grips(log, "m1")[:, 1].max() == 1.0
+
+
+OF_SOME_ROLES = ("hello", "hello.stage", "stage", "sites.*", "links.*.stated.*")
+"""Fields that a page may read although they are not sent to every role, or not of every link."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("who", ["experimenter", "user m1", "watcher"])
+def test_every_view_of_a_session_is_whole(who: str, stage: Stage) -> None:
+    """With delays that vary: no error, no empty frame, and every line of every plot is drawn."""
+    varied = ("rate_hz=250", "link.model=uniform", "link.delay_ms=120", "link.half_width_ms=60")
+    running = live(stage, "play", *chain.from_iterable(("--set", one) for one in varied))
+    with sync_playwright() as playwright, watched_page(launch(playwright)) as watched:
+        watched.page.goto(role_address(running, who))
+        shows(watched.page, "window.trilat?.frame?.t > 3")
+        watched.assert_whole(OF_SOME_ROLES)
+    running.signal(signal.SIGINT)
+    running.prints("checking the log")
 
 
 @pytest.mark.long

@@ -43,13 +43,18 @@ class WatchedPage:
         Args:
             unsent: patterns of fields that the page may read although nobody has sent them.
         """
+        faults = self.find_faults(unsent)
+        assert not faults, "\n".join(faults)
+
+    def find_faults(self, unsent: Collection[str] = ()) -> list[str]:
+        """Returns what is wrong with the page, in words; the argument is that of `assert_whole`."""
         faults: list[str] = [*self.errors, *self.page.evaluate("observed.faults()")]
         faults += [
             f"a script reads {name}, which nobody has sent"
             for name in self.page.evaluate("observed.unsent()")
             if not any(fnmatch(name, pattern) for pattern in unsent)
         ]
-        assert not faults, "\n".join(faults)
+        return faults
 
 
 @contextmanager

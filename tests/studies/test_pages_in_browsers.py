@@ -1,4 +1,4 @@
-"""Pages of studies in a browser: maps, the suite and experiments; pictures have colours, tables have cells."""
+"""Pages of studies in a browser: maps, the suite, experiments; pictures have colours, tables have cells."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,11 +111,12 @@ def test_page_of_a_map_is_whole(name: str, browser: Browser, tmp_path: Path) -> 
     assert_markdown_is_whole(browser, tmp_path / "map.md", pictures=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("tasks", "links", "seeds"),
     [
         (["free"], ["rtt8", "rtt68-loss25"], 2),
-        pytest.param(["free", "contact"], ["rtt8"], 1, marks=pytest.mark.long),
+        (["free", "contact"], ["rtt8"], 1),
     ],
 )
 def test_page_of_the_suite_is_whole(
