@@ -51,6 +51,7 @@ def describe_load(busy_share: float | None) -> str:
     cores = process.count_cores()
     processors = f"{cores} processors are" if cores > 1 else "one processor is"
     return (
-        f"this machine's {processors} {busy_share:.0%} busy with other programs, so that ticks may be late and "
-        "the recorder may miss records: end those programs, or lower the rate, as in --set rate_hz=200"
+        f"this machine's {processors} {busy_share:.0%} busy with other programs, so that ticks may be "
+        "late and the recorder may miss records: end those programs, or lower the rate, as in "
+        "--set rate_hz=200"
     )

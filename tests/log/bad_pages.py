@@ -1,4 +1,4 @@
-"""Files whose pages a disk lost, kept from before, or wrote to the wrong place; and what recovery makes of them."""
+"""Files whose pages a disk lost, kept from before, or wrote elsewhere; and what recovery makes of them."""
 
 import io
 import random

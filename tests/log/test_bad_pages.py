@@ -1,4 +1,4 @@
-"""Pages that are zeroed, stale or in the wrong place: recovery invents nothing, and says what it could not save."""
+"""Pages that are zeroed, stale or misdirected: recovery invents nothing, and says what it could not save."""
 
 import io
 import random

@@ -478,7 +478,7 @@ class _FileCopy:
 
     def _salvage(self, offset: int) -> str:
         """Copies the records of a chunk that was cut off, block by block; returns what ended that, or ""."""
-        if self._content is None and self._survey.names_members:
+        if self._content is None and self._survey.is_session_log:
             return "its scenario, without which no message can be checked"
         try:
             torn = TornChunk.read(self._scanner, offset)
@@ -498,9 +498,11 @@ class _FileCopy:
             result.lose(f"the definition of {topic}; its messages name it, and it was made again")
         for number in self._contradicted:
             result.lose(f"what channel or schema {number} is: the file says it in two ways")
-        if self._content is None and (self._survey.names_members or self._survey.is_foreign_session):
-            lacks = "the scenario" if SESSION in self._survey.metadata else "the session's metadata"
-            if self._survey.is_foreign_session:
+        survey = self._survey
+        has_head = SESSION in survey.metadata and SCENARIO in survey.attachments
+        if survey.is_session_log and not has_head:
+            lacks = "the scenario" if SESSION in survey.metadata else "the session's metadata"
+            if survey.is_foreign_session:
                 lacks += ", in whose place are those of another session"
             result.lose(
                 f"{lacks}; other MCAP programs open the new file, commands of trilat-net do not. If the file "

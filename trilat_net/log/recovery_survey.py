@@ -21,11 +21,12 @@ from mcap.opcode import Opcode
 from ..net import topics
 from . import mcap_records
 from .content_check import find_epochs_ns
-from .log_layout import SCENARIO, SESSION
+from .log_layout import ACCOUNTS, PART, SCENARIO, SESSION
 from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 
 Definition = tuple[int, bytes]
 """A schema or a channel: opcode and content."""
+_PROGRAM = "trilat-net"
 _TOPIC_ROOT = f"/{topics.ROOT}/".encode()
 _SAMPLED_CHUNKS = 16
 """Chunks whose messages are compared with the epoch of the session."""
@@ -47,7 +48,7 @@ class RecoverySurvey:
         is_foreign_session: True if the session that the file names is not that of its messages.
         misplaced: what is wrong with chunks that are not where they were written, by offset.
         is_chunked: True if the file has chunks.
-        names_members: True if channels are named as those of a session.
+        is_session_log: True if anything says that it is a log of a session.
         why_empty: the reason if there is nothing to save; else "".
     """
 
@@ -86,7 +87,11 @@ class RecoverySurvey:
             found[True, kind] and not set(found[False, kind]) <= set(found[True, kind])
             for kind in mcap_records.DEFINITIONS
         )
-        self.names_members = any(_TOPIC_ROOT in content for _, content in self.definitions)
+        self.is_session_log = (
+            any(_TOPIC_ROOT in content for _, content in self.definitions)
+            or _PROGRAM in self.library
+            or bool({SESSION, PART, ACCOUNTS} & self.metadata.keys())
+        )
         self.is_chunked = bool(self._chunks)
         self._choose_session()
         self.is_foreign_session = False
