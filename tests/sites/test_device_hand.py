@@ -263,3 +263,54 @@ def test_hand_that_is_not_led_by_its_tip_is_refused(tmp_path: Path) -> None:
 
 def test_a_service_is_given_up_before_a_hand_is_silent() -> None:
     assert SILENCE_S * 1e9 < SILENCE_NS
+
+
+def pumped(t_s: float) -> DeviceState:
+    """Moves right by 0.3 m with the clutch pressed, back with it open, five times in 2 s; then left."""
+    phase = min(t_s, 2.2) % 0.4
+    back = max(t_s - 2.2, 0.0)
+    if t_s < 0.2:
+        return DeviceState(ZERO, ZERO, FREE)
+    if t_s < 2.2:
+        right = 0.3 * min(phase, 0.4 - phase) / 0.2
+        return DeviceState((right, 0.0, 0.0), ZERO, HELD if phase < 0.2 else FREE)
+    return DeviceState((-0.5 * back, 0.0, 0.0), ZERO, HELD)
+
+
+def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> None:
+    """Five strokes of 0.3 m, twice as large at the arm; the first motion back moves the target at once."""
+    led = Led(tmp_path, pumped, {"scale": 2.0})
+    reach_m = sum(led.log.scenario.arms["m1"].lengths_m)
+    hand = led.log["m1"].hand
+    held = hand[hand[:, 2] > 0.0]
+    radius_m = np.hypot(held[:, 3], held[:, 4])
+    assert radius_m.max() == pytest.approx(reach_m, abs=1e-6)
+    t_s = led.log["m1"].t_s[hand[:, 2] > 0.0]
+    begun = int(np.argmax(radius_m > reach_m - 1e-3))
+    back = held[-1, 3] - held[begun:, 3].max()
+    assert back < -0.3  # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
+    assert t_s[begun] < 2.2
+    assert verify(led.log).passed
+
+
+LATER = [pytest.param(gaps, marks=pytest.mark.long) for gaps in ((150, 10), (30, 90))]
+
+
+@pytest.mark.parametrize("gaps_ms", [(60, 10), *LATER], ids=str)
+def test_uneven_states_never_jerk_the_target(gaps_ms: tuple[int, int], tmp_path: Path) -> None:
+    """A hand at 0.3 m/s whose machine hands its places over in bursts: 37 N m within 1 ms before."""
+
+    def place(t_s: float) -> tuple[float, float, float]:
+        late, even = (1e-3 * gap for gap in gaps_ms)
+        seen_s = t_s - t_s % (late if int(t_s / 0.3) % 2 else even)
+        return 0.1 * math.sin(3.0 * seen_s), 0.0, 0.0
+
+    led = Led(tmp_path, moving(place, clutched))
+    m1 = led.log["m1"]
+    live = led.log.scenario.sites["m1"].find_live_hand()
+    held = m1.hand[m1.hand[:, 2] > 0.0]
+    rates = held[:, 5:7]
+    change = np.linalg.norm(np.diff(rates, axis=0), axis=1)
+    assert change.max() <= live.acceleration_limit_m_s2 / 200 + 1e-12
+    assert np.linalg.norm(rates, axis=1).max() <= live.speed_limit_m_s + 1e-12
+    assert np.ptp(held[SETTLED:, 3]) > 0.1
