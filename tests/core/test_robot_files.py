@@ -3,6 +3,7 @@
 The packages come with `make test-long` (`requirements/robots.lock`, 0.9 GB); no mesh is opened.
 """
 
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,6 +33,7 @@ from trilat_net.core.chain import (
     place_joints,
 )
 from trilat_net.errors import ScenarioError
+from trilat_net.scenario.link_inertia import LinkInertia
 from trilat_net.scenario.urdf import UrdfChain, read_urdf
 
 pin = pytest.importorskip(
@@ -142,6 +144,9 @@ REFUSED = {
 NO_CHAIN_OF_TWO = {"iris_description/robots/iris.urdf"}
 
 
+ROBOTS = Path(__file__).parents[1] / "scenario/robots"
+
+
 def parse_chains() -> list[tuple[str, str, str, int]]:
     found, file = [], ""
     for word in CHAINS.split():
@@ -190,9 +195,70 @@ def test_a_chain_is_what_pinocchio_reads(file: str, base: str, tip: str, n: int)
     """Bodies, frames, limits; M, torque, pose and Jacobian of the model rebuilt from it; then the core's."""
     text = read_robot(file)
     chain = read_urdf(text, base, tip)
+    assert len(chain.joints) == n
+    check_dynamics(text, chain)
+
+
+def mend(text: str, link: str, given: LinkInertia) -> str:
+    """Returns a file with a mass and an inertia of a link written into its XML."""
+    root = ElementTree.fromstring(text)
+    element = next(one for one in root.findall("link") if one.get("name") == link)
+    inertial = element.find("inertial")
+    if inertial is None:
+        inertial = ElementTree.SubElement(element, "inertial")
+    parts: dict[str, ElementTree.Element] = {}
+    for tag in ("origin", "mass", "inertia"):
+        part = inertial.find(tag)
+        parts[tag] = ElementTree.SubElement(inertial, tag) if part is None else part
+    if given.mass_kg is not None:
+        parts["mass"].set("value", repr(given.mass_kg))
+    if given.com_m is not None:
+        parts["origin"].set("xyz", " ".join(map(repr, given.com_m)))
+    if given.inertia_kg_m2 is not None:
+        parts["origin"].set("rpy", "0 0 0")
+        keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
+        for key, value in zip(keys, given.inertia_kg_m2, strict=True):
+            parts["inertia"].set(key, repr(value))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+HEAVY = LinkInertia(
+    mass_kg=1.5, com_m=(0.02, -0.01, 0.1), inertia_kg_m2=(0.02, 1e-3, 0.03, -2e-3, 5e-4, 0.025)
+)
+PANDA, SO_ARM = "panda_description/urdf/panda.urdf", "so_arm_description/urdf/so101.urdf"
+GIVEN = [
+    (PANDA, "panda_hand_tcp", {"panda_link4": HEAVY, "panda_hand": LinkInertia(mass_kg=0.4)}),
+    (PANDA, "panda_hand_tcp", {"panda_leftfinger": HEAVY, "panda_link7": LinkInertia(com_m=(0.0, 0.1, 0.2))}),
+    (SO_ARM, "gripper_frame_link", {"moving_jaw_so101_v1_link": HEAVY}),
+    (ROBOTS / "kinematics_only.urdf", "", {"yaw": HEAVY, "tool": LinkInertia(mass_kg=0.25)}),
+    (ROBOTS / "finger_inertia.urdf", "lower", {"finger": HEAVY, "upper": LinkInertia(mass_kg=3.0)}),
+]
+
+
+@pytest.mark.parametrize(("file", "tip", "links"), GIVEN)
+def test_given_inertias_are_those_of_the_same_file_mended(
+    file: str | Path, tip: str, links: dict[str, LinkInertia]
+) -> None:
+    text = file.read_text() if isinstance(file, Path) else read_robot(file)
+    mended = text
+    for link, inertia in links.items():
+        mended = mend(mended, link, inertia)
+    check_dynamics(mended, read_urdf(text, tip=tip, links=links))
+
+
+def test_a_balanced_finger_is_that_of_the_same_file_mended() -> None:
+    text = (ROBOTS / "finger_inertia.urdf").read_text()
+    nearest = LinkInertia(inertia_kg_m2=(1.35e-6, 0.0, 2.65e-6, 0.0, 0.0, 4e-6))
+    check_dynamics(mend(text, "finger", nearest), read_urdf(text, balance=True))
+    check_dynamics(mend(text, "finger", nearest), read_urdf(text, tip="lower", balance=True))
+
+
+def check_dynamics(text: str, chain: UrdfChain) -> None:
+    """A chain against Pinocchio's reading of a file: bodies, frames, limits, and the terms of the dynamics."""
     model = parsed_model(text, chain)
+    n = len(chain.joints)
     assert [joint.name for joint in chain.joints] == list(model.names)[1:]
-    assert len(chain.joints) == model.nv == n
+    assert model.nv == n
     check_joints(chain, model)
     rebuilt = build_model(chain)
     data = model.createData()

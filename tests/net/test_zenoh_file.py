@@ -114,6 +114,76 @@ def test_what_session_does_not_need_is_taken_as_it_is() -> None:
     assert found(settings, "access_control/enabled") is False
 
 
+STOCK = Path(__file__).with_name("stock_session.json5")
+"""What a machine of ROS 2 has."""
+
+
+def test_a_stock_file_is_refused_for_gossip_alone() -> None:
+    """All else that a session sets itself has the session's values there."""
+    with pytest.raises(UsageError) as refused:
+        read_zenoh_file(STOCK)
+    assert str(refused.value).startswith(f"{STOCK}: scouting/gossip/enabled: true must be false")
+    assert str(refused.value).count("must be") == 1
+
+
+def test_a_stock_file_without_gossip_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "session.json5"
+    path.write_text(STOCK.read_text().replace("gossip: { enabled: true }", "gossip: { enabled: false }"))
+    file = read_zenoh_file(path)
+    assert file.endpoints("connect", "peer") == ["tcp/127.0.0.1:17447"]
+    settings = make_zenoh_config([], file.endpoints("connect", "peer") or [], "peer", file.settings)
+    assert found(settings, "transport/unicast/open_timeout") == 60_000
+    plain = make_zenoh_config([], [])
+    for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
+        assert found(settings, key) == found(plain, key)
+
+
+@pytest.mark.parametrize("mode", ["peer", "client", "router"])
+def test_values_that_a_session_uses_anyway_are_taken(mode: str) -> None:
+    """Once for the mode of the file, or by mode; those of another mode are refused."""
+    plain = make_zenoh_config([], [], mode)  # type: ignore[arg-type]
+    for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
+        used = found(plain, key)
+        other = {-1: 0, 0: -1}[used] if key == "connect/timeout_ms" else not used
+        assert checked({"mode": mode, **nested(key, used)}).mode == mode
+        assert checked(nested(key, {mode: used})).mode == ""
+        for wrong in ({"mode": mode, **nested(key, other)}, nested(key, {mode: other})):
+            with pytest.raises(UsageError, match=f"{key}: .* must be left out, or as a session sets it"):
+                checked(wrong)
+    with pytest.raises(UsageError, match="listen/timeout_ms"):
+        checked(nested("listen/timeout_ms", False))
+
+
+def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
+    stated: dict[str, Any] = {"transport": {"link": {"tls": {"root_ca_certificate": "/nowhere.pem"}}}}
+    for path, value in WRONG.items():
+        stated = merge_settings(stated, nested(path, value))
+    stated["access_control"] = {"default_permission": "deny"}
+    with pytest.raises(UsageError) as refused:
+        checked(stated)
+    message = str(refused.value)
+    assert message.startswith(f"{SOURCE}: {len(WRONG) + 2} settings cannot be taken: ")
+    assert [key for key in WRONG if f"{key}: " not in message] == []
+    assert "root_ca_certificate: /nowhere.pem cannot be read" in message
+    assert "access_control: has no `enabled: true`" in message
+
+
+def test_all_keys_that_zenoh_refuses_are_named_at_once(tmp_path: Path) -> None:
+    path = tmp_path / SOURCE
+    path.write_text("{mod: 'peer', transport: {link: {foo: 1, tx: {lease: 'x'}}}, connect: 3}")
+    with pytest.raises(UsageError) as refused:
+        read_zenoh_file(path)
+    message = str(refused.value)
+    assert "4 settings cannot be taken" in message
+    for part in (
+        "mod: no key of Zenoh's; did you mean mode?",
+        "connect: invalid type",
+        "link/foo",
+        "tx/lease",
+    ):
+        assert part in message
+
+
 def test_null_says_nothing() -> None:
     assert checked({"id": None, "transport": {"link": {"tx": {"lease": None}}}}).settings == {
         "transport": {"link": {"tx": {}}}

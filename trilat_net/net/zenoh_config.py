@@ -145,7 +145,7 @@ def _as_used(used: Mapping[str, Any]) -> _Requirement:
 
     def is_used(stated: Any) -> bool:
         return isinstance(stated, dict) and all(
-            mode in used and value == used[mode] and isinstance(value, type(used[mode]))
+            mode in used and value == used[mode] and type(value) is type(used[mode])
             for mode, value in stated.items()
         )
 
