@@ -254,7 +254,7 @@ def test_a_balanced_finger_is_that_of_the_same_file_mended() -> None:
 
 
 def check_dynamics(text: str, chain: UrdfChain) -> None:
-    """A chain against Pinocchio's reading of a file: bodies, frames, limits, and the terms of the dynamics."""
+    """A chain against Pinocchio: bodies, frames, limits, and the terms of the dynamics."""
     model = parsed_model(text, chain)
     n = len(chain.joints)
     assert [joint.name for joint in chain.joints] == list(model.names)[1:]
