@@ -195,3 +195,20 @@ def test_a_closed_window_is_a_signal_as_on_windows() -> None:
         "assert ENDING_SIGNALS == (signal.SIGINT, signal.SIGTERM, signal.SIGBREAK)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="threads have nice values on Linux alone")
+def test_priority_rises_but_for_the_main_thread() -> None:
+    """Where it is not permitted nothing changes and nothing is said."""
+    before = os.getpriority(os.PRIO_PROCESS, os.getpid())
+    found: list[tuple[bool, int]] = []
+
+    def work() -> None:
+        raised = process.raise_priority(before - 1)
+        found.append((raised, os.getpriority(os.PRIO_PROCESS, threading.get_native_id())))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found in ([(True, before - 1)], [(False, before)])
+    assert os.getpriority(os.PRIO_PROCESS, os.getpid()) == before

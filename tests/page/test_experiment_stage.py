@@ -249,6 +249,8 @@ def test_answers_are_those_of_the_scale(experiment: Experiment, stage: Stage) ->
         assert not stage.take("m1", 1, DoStep(key=step.key, answers=answers))
     assert stage.take("m1", 1, DoStep(key=step.key, answers=[0.0, 100.0, 5.0, 50.0, 60.0, 95.0]))
     assert asked.replies["m1"][0]["physical"] == 100.0
+    assert stage.take("m2", 2, DoStep(key=step.key, answers=[0.0, None, 5.0, None, 60.0, 95.0]))
+    assert asked.replies["m2"][0]["physical"] is None  # a slider that nobody touched
 
 
 def test_users_are_not_told_the_condition(experiment: Experiment, stage: Stage) -> None:

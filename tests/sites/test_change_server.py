@@ -199,3 +199,18 @@ def test_the_key_of_every_member_allows_stop_alone(more: dict[str, Any]) -> None
     (change,), reply = asked.ask(11, STOP, order="stop")
     assert reply.accepted
     assert '"order":"stop"' in change.text
+
+
+def test_who_orders_is_kept_until_an_event_says_it() -> None:
+    asked = Asked(load_scenario("paper", {"on_stale.action": "glide"}))
+    (taken,), reply = asked.ask(5, STOP, order="stop", source="the experimenter")
+    assert reply.accepted
+    assert asked.changes.sources == {taken.text: "the experimenter"}
+    assert "experimenter" not in taken.text  # the record, and so every execution, is the same
+    (other,), _ = asked.ask(6, STOP, order="stop")
+    assert other.text not in asked.changes.sources
+
+
+def test_request_without_source_has_the_bytes_of_before() -> None:
+    """A site of an older program refuses a field that it does not know."""
+    assert b"source" not in encode(ChangeRequest(order="stop"))

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ import pytest
 import trilat_net as tn
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-from trilat_net.studies.experiment.experiment_run import begin_experiment
+from trilat_net.studies.experiment.experiment_run import Experiment, Note, begin_experiment
+from trilat_net.studies.experiment.questionnaires import find_form
 
 from .experiments import REACH, write_protocol
 
@@ -84,6 +87,83 @@ def test_users_within_pairs_have_a_mixed_model(tmp_path: Path) -> None:
     assert {model.measure for model in found.fit_models()} == {"force_mean_n", "force_peak_n"}
     assert [one.condition for one in next(found.fit_models()).effects] == ["far"]
     assert "6 participants in 3 pairs" in found.methods
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One pair of synthetic participants whose time is short for the second condition."""
+    where = tmp_path_factory.mktemp("pair")
+    file = write_protocol(where, '["m1", "m2"]', REACH.replace("timeout_s = 6.0", "timeout_s = 1.2"))
+    forms = 'questionnaires = [{ name = "tlx" }, { name = "agency", after = "experiment" }]\n'
+    file.write_text(file.read_text(encoding="utf-8").replace("[set]", f"{forms}[set]"), encoding="utf-8")
+    return tn.run_experiment(file, where / "out", jobs=1).folder
+
+
+def test_trials_that_were_not_completed_are_counted(pair: Path, tmp_path: Path) -> None:
+    experiment = tn.open_experiment(pair)
+    found = tn.analyse_experiment(pair, tmp_path / "there")
+    failed = [row for row in experiment.to_rows() if not row["succeeded"]]
+    assert failed
+    assert sum(time.censored for time in found.times) == len(failed)
+    assert "completion_s" not in found.means  # no mean has the limit in it
+    assert f"{len(failed)} of 4 trials ran into the time limit of 1.2 s" in found.methods
+    assert "timed out" in found.summary()
+    assert (tmp_path / "there" / "completion_times.csv").exists()
+    assert "not reached" in experiment.summary()
+    assert is_documented("experiment analyse", {**found.to_dict(), "mixed_models": {}})
+
+
+def test_one_pair_has_every_measure_and_no_test(pair: Path, tmp_path: Path) -> None:
+    """What the lesson explains is there, whatever its value, and the paragraph claims no more."""
+    found = tn.analyse_experiment(pair, tmp_path / "there")
+    text = found.summary()
+    for measure in ("force_mean_user1_n", "internal_share", "first_effort_share", "first_work_j"):
+        assert measure in text
+    assert "first_taken_j" in text
+    assert "tlx: no number, because nobody has answered it" in text
+    for words in ("t test", "Wilcoxon", "bootstrap", "Student", "d_z", "mixed", "Holm"):
+        assert words not in found.methods
+    assert "Conditions were not compared by tests." in found.methods
+    assert "in 1 pair were" in found.methods
+
+
+def test_measure_of_one_value_is_shown(folder: Path) -> None:
+    found = tn.analyse_experiment(folder)
+    assert {one.mean for one in found.means["succeeded"]} == {1.0}
+    assert "succeeded, mean over participants" in found.summary()
+
+
+def answer(experiment: Experiment, cell: str, number: int, who: str, form: str, values: list[Any]) -> None:
+    items = [one for one in experiment.plan.protocol.questionnaires if one.name == form]
+    answers = find_form(items[0]).read(values)
+    with experiment.open_notes() as notes:
+        notes.add(Note(cell, "questionnaire", who, number, 0.0, form, answers))
+
+
+def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(pair, copy)
+    experiment = tn.open_experiment(copy)
+    full, lacking = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0], [10.0, None, 30.0, None, 50.0, 60.0]
+    for n, (number, who, values) in enumerate(
+        [(2, "P1", full), (2, "P2", lacking), (4, "P1", lacking), (4, "P2", lacking)]
+    ):
+        answer(experiment, f"q{n}", number, who, "tlx", values)
+    answer(experiment, "after", 4, "P1", "agency", [None, 1.0, 2.0, 3.0])
+    found = tn.analyse_experiment(copy, tmp_path / "there")
+    (mean,) = found.means["tlx"]  # the other condition has no whole questionnaire
+    assert (mean.condition, mean.mean, mean.missing) == ("near", 35.0, 1)
+    counts = [(one.questionnaire, one.condition, *one[2:]) for one in found.missing_answers]
+    assert counts == [
+        ("tlx", "near", 12, 2, 2, 1),
+        ("tlx", "far", 12, 4, 2, 2),
+        ("agency", "", 4, 1, 1, 1),
+    ]
+    assert "tlx, far: 4 of 12 answers are missing; 2 of 2 have no score for that reason" in found.summary()
+    assert "7 of 28 answers are missing" in found.methods
+    with (experiment.write_tables().parent / "questionnaires.csv").open(encoding="utf-8") as stream:
+        values = [row["value"] for row in csv.DictReader(stream)]
+    assert values.count("") == 7
 
 
 def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:
