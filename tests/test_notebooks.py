@@ -52,3 +52,31 @@ def test_a_notebook_runs_and_says_what_is_true(name: str, tmp_path: Path) -> Non
     notebook.cells.append(nbformat.v4.new_code_cell("\n".join(FACTS[name])))
     where = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=1200, kernel_name="python3", resources=where).execute()
+
+
+SHOWN = {
+    "tn.figure(log)": "image/png",
+    'tn.figure(log, "velocities")': "image/png",
+    'log["m1"]': "text/html",
+    "log": "text/html",
+    "tn.metrics(log)": "text/html",
+    "tn.verify(log)": "text/html",
+}
+"""By expression what a notebook shows of its value, at least."""
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("default")  # of its packages
+def test_values_show_themselves_in_a_notebook(tmp_path: Path) -> None:
+    nbclient = pytest.importorskip("nbclient", reason="make test-long installs it")
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("ipykernel")
+    begin = 'import trilat_net as tn\nlog = tn.simulate("paper", duration_s=0.5)'
+    cells = [nbformat.v4.new_code_cell(text) for text in (begin, *SHOWN)]
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    where = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3", resources=where).execute()
+    for cell, kind in zip(notebook.cells[1:], SHOWN.values(), strict=True):
+        (output,) = (one for one in cell.outputs if one.output_type == "execute_result")
+        assert kind in output.data, cell.source
+        assert len(output.data[kind]) > 200, cell.source

@@ -18,7 +18,8 @@ OVER = ("--over", "link.delay_ms=0:40:20", "--over", "control.Kd=1:4:1")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sweeps")
     (path / "trio.toml").write_text(SHORT)
-    trilat("sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path).succeeds()
+    text = trilat("sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path).succeeds()
+    (path / "printed.txt").write_text(text)
     return path
 
 
@@ -106,6 +107,16 @@ def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -
     assert {"map.md", "map.png", "map.svg", "results.csv"} <= set(names)
     text = (folder / "done" / "map.md").read_text()
     assert f"trilat sweep trio.toml {' '.join(OVER)} --map\n" in text
+
+
+def test_a_map_shows_its_progress_and_what_was_fixed(folder: Path) -> None:
+    lines = (folder / "printed.txt").read_text().splitlines()
+    assert lines.index("map: the lines of theory ...") < lines.index("map: drawing ...")
+    assert any(re.fullmatch(r"  \d of 3 columns of the map, about .* left", line) for line in lines)
+    assert "not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0" in lines
+    page = (folder / "done" / "map.md").read_text()
+    assert "- gains that were not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0\n" in page
+    assert "- laws at their best gains compare fairly by: `trilat compare --tune`\n" in page
 
 
 @pytest.mark.long

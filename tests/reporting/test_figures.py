@@ -244,3 +244,23 @@ def test_overlaid_runs_share_sites_and_kind():
     assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
     with pytest.raises(UsageError, match="of one kind"):
         run_overview.draw_overlay({"a": paper, "b": task})
+
+
+def test_a_figure_shows_itself_in_a_notebook() -> None:
+    log = trilat_net.simulate("two_sites", duration_s=0.1)
+    drawn = trilat_net.figure(log)
+    assert drawn._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+    assert drawn._repr_png_() == trilat_net.figure(log, "positions")._repr_png_()  # type: ignore[attr-defined]
+    assert 'src="data:image/png;base64,' in drawn._repr_html_()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("scenario", ["two_sites", "six_joints", "wall_in_space"])
+def test_a_site_shows_itself_in_a_notebook(scenario: str) -> None:
+    log = trilat_net.simulate(scenario, duration_s=0.1)
+    for site in log.values():
+        html = site._repr_html_()
+        for field in ("q", "qd", "tau"):
+            for joint in range(site.q.shape[1]):
+                assert f">{field}[{joint}]</td>" in html
+        assert f"{len(site)} records of" in html
+        assert html.count("<tr>") == html.count("</tr>")

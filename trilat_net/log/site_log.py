@@ -7,6 +7,7 @@ stays bounded for a log of any length: long sequences of records are decoded in 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from importlib import import_module
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -169,6 +170,10 @@ class _RecordVector(cached_property[Array]):
         self.__doc__ = meaning
 
 
+_HTML = "trilat_net.reporting.site_html"
+"""What shows the records of a site in a notebook; it is imported when a notebook asks."""
+
+
 class SiteLog:
     """The records of one site, in tick order.
 
@@ -230,6 +235,10 @@ class SiteLog:
         first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
         records = f"{len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
         return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
+
+    def _repr_html_(self) -> str:
+        html: str = import_module(_HTML).render_site_html(self)
+        return html
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
         try:

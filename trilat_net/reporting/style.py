@@ -8,6 +8,7 @@ fonts are embedded as TrueType. A run without events has figures without markers
 return of sites and applied changes.
 """
 
+import base64
 import io
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -49,6 +50,7 @@ LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "lin
 """The line of what is desired, true, stated or allowed."""
 
 REPORT_DPI = REPORT_SIZE.dpi
+_NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
 """Of values; less is rounding."""
 BUCKETS_PER_PANEL = 700
@@ -68,7 +70,24 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
     """Yields an empty figure of a size, to be drawn in the style of all figures; outside, nothing changes."""
     sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
     with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
-        yield Figure(figsize=(form.width_in, height_in), layout="constrained")
+        yield NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
+
+
+class NotebookFigure(Figure):
+    """A figure that shows itself in a notebook, where matplotlib alone prints how large it is."""
+
+    def _repr_png_(self) -> bytes:
+        drawing = io.BytesIO()
+        with mpl.rc_context(_FILE_RC):
+            self.savefig(drawing, format="png", dpi=_NOTEBOOK_DPI, metadata=_UNDATED["png"])
+        return drawing.getvalue()
+
+    def _repr_html_(self) -> str:
+        width = round(
+            self.get_figwidth() * _NOTEBOOK_DPI / 2
+        )  # two pixels of the picture for one of the page
+        picture = base64.b64encode(self._repr_png_()).decode()
+        return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:

@@ -12,6 +12,7 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from trilat_net.reporting.appearance import make_print_size
+from trilat_net.studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_net.studies.sweep.map_page import (
     CLASS_COLOURS,
     build_map_page,
@@ -22,6 +23,7 @@ from trilat_net.studies.sweep.map_page import (
 )
 from trilat_net.studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
 from trilat_net.studies.sweep.sweep_cell import CellClass
+from trilat_net.studies.sweep.sweep_plan import plan_sweep
 
 from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 
@@ -199,3 +201,47 @@ def test_uneven_values_are_named_one_by_one() -> None:
     made = figure(uneven)
     made.canvas.draw()
     assert [text.get_text() for text in made.axes[0].get_xticklabels()] == ["8", "68", "136", "272", "1088"]
+
+
+FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0")
+
+
+@pytest.mark.parametrize("panels", [(0.0,), (0.0, 400.0)])
+@pytest.mark.parametrize("width_in", [3.5, 7.0])
+def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
+    plane = drawn(link__playout_ms=panels)
+    figure = draw_stability_map(plane, [()] * len(plane.panels), make_print_size(width_in), FIXED)
+    figure.draw_without_rendering()
+    (caption,) = figure.texts[:1]
+    box = caption.get_window_extent()
+    assert box.x1 <= figure.bbox.width
+    others = [axes.get_tightbbox() for axes in figure.axes]
+    others += [text.get_window_extent() for text in figure.texts[1:]]
+    for text in (figure._supxlabel, figure._supylabel):  # type: ignore[attr-defined]
+        others += [text.get_window_extent()] if text is not None else []
+    for other in others:
+        assert other is not None
+        assert not box.overlaps(other)
+    words = " ".join(caption.get_text().split())
+    assert words.startswith(f"not swept: {'; '.join(FIXED)}")
+    assert "trilat compare --tune" in words
+
+
+@pytest.mark.parametrize(
+    ("axes", "laws", "texts"),
+    [
+        (["link.delay_ms=20,40", "control.d=1,2"], [], ["p_d: K 10, gravity 1"]),
+        (
+            ["sites.s.control.d=1,2"],
+            [],
+            ["p_d of m1, m2: K 10, d 1.1, gravity 1", "p_d of s: K 10, gravity 1"],
+        ),
+        (["rate_hz=500,1000"], ["p_d", "pd_d"], ["p_d: K 10, d 1.1, gravity 1", "pd_d: "]),
+        (["control.K=1,2", "control.d=1,2", "control.gravity=0,1"], [], ["p_d: none"]),
+    ],
+)
+def test_gains_that_were_not_swept_are_named(axes: list[str], laws: list[str], texts: list[str]) -> None:
+    found = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
+    assert len(found) == len(texts)
+    for one, text in zip(found, texts, strict=True):
+        assert one.startswith(text)

@@ -34,10 +34,10 @@ FIGURES = list_figures()
 """By name, in the order in which a paper has them."""
 
 
-def figure(log: str | Path | Log, name: str, width_in: float = COLUMN_IN) -> Figure:
+def figure(log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN) -> Figure:
     """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
 
-    The command is `trilat figure`.
+    It shows itself in a notebook. The command is `trilat figure`.
 
     >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
     >>> drawn.savefig("positions.pdf")

@@ -74,6 +74,7 @@ _STRIP_IN = 0.7
 _CAPTION_PT = 5.5
 _CAPTION_LINE_IN = 0.1
 _CAPTION_LETTERS_PER_IN = 25
+_SHARED_LABEL_IN = 0.14
 
 
 def draw_stability_map(
@@ -90,8 +91,8 @@ def draw_stability_map(
     caption = _wrap_caption(fixed, form)
     height_in = 0.95 + rows * each_in + _CAPTION_LINE_IN * len(caption)
     with style.styled_figure(form, height_in) as figure:
-        if caption:
-            _write_caption(figure, caption, height_in)
+        shared = columns * rows > 1
+        low = _write_caption(figure, caption, height_in, shared_label=shared) if caption else None
         grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
         for axes in grid[len(plane.panels) :]:
             axes.set_axis_off()
@@ -104,11 +105,12 @@ def draw_stability_map(
             _scale(axes, plane)
             axes.tick_params(labelleft=n % columns == 0 and bool(plane.y.key))
             axes.tick_params(labelbottom=n + columns >= len(plane.panels))
-        if columns * rows == 1:
+        if not shared:
             grid[0].set_xlabel(plane.x.label)
             grid[0].set_ylabel(plane.y.label)
         else:
-            figure.supxlabel(plane.x.label, fontsize=8.0)
+            below: Any = {} if low is None else {"y": low, "va": "bottom"}
+            figure.supxlabel(plane.x.label, fontsize=8.0, **below)
             figure.supylabel(plane.y.label, fontsize=8.0)
         if barred:
             _draw_scale(figure, grid, plane)
@@ -129,14 +131,19 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
     return [line for text in texts for line in textwrap.wrap(text, width)]
 
 
-def _write_caption(figure: Figure, caption: Sequence[str], height_in: float) -> None:
-    """Writes the caption below the panels, which give way to it."""
-    share = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
+def _write_caption(figure: Figure, caption: Sequence[str], height_in: float, *, shared_label: bool) -> float:
+    """Writes the caption below the panels, which give way to it; returns where it ends, from 0 to 1.
+
+    The layout engine moves panels, but no label that they share: with `shared_label` they make room for that.
+    """
+    end = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
+    share = end + _SHARED_LABEL_IN / height_in * shared_label
     engine: Any = figure.get_layout_engine()
     engine.set(rect=(0.0, share, 1.0, 1.0 - share))
     figure.text(
         0.01, 0.02 / height_in, "\n".join(caption), va="bottom", fontsize=_CAPTION_PT, color=style.REFERENCE
     )
+    return end
 
 
 def _columns(panels: int, form: FigureSize) -> int:

@@ -1,0 +1,160 @@
+"""The commands of the README's table, with real arguments: `.ci/readme` runs them after `make setup` alone.
+
+Invariant:
+- Every command that the table names stands here or in a fenced block of the README (`list_missing_commands`).
+- A chain runs one command after another; chains run side by side and share no file but those that
+  `FIRST` made.
+- What would go on until somebody ends it is bounded by its own options, or interrupted (`LiveSession`).
+"""
+
+import re
+import shlex
+from pathlib import Path
+from typing import NamedTuple
+
+from .documentation import find_blocks, read_commands
+
+ROOT = Path(__file__).parents[1]
+
+FIRST = [
+    "trilat sim two_sites --duration 2 -o sim.mcap",
+    "trilat keys pair lab",
+]
+"""Makes what several chains need."""
+
+SHORTEN = (
+    r"sed -i -E '/^\[conditions\.(delay_100|jitter_300)\]/,/^$/d; "
+    r"s/^(participants) = .*/\1 = 2/; s/^(trials) = .*/\1 = 1/; s/^(practice) = .*/\1 = 0/' reaching.toml"
+)
+"""Makes an experiment of twelve participants one of two, with a trial in each of two conditions."""
+
+CHAINS = [
+    [
+        "trilat verify sim.mcap",
+        "trilat certify sim.mcap",
+        "trilat twin sim.mcap --at 1",
+        "trilat metrics sim.mcap",
+        "trilat rerun sim.mcap --replace s --set control.Kd=5 -o kd5.mcap",
+        "trilat compare sim.mcap kd5.mcap",
+        "trilat report sim.mcap",
+        "trilat figure sim.mcap --with kd5.mcap -o figures",
+    ],
+    [
+        "trilat log info sim.mcap",
+        "trilat log check sim.mcap",
+        "trilat log sign sim.mcap --key lab.key",
+        "trilat log check sim.mcap --key lab.pub",
+        "trilat log export sim.mcap --to csv",
+        "trilat log export sim.mcap --to ros2",
+        "trilat log recover sim.mcap",
+        "cp sim.mcap seen.mcap",
+        "trilat log view seen.mcap",
+        "trilat keys new keys m1 m2 s recorder",
+        "trilat keys info keys/m1",
+        "trilat doctor",
+    ],
+    [
+        "trilat scenario list",
+        "trilat scenario show paper",
+        "trilat scenario check paper",
+        "trilat scenario new mine.toml",
+        "trilat scenario check mine.toml",
+        "trilat test two_sites",
+        "trilat new law mylaw.py",
+        "trilat new hand myhand.py",
+        "trilat new plant myplant.py",
+        "trilat linear free",
+        "trilat tune --arm arm6.urdf --delay 40ms",
+        "trilat compare --tune free --law p_d --budget 2 --duration 2 --jobs 1 -o tuned",
+    ],
+    [
+        "trilat sweep free --over link.delay_ms=20,100 --set link.model=uniform --duration 1 --longest 1 "
+        "--jobs 1 -o swept",
+        "trilat sweep swept --cell 0",
+        "trilat sweep p_d_margin --over link.delay_ms=100,200 --over control.d=0.5,1.5 --duration 1 "
+        "--longest 1 --jobs 1 --map -o mapped",
+        "trilat bench --task free --law p_d --link rtt68 --seeds 1 --jobs 1 -o suite",
+        "trilat experiment new reaching.toml",
+        SHORTEN,
+        "trilat experiment check reaching.toml",
+        "trilat experiment power 0.8 --participants 16",
+        "trilat experiment run reaching.toml --jobs 1 -o reaching",
+        "trilat experiment status reaching",
+        "trilat experiment analyse reaching",
+    ],
+]
+"""Needs no network; each chain in a folder of its own, in which the files of `FIRST` lie."""
+
+
+class LiveSession(NamedTuple):
+    """A session, and what is done with it while it runs.
+
+    Attributes:
+        start: begins the session; it is interrupted at the end, as by Ctrl-C.
+        watch: goes on until the session ends.
+        meanwhile: one after another, once the session answers.
+    """
+
+    start: str
+    watch: str
+    meanwhile: list[str]
+
+
+LIVE = LiveSession(
+    "trilat live play --duration 600 --no-browser",
+    "trilat watch --session play --timeout 60",
+    [
+        "trilat ping --session play --timeout 60",
+        "trilat set --session play link 'm1->s' --delay 350ms --loss 5%",
+        "trilat set --session play dominance s m1=0.9 m2=0.1 --ramp 1s",
+        "trilat stop --session play",
+        "trilat enable --session play",
+        "trilat reset --session play s",
+    ],
+)
+ALONE = [
+    "trilat demo two_sites --duration 1",
+    "trilat replay sim.mcap --rate max",
+    "trilat ping --benchmark free --seconds 2",
+]
+"""Uses the network of this machine, one after another, after the live session."""
+INTERRUPTED = {"trilat router": "listening at"}
+"""What goes on until Ctrl-C, and what it prints once it works."""
+ENDED_BY_CTRL_C = (0, 130)
+
+
+def list_all() -> list[str]:
+    """Every command of this table."""
+    chained = [command for chain in CHAINS for command in chain]
+    return [*FIRST, *chained, LIVE.start, LIVE.watch, *LIVE.meanwhile, *ALONE, *INTERRUPTED]
+
+
+def read_table_commands() -> set[str]:
+    """The commands that the README's table names, as in "log info", and groups as a whole, as in "keys"."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = text.partition("| command | what it does |")[2].partition("\n\n")[0]
+    named: set[str] = set()
+    for row in table.splitlines()[2:]:
+        for code in re.findall(r"`trilat ([^`]*)`", row.split(" | ")[0]):
+            parts = [
+                re.sub(r"\[.*?\]|--\S.*|\b[A-Z]{1,}\b.*", "", part).split() for part in code.split(" / ")
+            ]
+            group = parts[0][:-1] if len(parts) > 1 else []
+            named |= {" ".join([*group, *words] if n else words) for n, words in enumerate(parts) if words}
+    return {name.split(" '")[0] for name in named}
+
+
+def list_missing_commands(commands: set[str]) -> set[str]:
+    """The commands of the program that the table names and that nothing runs.
+
+    Args:
+        commands: all commands of the program, as in "log info".
+    """
+    run = [shlex.split(command)[1:] for command in list_all() if command.startswith("trilat ")]
+    for block in find_blocks("README.md"):
+        run += [words[1:] for words, _ in read_commands(block.text) if words[0] == "trilat"]
+    done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {words[0] for words in run}
+    named = read_table_commands()
+    assert all(name in commands or any(one.startswith(f"{name} ") for one in commands) for name in named)
+    wanted = {one for one in commands if one in named or any(one.startswith(f"{name} ") for name in named)}
+    return {one for one in wanted if one not in done}

@@ -1,0 +1,40 @@
+"""The list of commands that `.ci/readme` runs covers the README's table."""
+
+import shlex
+
+from tests.golden.surface import all_options
+from tests.readme_commands import list_all, list_missing_commands, read_table_commands
+
+
+def list_commands() -> set[str]:
+    """All commands of the program, as in "log info"."""
+    names = [name.removeprefix("trilat ") for name in all_options() if name != "trilat"]
+    return {name for name in names if not any(other.startswith(f"{name} ") for other in names)}
+
+
+def test_every_command_of_the_table_is_run() -> None:
+    assert len(read_table_commands()) > 40
+    assert list_missing_commands(list_commands()) == set()
+
+
+def test_the_table_names_nearly_every_command() -> None:
+    named = read_table_commands()
+    absent = {
+        command
+        for command in list_commands()
+        if command not in named and not any(command.startswith(f"{name} ") for name in named)
+    }
+    assert absent == {"hand", "identify hand", "ros2", "trace import"}
+
+
+def test_options_of_these_commands_exist() -> None:
+    options = all_options()
+    for command in list_all():
+        words = shlex.split(command)
+        if words[0] != "trilat":
+            continue
+        name = max((one for one in options if " ".join(words).startswith(one)), key=len)
+        if name == "trilat set":
+            continue  # the options of its commands follow their words
+        unknown = {word.partition("=")[0] for word in words if word.startswith("-")} - {*options[name]}
+        assert not {word for word in unknown if not word.startswith("--no-")}, command
