@@ -15,21 +15,43 @@ def gravity_of(theta: Array, q: Array) -> Array:
 
 
 def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
-    """q_ref and qd_ref of an arm that comes to rest from its record `first` on."""
-    q, v = part.q[first], part.qd[first]
-    stop_s = max(LEAST_STOP_S, float((np.abs(v) / gains.deceleration).max()))
-    t = np.minimum(np.arange(rows) / part.rate_hz, stop_s)[:, None]
-    return q + v * (t - t**2 / (2.0 * stop_s)), v * (1.0 - t / stop_s)
+    """q_ref and qd_ref of an arm that comes to rest from its record `first` on, with no torque at its limit.
+
+    Eq. (1) of docs/links.md, joint by joint; q_ref is the integral of qd_ref.
+    """
+    h_s = 1.0 / part.rate_hz
+    q_ref, qd_ref = [part.q[first].copy()], [part.qd[first].copy()]
+    for n in range(1, rows):
+        left_s = max(LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max()))
+        share = 1.0 - h_s / left_s if left_s > h_s + 1e-9 else 0.0
+        own = part.qd[first + n]
+        slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(own)), own)
+        rate = np.where(qd_ref[-1] * own > 0.0, slower, 0.0) * (share > 0.0)
+        q_ref.append(q_ref[-1] + 0.5 * h_s * (qd_ref[-1] + rate))
+        qd_ref.append(rate)
+    return np.array(q_ref), np.array(qd_ref)
 
 
-def rest_torque(gains: RestGains, part: SiteLog, law: Array, first: int) -> tuple[Array, Array]:
-    """Law + w - B s from a record on, and w, of a law that does not learn; rows of its law's torque."""
+def rest_torque(gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array) -> tuple[Array, Array]:
+    """Law + w - B s from a record on, and w, of a slow arm whose law does not learn.
+
+    Eq. (2) to (4) of docs/links.md, for rows of its law's torque; w is that with which a tick begins.
+    """
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))
-    B, slip = np.array(gains.damping), part.qd[rows] - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
-    taken = np.vstack([np.zeros(2), np.cumsum(slip, axis=0)[:-1]]) * B / (4.0 * gains.time_s) / part.rate_hz
-    w = part.tau[first - 1] - law[0] - taken
-    return law + w - B * slip, w
+    B, qd = np.array(gains.damping), part.qd[rows]
+    slip = qd - qd_ref + REST_RATE_1_S * (part.q[rows] - q_ref)
+    haste = float((B * np.abs(qd[0]) / limit).max())
+    w = (1.0 - haste) * (part.tau[first - 1] - law[0])
+    begun, taken = [], []
+    for n in range(len(law)):
+        begun.append(w)
+        if n < LEAST_STOP_S * part.rate_hz or qd_ref[n].any():
+            left = np.copysign(np.maximum(np.abs(w) - B * np.abs(qd[n]), 0.0), w)
+            w = np.where(w * qd[n] > 0.0, left, w)
+        taken.append(law[n] + w - B * slip[n])
+        w = w - B / (4.0 * gains.time_s) * slip[n] / part.rate_hz
+    return np.array(taken), np.array(begun)
 
 
 def integrals(part: SiteLog, rows: slice) -> Array:

@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net
-from tests.core.guarded_runs import LIMITS, TEXT, adaptive_text, guarded, ordered, stopped_log
+from tests.core.guarded_runs import (
+    LIMITS,
+    RATE_NM_S,
+    TEXT,
+    adaptive_text,
+    guarded,
+    largest_step,
+    ordered,
+    stopped_log,
+)
+from tests.core.hard_stops import CHAINS, RULE, THREE, TWO
 from tests.core.rests import gravity_of, integrals, reference, rest_torque
 from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
 from trilat_net.core.resting import limit_torque_rate
@@ -30,7 +40,7 @@ AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
 
 @pytest.mark.parametrize("law", ["adaptive", "pd_d"])
 def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
-    """q_ref = q + v (t - t^2 / 2 T), and qd_ref is its derivative."""
+    """Eq. (1) of docs/links.md; never faster than the joint, and in its direction."""
     log = stopped_log(adaptive_text() if law == "adaptive" else TEXT)
     part, gains = log["s"], log.scenario.setup("s").rest
     assert set(part.mode[2000:3500]) == {"stopped"}
@@ -38,19 +48,24 @@ def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
     wanted = reference(gains, part, 2000, 1500)
     assert np.abs(part.q_des[2000:3500] - wanted[0]).max() <= 1e-12
     assert np.abs(part.qd_des[2000:3500] - wanted[1]).max() <= 1e-12
+    ahead = part.qd[2000:3500] * part.qd_des[2000:3500] - part.qd_des[2000:3500] ** 2
+    assert ahead.min() >= 0.0
+    assert np.diff(np.abs(part.qd_des[2000:3500]), axis=0).max() <= 0.0
 
 
 def test_torque_of_stop_is_law_and_what_rests() -> None:
-    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s, and no step where it begins."""
+    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s: Eq. (2) to (4) of docs/links.md."""
     log = stopped_log(TEXT)
     part, rows = log["s"], slice(2000, 3500)
     q, qd = part.q[rows], part.qd[rows]
     e, ed = q - part.q_des[rows], qd - part.qd_des[rows]
     law = gravity_of(log.scenario.arms["s"].theta, q) - 60.0 * e - 12.0 * qd - 4.0 * ed
-    wanted, w = rest_torque(log.scenario.setup("s").rest, part, law, 2000)
+    setup = log.scenario.setup("s")
+    limit = np.broadcast_to(setup.tau_limit_nm, 2)
+    wanted, w = rest_torque(setup.rest, part, law, 2000, limit)
     assert np.abs(part.tau[rows] - wanted).max() <= 1e-9
     assert np.abs(integrals(part, rows)[:-1] - w[1:]).max() <= 1e-9
-    assert np.abs(part.tau[2000] - part.tau[1999]).max() <= 1e-12
+    assert largest_step(log, "s", 2000) <= RATE_NM_S / 1000.0 + 1e-9
     assert part.mode[3500] == "return"  # its peers are there
     assert part.mode[-1] == "run"
 
@@ -143,7 +158,6 @@ def test_credible_estimates_are_those_that_the_motors_can_hold() -> None:
     assert np.isinf(load_scenario("free").setup("m1").gains.high).all()
 
 
-RULE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 4.0, "on_stale.align_speed_rad_s": 2.0}
 HARNESS = {
     "duration_s": 4.0,
     "link": {"delay_ms": 30.0},
@@ -250,22 +264,6 @@ def test_a_stop_at_ten_instants_ends_in_rest() -> None:
     assert_stops(run_of("free", "adaptive", {}, 2.0), 10)
 
 
-TWO: dict[str, dict[str, Any]] = {
-    "p_f": {},
-    "four_channel": {"control.acceleration": 0.5},
-    "smith": {"sites.m.control.predicts": True},
-    **{name: {"scheme": "digital"} for name in ("wave", "tdpa", "tanks")},
-}
-"""Laws of two sites, and settings."""
-THREE: dict[str, dict[str, Any]] = {
-    "six_channel": {"control.acceleration": 0.5, "control.force_own": 0.1},
-    "authority": {"sites.s.control.leads": False},
-    "impedance": {"sites.s.control.follows": True},
-    "adaptive_kinematics": {"arm.g_m_s2": 0.0},
-    **{name: {} for name in ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d", "saturated_pd")},
-    **{name: {} for name in ("lee_spong", "sync")},
-}
-CHAINS = ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d")
 RUNS = [
     *(("two_sites", law, settings) for law, settings in TWO.items()),
     *((name, law, settings) for law, settings in THREE.items() for name in ("free", "paper", "handover")),

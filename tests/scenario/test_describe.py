@@ -7,6 +7,7 @@ from tests.unit_arm import unit_scenario
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import compare_scenarios, describe_scenario
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
+from trilat_net.scenario.rest_bounds import find_rest_bounds
 
 
 def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
@@ -82,17 +83,29 @@ def test_of_a_site_that_never_holds_it_says_nothing() -> None:
     assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))
 
 
-def test_an_arm_that_takes_long_to_stop_says_so() -> None:
-    """T = qd_limit / a of the slowest joint, and the way T qd_limit / 2."""
+def test_check_states_the_time_to_rest() -> None:
+    """Of every site under `glide`, and of an arm that is faster than its motors bear how fast joints get."""
     scenario = load_scenario("free", {"on_stale.action": "glide"})
-    stop_s = 100.0 / min(scenario.setup("s").rest.deceleration)
-    (line,) = (line for line in describe_scenario(scenario) if "to stop from" in line)
-    assert line == (
-        f"arms of m1, m2, s take {stop_s:.3g} s and {50.0 * stop_s:.3g} rad to stop from "
-        "limits.qd_limit_rad_s = 100"
-    )
-    slow = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 10.0})
-    assert not [line for line in describe_scenario(slow) if "to stop from" in line]
+    bounds = find_rest_bounds(scenario, "s")
+    lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
+    stated = f"come to rest within {bounds.rest_s:.3g} s of a stop at limits.qd_limit_rad_s = 7.5"
+    assert lines == [f"arms of m1, m2, s {stated}"]
+    assert not [line for line in describe_scenario("free") if "come to rest" in line]
+    fast = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 40.0})
+    (line,) = (line for line in describe_scenario(fast) if "motors bear" in line)
+    assert "beyond 7.54 rad/s" in line
+    weak = load_scenario("free", {"on_stale.action": "glide", "limits.tau_limit_nm": 20.0})
+    assert any("they sink" in line for line in describe_scenario(weak))
+
+
+@pytest.mark.parametrize("name", ["free", "paper_rods", "play", "six_joints", "unlike_arms"])
+def test_motors_bear_the_speeds_of_shipped_scenarios(name: str) -> None:
+    """Eq. (7) of docs/links.md: the limits of torque hold gravity and Coriolis torques."""
+    scenario = load_scenario(name, {"on_stale.action": "glide"})
+    for site in scenario.names:
+        bounds = find_rest_bounds(scenario, site)
+        assert bounds.bearable >= 1.0
+        assert bounds.rest_s < 4.5
 
 
 REVERSIBLE = {"m1": {"m2": 0.25, "s": 0.75}, "m2": {"m1": 0.25, "s": 0.75}, "s": {"m1": 0.5, "m2": 0.5}}

@@ -45,6 +45,9 @@ from .vectors import Array, Row
 REST_RATE_1_S = 3.0
 """By how much of the way an arm goes back to its rest in a second, where its law has no Lambda of joints."""
 
+_ROUNDING_S = 1e-9
+"""By less than this the last step of a reference misses the end of its time."""
+
 _WAITING, _HOLD = int(Mode.WAITING), int(Mode.HOLD)
 _FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
@@ -130,7 +133,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: Row) -> None:
     step_s = ticks / site.rate_hz
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
     remaining_s = _find_remaining_s(elapsed_s, site)
-    share = 1.0 - step_s / remaining_s if remaining_s > step_s else 0.0
+    share = 1.0 - step_s / remaining_s if remaining_s > step_s + _ROUNDING_S else 0.0
     for i in range(site.joints):
         q_ref, rate_before = _read_reference(site, i)
         rate = share * rate_before

@@ -21,6 +21,7 @@ from ..laws.conditions import LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
+from .rest_bounds import find_rest_bounds
 from .sample_uses import count_silences, draw_uses
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
@@ -251,22 +252,35 @@ def _describe_silences(scenario: Scenario) -> list[str]:
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns how long arms take to stop that the rule `glide` lets run so fast that it is long."""
+    """Returns when arms under the rule `glide` come to rest, and what their motors cannot hold."""
     lines: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
-        setup = scenario.setup(name)
-        qd = np.broadcast_to(setup.qd_limit_rad_s, len(spec.q0_rad))
-        stop_s = float(setup.rest.stop_s(qd))
-        if spec.on_stale.action == "glide" and stop_s > LONG_STOP_S:
-            way_rad = 0.5 * stop_s * float(np.max(qd))
-            text = f"take {stop_s:.3g} s and {way_rad:.3g} rad to stop from limits.qd_limit_rad_s"
-            lines.setdefault(f"{text} = {np.max(qd):g}", []).append(name)
+        if spec.on_stale.action != "glide":
+            continue
+        if not spec.arm.known:
+            text = "have no stated time to rest: their inertia is not known (arm.known)"
+            lines.setdefault(text, []).append(name)
+            continue
+        qd = np.broadcast_to(scenario.setup(name).qd_limit_rad_s, len(spec.q0_rad))
+        bounds = find_rest_bounds(scenario, name)
+        speed = f"limits.qd_limit_rad_s = {np.max(qd):g}"
+        if not math.isfinite(bounds.rest_s):
+            text = "need more than limits.tau_limit_nm to hold themselves against gravity: they sink"
+            lines.setdefault(text, []).append(name)
+            continue
+        text = f"come to rest within {bounds.rest_s:.3g} s of a stop at {speed}"
+        lines.setdefault(text, []).append(name)
+        if bounds.bearable < 1.0:
+            most = bounds.bearable * np.max(qd)
+            text = (
+                f"can be faster than their motors bear: beyond {most:.3g} rad/s a joint may speed up to "
+                f"{np.max(bounds.peak_rad_s):.3g} rad/s while they brake from {speed}"
+            )
+            lines.setdefault(text, []).append(name)
     return [f"arms of {', '.join(names)} {text}" for text, names in lines.items()]
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
-LONG_STOP_S = 1.5
-"""An arm that may take longer to stop is named."""
 _MOST = 80
 """Most letters of a value."""
 
