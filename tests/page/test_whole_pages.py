@@ -15,7 +15,8 @@ pytestmark = needs_browser
 
 LIBRARY = Path(reporting.__file__).with_name("assets") / "uPlot.iife.min.js"
 CHART = """<figure id="frame"><h2>ages</h2></figure><script>{library}</script><script>
-const lines = [{{ label: "a", stroke: "red" }}, {{ label: "b", stroke: "blue", points: {{ show: {points} }} }}];
+const lines = [{{ label: "a", stroke: "red" }},
+  {{ label: "b", stroke: "blue", points: {{ show: {points} }} }}];
 new uPlot({{ width: 300, height: 200, series: [{{}}, ...lines],
   scales: {{ x: {{ time: false }}, y: {{ range: [0, 5] }} }} }},
   [[0, 1, 2], [1, 2, 3], {values}], document.getElementById("frame"));</script>"""

@@ -78,10 +78,30 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
             == count(page, "document.querySelectorAll('figure').length")
         )
         assert charts > 0 or not any(len(log[site]) for site in log.sites)
-        assert count(page, "document.querySelectorAll('#arms svg').length") == len(log.sites)
-        recorded = [len(log[site]) > 0 for site in log.sites]
-        page.locator("#arms input").fill("1000")
-        assert [points != "" for points in arms_drawn(page)] == recorded
+        recorded = sum(len(log[site]) > 0 for site in log.sites)
+        if recorded:
+            page.locator("#arms input").fill("1000")
+        assert [points != "" for points in arms_drawn(page)] == [True] * recorded
+        strip = "document.querySelectorAll('.strip svg .arm').length"
+        assert count(page, strip) >= recorded
+        absent = [site for site in log.sites if not len(log[site])]
+        assert not absent or f"there is no record: {', '.join(absent)}." in page.inner_text("body")
+
+
+def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
+    """Also not where the chart has ticks of other sites within the gap of one."""
+    with watched_page(browser, **SCREEN) as watched:
+        page = open_report(watched, VARIED["single records"](), tmp_path)
+        charts = "trilat.plots().filter((plot) => plot.series[1].label === 'm1' && plot.series.length > 2)"
+        t_s, values = page.evaluate(
+            f"(() => {{ const [{{ data }}] = {charts}; return [data[0], data[1]]; }})()"
+        )
+        known = [n for n, value in enumerate(values) if value is not None]
+        assert [t_s[n] for n in known] == [0.0, 0.5, 1.0, 1.5]
+        bridged = (
+            f"(last) => {charts}[0].data[1].slice(0, last).filter((value) => value === undefined).length"
+        )
+        assert page.evaluate(bridged, known[-1]) == 0
 
 
 USED = ("live change", "six joints", "fault", "four sites")

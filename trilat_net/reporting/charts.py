@@ -105,7 +105,7 @@ class Charts:
             colours=Palettes(
                 list_site_colours(log.scenario), list_site_colours(log.scenario, DARK_SITE_COLOURS)
             ),
-            arms=[self._arm(index, site) for index, site in enumerate(log.sites)],
+            arms=[self._arm(index, site) for index, site in enumerate(log.sites) if len(log[site])],
             tables=self._tables,
             charts=drawn,
             changes=[

@@ -122,7 +122,7 @@ def render_report(
         sites=_render_sites(log, facts),
         loops=_render_loops(log, facts),
         links=_links(log, facts),
-        strip=render_arms_svg(log, drawn.bounds_m, drawn.factor),
+        arms=_render_arms(log, drawn),
         sections=certificate + _sections(log, data.charts, missing),
         assumed=_render_assumptions(scenario),
         again=_render_commands(log),
@@ -136,6 +136,27 @@ def render_report(
         uplot_css=_asset("uPlot.min.css"),
         uplot_js=_asset("uPlot.iife.min.js"),
     )
+
+
+_ARM_PLAYER = """<div id="arms" class="screen">
+<div class="row"></div>
+<div class="controls"><button type="button">play</button>
+<input type="range" min="0" max="1000" value="0" step="1" aria-label="time"><output>0.000 s</output></div>
+</div>
+<p class="note">Solid: the arm; dashed: the reference of Eq. (6). Above, the arms follow the slider and the
+pointer in any chart. Below, a few instants, with the path of the end effector until then.</p>
+"""
+
+
+def _render_arms(log: Log, drawn: Charts) -> str:
+    """Returns the player of the arms and their pictures, and which sites have no record to draw."""
+    html = ""
+    if any(len(log[site]) for site in log.sites):
+        html = _ARM_PLAYER + render_arms_svg(log, drawn.bounds_m, drawn.factor)
+    absent = [site for site in log.sites if not len(log[site])]
+    if absent:
+        html += f'<p class="note">Not drawn, because there is no record: {escape(", ".join(absent))}.</p>'
+    return html
 
 
 def _sections(log: Log, drawn: Sequence[Chart], missing: Mapping[str, Sequence[str]]) -> str:

@@ -207,6 +207,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         end_s: end of the time axis, s.
         spans: per site, the times in which the site does not follow its peers.
+        arms: arms of the sites that have a record.
         bounds_m: left, right, bottom and top of the pictures of the arms, in the units of these pictures.
     """
 

@@ -5,6 +5,7 @@
   const EDGES = 32; // numbers of the path along the edges of a body
   const SVG = "http://www.w3.org/2000/svg";
   const row = document.querySelector("#arms .row");
+  if (!row) return; // no site has a record
   const slider = document.querySelector("#arms input");
   const clock = document.querySelector("#arms output");
   const button = document.querySelector("#arms button");

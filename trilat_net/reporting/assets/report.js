@@ -121,6 +121,7 @@
     });
   }
 
+  const EXPAND = 2; // of uPlot.join: nulls fill the rows of other tables beside them
   function timeData(chart) {
     const parts = new Map();
     for (const series of chart.series) {
@@ -129,7 +130,8 @@
     }
     const aligned = [...parts].map(([table, members]) =>
       [tables[table].t, ...members.map((series) => tables[table].columns[series.column])]);
-    return [aligned.length > 1 ? uPlot.join(aligned) : aligned[0], [...parts.values()].flat()];
+    const modes = aligned.map((columns) => columns.map(() => EXPAND)); // a gap of one site ends where its next value is
+    return [aligned.length > 1 ? uPlot.join(aligned, modes) : aligned[0], [...parts.values()].flat()];
   }
 
   const rungs = (u, index, min, max) => [-3, -2, -1, 0, 1, 2, 3, 4, 5, 6].flatMap((power) =>
@@ -150,7 +152,7 @@
     };
     const shared = order.length > 1 && !order.some((series) => series.dash);
     const options = {
-      width: box.clientWidth, height: tall(box), padding: [8, 10, 0, 0],
+      width: box.clientWidth, height: tall(box), padding: [8, 20, 0, 0],
       scales: { x: { time: false, range: (u, min, max) => (min == null ? zoom : [min, max]) }, y: { range, distr: chart.log ? 3 : 1 } },
       cursor: {
         drag: { x: true, y: false }, points: { size: 6 }, dataIdx: nearest,

@@ -181,14 +181,19 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
-    """Returns HTML with a row per site and a column per instant; bounds: left, right, bottom, top, m.
+    """Returns HTML with a row per site that has a record, and a column per instant.
 
-    A picture has `factor` units per m.
+    Args:
+        log: the log.
+        bounds_m: left, right, bottom and top of every picture, m.
+        factor: units of a picture per m.
     """
     left, right, bottom, top = (factor * bound for bound in bounds_m)
     times = choose_instants_s(log)
     cells = ["<span></span>", *(f'<span class="head">t = {t:.4g} s</span>' for t in times)]
     for index, site in enumerate(log.sites):
+        if not len(log[site]):
+            continue
         cells.append(f'<span class="head">{escape(site)}</span>')
         for t in times:
             drawn = pose_at(log, site, t)
