@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 from trilat_net import process
-from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
@@ -31,7 +30,8 @@ from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
 
 POLL_NS = 10_000_000
-END_NS = 10_000_000_000
+END_S = 10
+END_NS = END_S * 1_000_000_000
 """Longest time after a signal for what the sites still hold; they hold it as long as that, see `sites`."""
 FLUSH_NS = 65_000_000
 """Between two turns of writing, each of which ends in a flush: a crash loses this. Fewer turns cost less."""
@@ -161,7 +161,7 @@ class Recorder:
             if ending_ns is None and self._is_ending():
                 ending_ns = since_ns
                 self._say(
-                    f"recorder: asks for the records that are missing, {END_NS // NS_PER_S} s at most; "
+                    f"recorder: asks for the records that are missing, {END_S} s at most; "
                     "Ctrl-C a second time ends it at once"
                 )
             if ending_ns is not None and (

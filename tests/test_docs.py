@@ -11,7 +11,14 @@ import pytest
 
 from recorder import backfill, record_process, session_recording
 from recorder.play import player
-from sites import change_server, code_watchdog, external_arm, retransmit_buffer, site_process
+from sites import (
+    change_server,
+    code_watchdog,
+    external_arm,
+    machine_load,
+    retransmit_buffer,
+    site_process,
+)
 from sites.devices import haply_inverse3, spacemouse
 from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
 from trilat_net.analysis.certificate import premises
@@ -69,7 +76,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),
     ("design.md", "an epoch 500 ms ahead", 500, session.EPOCH_AHEAD_NS / 1e6),
     ("design.md", "150 ms before the epoch", 150, session.DECIDE_NS / 1e6),
-    ("design.md", "at most 5 s from the last question", 5, site_process.LINGER_NS / 1e9),
+    ("design.md", "at most 10 s from the last question", 10, site_process.LINGER_NS / 1e9),
     ("design.md", "and 2 s more", 2, site_process.LEAVE_TIMEOUT_NS / 1e9),
     ("design.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("design.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
@@ -145,6 +152,9 @@ STATED: list[tuple[str, str, float, float]] = [
     ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * accounting.MIN_COVERAGE),
     ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
     ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
+    ("recording.md", "for 10 s after its last question", 10, site_process.LINGER_NS / 1e9),
+    ("recording.md", "at most 10 s after the signal", 10, record_process.END_NS / 1e9),
+    ("recording.md", "busy for 80 % of the time", 80, 100 * machine_load.BUSY_SHARE),
     ("linear.md", "of at most 60 s", 60, floquet.MAX_PERIOD_S),
     ("linear.md", "30 s of the draws", 30, floquet.DRAWN_SPAN_S),
     ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),

@@ -19,7 +19,7 @@ MADE = re.compile(r"^(\w+): (\d+) ticks, \d+ of them late", re.MULTILINE)
 
 
 def assert_accounted(log: Log, made: Mapping[str, int]) -> None:
-    """Every record is in the file or counted as missing; where nobody could say how many, the log says that."""
+    """Every record is in the file or counted as missing; of an unknown end the log says that."""
     for site in log.sites:
         ticks = log[site].tick.tolist()
         assert len(ticks) == len(set(ticks))

@@ -198,6 +198,7 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder.record_process import record_session
+    from sites.machine_load import describe_load, measure_busy_share
 
     from ..files import refuse_existing
     from ..log.log_layout import find_parts, parse_channel_filter
@@ -225,6 +226,8 @@ def record_command(
     if concluded:
         refuse_existing(page, force=force)
     clock = make_system_clock(clock_offset, clock_drift)
+    if warning := describe_load(measure_busy_share(clock)):
+        terminal.print_note(warning)
     then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
     try:
         code = record_session(session, place, connection, join_timeout, clock, terminal.print_line, then)
