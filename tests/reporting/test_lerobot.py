@@ -223,7 +223,7 @@ def test_other_actions_are_refused(tmp_path: Path) -> None:
 
 def test_users_with_other_joints_are_told_to_use_tips(tmp_path: Path) -> None:
     source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
-    with pytest.raises(LogError, match=r"joints of m2 are not those of m1, .*: use --actions tip"):
+    with pytest.raises(LogError, match=r"joints of m2 are not those of m1, .*: use actions tip"):
         exported(tmp_path, source, actions="joints")
     folder = exported(tmp_path, source, actions="tip")
     assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]

@@ -118,7 +118,8 @@ def log_export_command(
         form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
             site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
             episode for each log of the files and folders that are given.
-        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program).
+        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program);
+            of ros2 names=crtk (or a file of names).
         actions: Actions of lerobot as its plugin takes them: places of end effectors, or angles of joints.
             Default: what sites share.
         output: File or folder; default: next to FILE, named after it.

@@ -16,9 +16,3 @@ def check_ros_name(name: str, what: str) -> str:
     if not _NAME.fullmatch(bare := name.removeprefix("/")):
         raise UsageError(f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /")
     return bare
-
-
-def make_ros_name(text: str) -> str:
-    """Returns a text as one part of a name: other characters become _, and so does an empty text."""
-    bare = re.sub(r"[^A-Za-z0-9_]", "_", text)
-    return bare if bare[:1].isalpha() else f"_{bare}"

@@ -20,6 +20,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from ..core.vectors import Array
 
 _SEQUENCE_NUMBERS = 2**16
 """After so many probes `ping` counts from 0 again."""
@@ -189,24 +192,24 @@ def _arrange_probes(
     return PingProbes(sent_s, rtt_ms, first is not None or lowest <= 1, counts is not None)
 
 
-def _find_sending_times(
-    numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]], answers: dict[int, _Answer], every_s: float
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _find_sending_times(numbers: NDArray[np.int64], answers: dict[int, _Answer], every_s: float) -> Array:
     """Returns when probes were sent, s: by the times of the answers, which are on a line if all have them.
 
     Between two answers the times are interpolated; before the first and after the last answer they continue
     at the mean interval, since `ping` prints no time of sending.
     """
-    known = [(n, answer.printed_s - answer.rtt_ms * 1e-3) for n, answer in sorted(answers.items())
-             if answer.printed_s is not None]  # fmt: skip
+    known = [
+        (n, answer.printed_s - answer.rtt_ms * 1e-3)
+        for n, answer in sorted(answers.items())
+        if answer.printed_s is not None
+    ]
     if not known or len(known) < len(answers):
-        return numbers * every_s
+        return np.asarray(numbers * every_s)
     at, sent_s = np.array(known).T
     mean_s = (sent_s[-1] - sent_s[0]) / (at[-1] - at[0]) if len(known) > 1 else every_s
     mean_s = mean_s if mean_s > 0.0 else every_s
-    times_s = np.interp(numbers, at, sent_s)
-    times_s += mean_s * (np.minimum(numbers - at[0], 0.0) + np.maximum(numbers - at[-1], 0.0))
-    return times_s
+    beyond = np.minimum(numbers - at[0], 0.0) + np.maximum(numbers - at[-1], 0.0)
+    return np.asarray(np.interp(numbers, at, sent_s) + mean_s * beyond)
 
 
 def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:

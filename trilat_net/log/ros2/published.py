@@ -100,7 +100,11 @@ class SiteMessages:
         own["dominance"] = Ros2Channel(cdr.FLOAT64_ARRAY, shares, latched=True)
         robot = {"content": "URDF, with links named after their site"}
         own["robot_description"] = Ros2Channel(cdr.STRING, robot, latched=True)
-        return own | {_name_array(name): array.channel for name, array in shapes.arrays.items()}
+        arrays = {_name_array(name): array.channel for name, array in shapes.arrays.items()}
+        if self._arm.counts.shared == POSE and self._arm.shares_pose:
+            turn = {"orientation": "rotation vector of the law's error, at most half a turn long"}
+            arrays["error"] = arrays["error"]._replace(about={**arrays["error"].about, **turn})
+        return own | arrays
 
     def stamp_ns(self, record: State) -> int:
         """Returns the nominal time of a record, Unix ns."""

@@ -5,6 +5,7 @@ Invariant:
 - What a bag has of a session stands there under the name that the live bridge gives it.
 """
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,6 +77,12 @@ class TopicTable(NamedTuple):
         """Returns the full name of a topic of a site; one that begins with / stands for itself."""
         called = self.of_site.get(site, {}).get(topic, self.names.get(topic, topic))
         return called[1:] if called.startswith("/") else f"{session}/{site}/{called}"
+
+
+def make_session_name(text: str) -> str:
+    """Returns the name of a session as a name of ROS 2: other characters become _."""
+    bare = re.sub(r"[^A-Za-z0-9_]", "_", text)
+    return bare if bare[:1].isalpha() else f"_{bare}"
 
 
 def read_topic_table(asked: str) -> TopicTable:

@@ -21,8 +21,14 @@ from ...log.log_reader import Log
 from ...log.mcap_writer import McapWriter
 from ...log.ros2 import cdr, ros2_messages
 from ...log.ros2.published import SiteMessages, list_topics, pack_diagnostics
-from ...log.ros2.topic_names import DIAGNOSTICS, FRAMES, NAMINGS, TopicTable, read_topic_table
-from ...net.ros2_names import make_ros_name
+from ...log.ros2.topic_names import (
+    DIAGNOSTICS,
+    FRAMES,
+    NAMINGS,
+    TopicTable,
+    make_session_name,
+    read_topic_table,
+)
 from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
@@ -59,7 +65,7 @@ def export_ros2(log: Log, path: Path, written: Written = lambda _: None, *, name
         OSError: the disk refuses.
     """
     table = read_topic_table(names)
-    session = make_ros_name(log.session.get("session", "") or log.scenario.name)
+    session = make_session_name(log.session.get("session", "") or log.scenario.name)
     with path.open("wb") as stream:
         file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2")
         file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
@@ -93,7 +99,10 @@ class _SiteRecords:
     ) -> None:
         self._log, self._name, self._progress = log, name, progress
         self._messages = SiteMessages(log.scenario, name, _find_epoch_ns(log))
-        self._find_topic = lambda topic: table.find(session, name, topic)
+        self._session, self._table = session, table
+
+    def _find_topic(self, topic: str) -> str:
+        return self._table.find(self._session, self._name, topic)
 
     def _named(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
         return [(self._find_topic(topic), data) for topic, data in messages]
