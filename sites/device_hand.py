@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, Reach
+from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.clock import Clock
 from trilat_net.scenario.operators.kernel_operators import DeviceSettings
@@ -46,7 +46,9 @@ class DeviceHand:
         trips_ns: from the place of the device to the force that it has caused.
     """
 
-    def __init__(self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: Reach) -> None:
+    def __init__(
+        self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: HandReach
+    ) -> None:
         self._hand, self._device, self._how, self._clock = hand, device, how, clock
         self._reach = reach
         self._rows = how.rows(len(hand.pose))

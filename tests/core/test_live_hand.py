@@ -23,7 +23,7 @@ from trilat_net.core.live_hand import (
     HandMemory,
     HandRules,
     HandStep,
-    Reach,
+    HandReach,
     advance_hand,
     find_stopping_speed,
     free_hand,
@@ -252,20 +252,20 @@ def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
 
 
 def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
-    ring = Reach((0.0, 0.0), 0.5, 2.0)
+    ring = HandReach((0.0, 0.0), 0.5, 2.0)
     assert ring.find_nearest((3.0, 4.0)) == pytest.approx((1.2, 1.6))
     assert ring.find_nearest((0.0, 0.1)) == pytest.approx((0.0, 0.5))
     assert math.hypot(*ring.find_nearest((0.0, 0.0))) == 0.5
     assert ring.find_nearest((1.0, -1.0)) == (1.0, -1.0)
-    box = Reach(low=(-1.0, -math.inf), high=(1.0, 2.0))
+    box = HandReach(low=(-1.0, -math.inf), high=(1.0, 2.0))
     assert box.find_nearest((-3.0, 5.0)) == (-1.0, 2.0)
-    assert Reach().find_nearest((50.0, 60.0)) == (50.0, 60.0)
+    assert HandReach().find_nearest((50.0, 60.0)) == (50.0, 60.0)
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=2), max_size=30))
 def test_target_never_leaves_the_reach_by_more_than_it_takes_to_stop(messages: Any) -> None:
-    rules = LIMITED._replace(reach=Reach((0.0, 0.0), 0.0, 2.0))
+    rules = LIMITED._replace(reach=HandReach((0.0, 0.0), 0.0, 2.0))
     steps = hands(run(messages, 500, rules))
     stopping_m = 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0
     assert all(math.hypot(*now.target) <= 2.0 + stopping_m for now in steps)

@@ -44,7 +44,7 @@ TAKEN, RELEASED, SILENT = "takes hold", "lets go", "is silent: let go"
 """What a tick changed in who holds an arm."""
 
 
-class Reach(NamedTuple):
+class HandReach(NamedTuple):
     """The goals that an arm can get to, or a bound of them: a shell around a centre, and a box.
 
     Attributes:
@@ -100,7 +100,7 @@ class HandRules(NamedTuple):
     from_arm: bool = True
     farthest: float = math.inf
     acceleration_limit: float = math.inf
-    reach: "Reach" = Reach()
+    reach: "HandReach" = HandReach()
 
 
 class HandCommand(NamedTuple):

@@ -25,7 +25,7 @@ from ..core.chain import (
     place_end_effector,
     place_joints,
 )
-from ..core.live_hand import Reach
+from ..core.live_hand import HandReach
 from ..core.rotation import rotation_matrix, turn_between
 from ..core.site_setup import ChainSetup, Gains, Law, RestGains, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
@@ -243,7 +243,7 @@ class ArmModel(NamedTuple):
         return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
     @property
-    def reach(self) -> Reach:
+    def reach(self) -> HandReach:
         """A bound of the places of its end effector, which is exact for two links of a planar arm.
 
         Every joint, and the end effector, lies at a fixed distance from the joint before, and a sliding joint
@@ -252,23 +252,23 @@ class ArmModel(NamedTuple):
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
-            return Reach((0.0, 0.0), abs(l1 - l2), l1 + l2)
+            return HandReach((0.0, 0.0), abs(l1 - l2), l1 + l2)
         first, *others = self.chain.joints
         lengths = [math.sqrt(sum(x * x for x in joint.origin_m)) for joint in others]
         lengths.append(math.sqrt(sum(x * x for x in self.chain.tip_m)))
         sliding = [joint for joint in self.chain.joints if joint.prismatic]
         outer = sum(lengths) + sum(max(abs(joint.lower), abs(joint.upper)) for joint in sliding)
         inner = 0.0 if sliding else max(0.0, 2.0 * max(lengths) - sum(lengths))
-        return Reach(first.origin_m, inner, outer)
+        return HandReach(first.origin_m, inner, outer)
 
     @property
-    def joint_reach(self) -> Reach:
+    def joint_reach(self) -> HandReach:
         """The joint angles between its stops."""
         if self.chain is None:
-            return Reach()
+            return HandReach()
         joints = self.chain.joints
         low, high = (tuple(getattr(joint, end) for joint in joints) for end in ("lower", "upper"))
-        return Reach(low=low, high=high)
+        return HandReach(low=low, high=high)
 
     @property
     def shares_pose(self) -> bool:

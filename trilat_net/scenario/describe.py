@@ -201,7 +201,8 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
             ("q_max_rad", given.q_max, in_force.q_max),
         ):
             shape = (len(spec.q0_rad),)
-            for n in np.flatnonzero(np.broadcast_to(before, shape) != np.broadcast_to(after, shape)):
+            moved = np.broadcast_to(before, shape) != np.broadcast_to(after, shape)
+            for n in np.flatnonzero(moved).tolist():
                 limit = float(np.broadcast_to(after, shape)[n])
                 notes.append(
                     f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "

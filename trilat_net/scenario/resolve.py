@@ -233,12 +233,12 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
 def _join_group(shared: TomlTable, own: TomlTable) -> TomlTable:
     """Returns a site's table of a group upon the one of all sites; of `links` link by link, key by key."""
     joined = {**shared, **own}
-    links = [table.get("links") for table in (shared, own)]
-    if all(isinstance(table, dict) for table in links):
-        joined["links"] = {**links[0], **links[1]}
-        for name in links[0].keys() & links[1].keys():
-            if isinstance(links[0][name], dict) and isinstance(links[1][name], dict):
-                joined["links"][name] = {**links[0][name], **links[1][name]}
+    shared_links, own_links = shared.get("links"), own.get("links")
+    if isinstance(shared_links, dict) and isinstance(own_links, dict):
+        joined["links"] = {**shared_links, **own_links}
+        for name in shared_links.keys() & own_links.keys():
+            if isinstance(shared_links[name], dict) and isinstance(own_links[name], dict):
+                joined["links"][name] = {**shared_links[name], **own_links[name]}
     return joined
 
 

@@ -16,7 +16,7 @@ from msgspec import Meta
 from ... import fields
 from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
-from ...core.live_hand import HandRules, Reach
+from ...core.live_hand import HandRules, HandReach
 from ...errors import ScenarioError
 from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
@@ -317,7 +317,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
             limits,
             farthest=FARTHEST,
             acceleration_limit=acceleration if acceleration < fields.MAX_QUANTITY else math.inf,
-            reach=reach if self.is_open else Reach(),
+            reach=reach if self.is_open else HandReach(),
         )
 
     def _source(self) -> TorqueSource:
