@@ -341,6 +341,47 @@ def test_any_page_stops_every_arm_past_what_waits_for_answer(
         until(lambda: server.refused["does not take part"] == 1)
 
 
+def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
+    network: LocalNetwork, server: PageServer
+) -> None:
+    site: LocalBus = network.join()
+    changes, stops = site.questions("trilat/s1/s/set"), site.questions("trilat/s1/s/stop")
+    server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
+    with socket(server) as page:
+        hears(page)
+        page.send('{"do":"release","order":"enable","sites":["s"]}')
+        query = until(changes.poll)  # nobody answers
+        released = ChangeRequest(order="enable", source="the experimenter")
+        assert decode(query.payload, ChangeRequest) == released
+        page.send('{"do":"release","order":"enable","sites":["s"]}')  # waits for that answer
+        page.send('{"do":"stop"}')
+        until(stops.poll)
+        query.answer(encode(ChangeReply(member="s", accepted=True, text="s: enable at tick 5")))
+        page.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')  # is asked after whatever waits
+        query = until(changes.poll)
+        assert decode(query.payload, ChangeRequest).link == "m1->s"
+        page.send('{"do":"release","order":"enable","sites":["s","unknown"]}')
+        until(lambda: server.refused["no such site"] == 1)
+        for wrong in ('"stop","sites":["s"]', '"enable","sites":[]', '"enable","sites":"s"'):
+            page.send('{"do":"release","order":' + wrong + "}")
+        until(lambda: server.refused["malformed"] == 3)
+
+
+def test_a_stop_that_an_older_site_refuses_is_ordered_again(
+    network: LocalNetwork, server: PageServer
+) -> None:
+    """It knows no source of an order, and refuses what names one."""
+    stops = network.join().questions("trilat/s1/s/stop")
+    server.view.sites = {"s": None}  # type: ignore[dict-item]
+    with socket(server) as page:
+        hears(page)
+        page.send('{"do":"stop"}')
+        query = until(stops.poll)
+        query.answer(encode(ChangeReply(member="s", accepted=False, text="malformed")))
+        again = until(stops.poll)
+        assert decode(again.payload, ChangeRequest) == ChangeRequest(order="stop")
+
+
 def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture[str]) -> None:
     """Names that Zenoh takes for expressions: no session has them, and the bus refuses them."""
     said: list[str] = []
@@ -392,6 +433,8 @@ ORDERS = [
     '{"do":"answer","page":1,"yes":true}',
     '{"do":"ages","shown":false}',
     '{"do":"end"}',
+    '{"do":"release","order":"enable","sites":["s"]}',
+    '{"do":"release","order":"reset","sites":["s"]}',
     '{"do":"hand","site":"m2","grip":true,"to":[1.0,0.5]}',
 ]
 """What no user of m1 may ask for; nor may a watcher, who may not hold m1 either."""
