@@ -16,7 +16,7 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +29,7 @@ from trilat_net.files import find_rights_of_others
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
     ENCRYPTED,
+    ENDS_SOON,
     Connection,
     find_endpoint_addresses,
     is_loopback,
@@ -47,7 +48,6 @@ from .site_loop import PeerInbox, StateBlock, run_loop
 from .site_parts import warm_up
 
 FindingState = Literal["ok", "warn", "fail"]
-ENDS_SOON = timedelta(days=7)
 CONNECT_S = 2.0
 LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
 """Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
@@ -102,7 +102,7 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
     left = owned.ends - datetime.now(UTC)
     text = f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
     if left < ENDS_SOON:
-        yield DoctorFinding("keys", "warn", f"{text}: soon; make new ones for all with trilat keys new")
+        yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
     else:
         yield DoctorFinding("keys", "ok", text)
     if find_rights_of_others(folder):

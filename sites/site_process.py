@@ -83,6 +83,8 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
         RunFailed: the run diverged, its user law failed, or its arm fell silent.
     """
     check_outside_arms(scenario)
+    if not scenario.sites_may_return:  # one that returns to a session has less time to go: see `join_session`
+        options.connection.require_keys_until(scenario.duration_s)
     share_threads()
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
@@ -136,6 +138,8 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     while not parts.interrupt.requested():
         epoch = joining.poll()
         if epoch is not None:
+            since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
+            options.connection.require_keys_until(scenario.duration_s - since_ns / NS_PER_S)
             return RunningSite(parts, publisher, pinger, epoch)
         if joining.coming_at != begins:
             begins = joining.coming_at

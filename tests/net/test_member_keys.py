@@ -5,17 +5,23 @@ the same link, so that the first has been refused once the second is there.
 """
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
 
-from trilat_net.errors import UsageError
-from trilat_net.net import topics
+from tests.cli.running import trilat
+from trilat_net.cli.options import check_session_name
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.net import member_keys, topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
 from trilat_net.net.member_keys import (
@@ -25,6 +31,7 @@ from trilat_net.net.member_keys import (
     MemberKeys,
     create_keys,
     read_member_keys,
+    renew_keys,
 )
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.net.zenoh_config import (
@@ -36,6 +43,7 @@ from trilat_net.net.zenoh_config import (
     ROUTER,
     make_access_rules,
 )
+from trilat_net.scenario import load_scenario
 
 from .waiting import answered, drained, received, until
 
@@ -369,3 +377,138 @@ def test_every_rule_names_its_member_or_everybody_and_denies_rest() -> None:
     for site in SITES:
         assert {topics.parse_key(one).member for one in says[site]} == {site}  # type: ignore[union-attr]
     assert says[OPERATOR] == {topics.key("*", "*", channel) for channel in ROLES[OPERATOR].addresses}
+
+
+LOOK_ALIKE = ["m\u0430ster", "s\u04351", "\uff4d1", "m\u2081", "\u00e9", "m1\n", "m\u200d1"]
+"""A Cyrillic a and e, a full-width m, a subscript, an accent, a line's end, a joiner of no width."""
+
+
+@pytest.mark.parametrize("name", LOOK_ALIKE)
+def test_names_that_look_alike_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a member's name is at most 64 letters") as raised:
+        create_keys(tmp_path / "keys", [name])
+    assert str(raised.value).isascii()
+    with pytest.raises(UsageError, match="a session's name is at most 80 letters"):
+        check_session_name(name)
+    text = load_scenario("two_sites").text
+    for before, after in (
+        ('name = "two_sites"', f"name = {json.dumps(name)}"),
+        ("[sites.m]", f"[sites.{json.dumps(name)}]"),
+    ):
+        assert before in text
+        with pytest.raises(ScenarioError):
+            load_scenario(text.replace(before, after))
+
+
+def test_names_of_ascii_letters_are_taken(tmp_path: Path) -> None:
+    names = ["m1", "Robot-2", "arm_3", "9"]
+    assert [made.name for made in create_keys(tmp_path / "keys", names)] == names
+    for name in (*names, "paper.2"):
+        assert check_session_name(name) == name
+
+
+@pytest.fixture
+def make_ending_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[timedelta], Path]:
+    """Makes keys that have ended, whose certificates hold for a while yet."""
+
+    def make(holds: timedelta) -> Path:
+        monkeypatch.setattr(member_keys, "STOPPING_TIME", holds)
+        create_keys(tmp_path / "ending", ALL, days=0)
+        return tmp_path / "ending"
+
+    return make
+
+
+@contextmanager
+def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus, ZenohBus]]:
+    """The site m1, which listens, and s, which is connected to it."""
+    (place,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
+    own = {member: read_member_keys(folder / member, stops=stops).settings for member in ("m1", "s")}
+    with (
+        closing(ZenohBus([place], own=own["m1"])) as site,
+        closing(ZenohBus([], [place], own=own["s"])) as peer,
+    ):
+        yield site, peer
+
+
+@pytest.mark.long
+def test_open_link_outlives_its_certificate(make_ending_keys: Callable[[timedelta], Path]) -> None:
+    """Zenoh closes no link at the end of a certificate, so that no date ends a session."""
+    folder = make_ending_keys(timedelta(seconds=8))
+    ends = load_certificate(folder / "m1").not_valid_after_utc
+    with two_members(folder, stops=True) as (site, peer):
+        inbox, say = peer.inbox(key("m1", topics.EVENT)), site.publisher(key("m1", topics.EVENT))
+        assert heard(say, inbox)
+        until(lambda: datetime.now(UTC) > ends + timedelta(seconds=1), 30.0)
+        assert heard(say, inbox)
+
+
+def test_ended_keys_stop_arms_and_nothing_else(make_ending_keys: Callable[[timedelta], Path]) -> None:
+    folder = make_ending_keys(timedelta(days=1))
+    with pytest.raises(UsageError, match=r"the certificate ended on .*: renew it with trilat keys renew"):
+        read_member_keys(folder / "m1")
+    with two_members(folder, stops=True) as (site, peer):
+        questions = site.questions(key("m1", topics.STOP))
+
+        def is_asked() -> bool:
+            peer.ask(key("m1", topics.STOP), b"stop")
+            return questions.poll() is not None
+
+        until(is_asked)
+
+
+def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
+    """Members are renewed one after the other; hosts, names and private keys stay."""
+    folder = tmp_path / "keys"
+    create_keys(folder, ALL, ["192.0.2.1"], 5)
+    before = {member: (folder / member / PRIVATE_KEY).read_bytes() for member in ALL}
+    names = load_certificate(folder / "m1").extensions
+    assert renew_keys(folder, ["m1"], 90) == [folder / "m1"]
+    assert read_member_keys(folder / "m1").ends > datetime.now(UTC) + timedelta(days=89)
+    assert read_member_keys(folder / "s").ends < datetime.now(UTC) + timedelta(days=6)
+    assert [one.value for one in load_certificate(folder / "m1").extensions] == [one.value for one in names]
+    with two_members(folder) as (site, peer):
+        assert heard(site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT)))
+    assert {path.name for path in renew_keys(folder)} == set(ALL)
+    assert {member: (folder / member / PRIVATE_KEY).read_bytes() for member in ALL} == before
+    assert {path.stat().st_mode & 0o077 for path in folder.rglob("*")} == {0}
+
+
+def test_keys_that_cannot_be_renewed_are_refused(tmp_path: Path) -> None:
+    for name in ("keys", "others"):
+        create_keys(tmp_path / name, SITES)
+    with pytest.raises(UsageError, match="holds no keys of m9; it has m1, m2, s"):
+        renew_keys(tmp_path / "keys", ["m9"])
+    shutil.rmtree(tmp_path / "keys" / "s")
+    shutil.copytree(tmp_path / "others" / "s", tmp_path / "keys" / "s")
+    content = {path: path.read_bytes() for path in (tmp_path / "keys").rglob("*") if path.is_file()}
+    with pytest.raises(UsageError, match="s: damaged, or not of this authority"):
+        renew_keys(tmp_path / "keys")
+    assert {path: path.read_bytes() for path in content} == content
+    shutil.rmtree(tmp_path / "keys" / "authority")
+    with pytest.raises(UsageError, match="without it, make new keys for all"):
+        renew_keys(tmp_path / "keys")
+
+
+def load_certificate(folder: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
+
+
+def test_keys_that_end_before_session_are_refused(tmp_path: Path) -> None:
+    """The end is known when a site begins, and again when the session begins for which it has waited."""
+    create_keys(tmp_path / "keys", ["m", "s"], days=1)
+    for member, words in (("m", "two_sites"), ("s", "two_sites")):
+        long = ("--set", "duration_s=86400")
+        keys = str(tmp_path / "keys" / member)
+        done = trilat("site", member, "--scenario", words, "--keys", keys, *long, cwd=tmp_path)
+        assert done.code == 2, done
+        assert f"--keys: the keys of {member} end on " in done.err
+        assert "renew them with trilat keys renew" in done.err
+    connection = secure_connection(Connection(), tmp_path / "keys" / "m", insecure=False)
+    connection.require_keys_until(86_000.0)
+    assert "the keys of m end on" in connection.describe_end()
+    with pytest.raises(UsageError, match="the session is planned until"):
+        connection.require_keys_until(86_500.0)
+    create_keys(tmp_path / "later", ["m"], days=8)
+    assert secure_connection(Connection(), tmp_path / "later" / "m", insecure=False).describe_end() == ""
+    Connection().require_keys_until(1e9)

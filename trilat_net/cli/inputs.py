@@ -162,7 +162,7 @@ def keys_new_command(
 
     Bring each folder to its machine by a channel that you trust, and give it as --keys. Members without keys,
     or with keys of another authority, cannot connect; a member can send only under its own name. Keep the
-    folder `authority` where no member runs, or delete it: new keys are always made for all members at once.
+    folder `authority` where no member runs: `trilat keys renew` needs it before the keys end.
 
     Options:
         members: The sites; and recorder, operator, router, bridge if there are any.
@@ -176,6 +176,26 @@ def keys_new_command(
     terminal.print_line(
         f"they are valid for {days} days; use them as in: trilat site {made[0].name} --keys {made[0]} ..."
     )
+
+
+@options.command("keys", "keys m1 recorder --days 90")
+def keys_renew_command(
+    folder: Annotated[Path, typer.Argument(help="Folder that trilat keys new has made.", metavar="DIR")],
+    members: Annotated[list[str] | None, typer.Argument(metavar="[MEMBER]...")] = None,
+    days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
+) -> None:
+    """Renews the certificates of members, by the authority in the folder; their private keys stay.
+
+    Bring the files authority.pem, certificate.pem and members.json of each folder to its machine again, and
+    start the member anew before its next session: a running one keeps its old certificate.
+
+    Options:
+        members: Default: all members whose folders are there.
+    """
+    from ..net.member_keys import renew_keys
+
+    for one in renew_keys(folder, members or (), days):
+        terminal.print_line(f"{one}: valid for {days} days from now")
 
 
 @options.command("lab")

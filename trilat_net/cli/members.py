@@ -465,6 +465,8 @@ def router_command(
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
     named = resolve_member_connection(listen, connect, None, file, places, (), routes=True)
     connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
+    if text := connection.describe_end():
+        terminal.print_note(text)
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)

@@ -143,9 +143,11 @@ MOST_LETTERS = 80
 
 def check_session_name(name: str) -> str:
     """Refuses a session name that cannot be part of a key."""
-    if not 0 < len(name) <= MOST_LETTERS or not all(c.isalnum() or c in "_-." for c in name):
+    if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
+        letters = "" if name.isascii() else "; its letters are a to z and A to Z"  # others look alike
         raise UsageError(
-            f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., not {name[:80]!r}"
+            f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
+            f"not {ascii(name)[:80]}{letters}"
         )
     return name
 
@@ -292,13 +294,28 @@ class MemberOptions(NamedTuple):
         return resolve_member_connection(*ways, listen_else, connect_else)
 
     def resolve(
-        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+        self,
+        listen_else: Sequence[str] = (),
+        connect_else: Sequence[str] | None = None,
+        *,
+        stops: bool = False,
     ) -> "Connection":
-        """Returns how it takes part, by default at these endpoints; with its keys."""
+        """Returns how it takes part, by default at these endpoints; with its keys.
+
+        With `stops` it serves to stop arms alone, for which keys that have ended may do.
+        """
         from ..net.connection import secure_connection
 
         connection = self.find_endpoints(listen_else, connect_else)
-        return secure_connection(connection, self.keys, insecure=self.insecure)
+        keys: Any = self.keys
+        if stops and keys is not None:
+            from ..net.member_keys import read_member_keys
+
+            keys = read_member_keys(keys, stops=True)
+        secured = secure_connection(connection, keys, insecure=self.insecure)
+        if text := secured.describe_end():
+            terminal.print_note(text)
+        return secured
 
 
 class Reach(NamedTuple):
@@ -309,11 +326,16 @@ class Reach(NamedTuple):
     zenoh_config: ZenohConfigOption = None
     keys: KeysOption = None
 
-    def resolve(self, *, operates: bool = True) -> "Connection":
-        """Returns the connection; its keys are the operator's, unless `operates` is False."""
+    def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
+        """Returns the connection.
+
+        Args:
+            operates: whether the keys must be the operator's.
+            stops: whether it serves to stop arms alone, for which keys that have ended may do.
+        """
         from ..net.zenoh_config import OPERATOR
 
-        connection = MemberOptions(None, *self).resolve()
+        connection = MemberOptions(None, *self).resolve(stops=stops)
         return connection.require(OPERATOR) if operates else connection
 
 

@@ -262,10 +262,10 @@ SessionOption = Annotated[str, value("--session", "ID", "The session.")]
 SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
 
 
-def _find(session: str, reach: options.Reach) -> "RunningSession":
+def _find(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
     from sites.running_session import RunningSession
 
-    connection = reach.resolve(operates=False)
+    connection = reach.resolve(operates=False, stops=stops)
     return RunningSession(options.check_session_name(session), connection)
 
 
@@ -285,7 +285,7 @@ def stop_command(
     """
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
-    running = _find(session, reach)
+    running = _find(session, reach, stops=not end)
     terminal.print_texts(running.end() if end else running.stop(*(sites or ())))
 
 

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,6 +79,8 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
     return [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in sockets]
 
 
+ENDS_SOON = timedelta(days=7)
+DATE = "%Y-%m-%d %H:%M:%S UTC"
 RETRY_NS = 200_000_000
 """Between two attempts to reach a router."""
 
@@ -92,6 +95,7 @@ class Connection:
         own: Zenoh settings of a user's file, or of a member's keys.
         keys_of: the member whose keys it has: links are encrypted, and both ends prove by certificates who
             they are; "": none.
+        keys_end: when these keys end, in UTC; None: there are none.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -99,6 +103,7 @@ class Connection:
     mode: ZenohMode = "peer"
     own: Mapping[str, Any] = field(default_factory=dict)
     keys_of: str = ""
+    keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
         """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
@@ -115,6 +120,34 @@ class Connection:
         listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
         check_hosts(find_endpoint_addresses([*listen, *connect]))
         return ZenohBus(listen, connect, self.mode, self.own)
+
+    def require_keys_until(self, left_s: float) -> None:
+        """Refuses keys that end before a session does.
+
+        An open link outlives the end of its certificate, but no link is made again after it: a cable that is
+        pulled for six seconds would end the session then.
+
+        Args:
+            left_s: how long the session lasts from now on, s.
+
+        Raises:
+            UsageError: the keys end before.
+        """
+        if self.keys_end is None or self.keys_end > (
+            planned := datetime.now(UTC) + timedelta(seconds=left_s)
+        ):
+            return
+        raise UsageError(
+            f"--keys: the keys of {self.keys_of} end on {self.keys_end:{DATE}}, and the session is planned "
+            f"until {planned:{DATE}}: renew them with trilat keys renew (docs/network.md)"
+        )
+
+    def describe_end(self) -> str:
+        """Returns a sentence on keys that end soon, "" for others."""
+        if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
+            return ""
+        remedy = "renew them with trilat keys renew (docs/network.md)"
+        return f"the keys of {self.keys_of} end on {self.keys_end:{DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
         """Returns itself.
@@ -161,7 +194,9 @@ def secure_connection(
             raise UsageError(
                 f"--zenoh-config: transport/link/{twice[0]}: comes from --keys; give it in one place"
             )
-        return replace(connection, own=merge_settings(keys.settings, own), keys_of=keys.member)
+        return replace(
+            connection, own=merge_settings(keys.settings, own), keys_of=keys.member, keys_end=keys.ends
+        )
     mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
     for place in find_endpoint_addresses(connection.listen):
         if not (insecure or is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):

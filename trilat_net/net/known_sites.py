@@ -164,7 +164,7 @@ def _order(known: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
     if keys:
         from .member_keys import read_member_keys
 
-        own = merge_settings(read_member_keys(Path(keys)).settings, AT_ONCE)
+        own = merge_settings(read_member_keys(Path(keys), stops=True).settings, AT_ONCE)
     left, twins = set(sites or known[0].sites), Counter(one.site for one in known)
     asked: list[tuple[str, Inbox, list[dict[str, Any]]]] = []
     clock, session, stops = SystemClock(), known[0].session, True

@@ -4,6 +4,9 @@ Invariant: a private authority signs one certificate per member, which ends afte
 apart. A member's folder holds its own key, which nobody else may read, its certificate, that of the
 authority, and the list of members, from which its access rules follow; nobody else may write any of it.
 Keys are made whole or not at all.
+
+Keys end a day before their certificate does: no member begins with them any more, but `trilat stop` still
+connects. Every connection of Zenoh, also one that is made again, needs a certificate that holds.
 """
 
 import datetime
@@ -23,7 +26,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
-from ..files import find_rights_of_others, make_folder, open_regular, stage_output
+from ..files import find_rights_of_others, make_folder, open_regular, stage_output, write_whole
 from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
@@ -35,10 +38,13 @@ AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
 _AUTHORITY_FOLDER = "authority"
 HERE = ("localhost", "127.0.0.1", "::1")
 """Names of the own machine, which every certificate holds."""
+STOPPING_TIME = datetime.timedelta(days=1)
+"""Time after the end of keys during which they still stop arms."""
 _BEFORE = datetime.timedelta(hours=1)
 """Clocks of machines may differ by so much."""
 MOST_KEY_BYTES = 65_536
 """Of a file of keys; the rest of a longer one is not read."""
+_RENEWAL = "renew it with trilat keys renew, or make new keys for all with trilat keys new"
 _DATE = "%Y-%m-%d %H:%M UTC"
 MOST_DAYS, MOST_LETTERS = 3_650, 64
 """For which certificates may hold, and of a name in one."""
@@ -48,7 +54,7 @@ class MemberKeys(NamedTuple):
     """A member's keys.
 
     Attributes:
-        ends: when the certificate ends, in UTC.
+        ends: when the keys end, in UTC; their certificate holds for `STOPPING_TIME` longer.
         settings: of Zenoh, see `make_zenoh_config`.
     """
 
@@ -93,10 +99,11 @@ def create_keys(
 
 def _find_name_fault(members: Sequence[Any]) -> str:
     for name in members:
-        of_letters = isinstance(name, str) and all(c.isalnum() or c in "_-" for c in name)
-        if not of_letters or not 0 < len(name) <= MOST_LETTERS or name == _AUTHORITY_FOLDER:
+        of_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
+        if not of_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
             most = f"at most {MOST_LETTERS} letters, digits, _ and -"
-            return f"a member's name is {most}, and not {_AUTHORITY_FOLDER}, not {str(name)[:80]!r}"
+            letters = "" if str(name).isascii() else "; its letters are a to z and A to Z"
+            return f"a member's name is {most}, and not {_AUTHORITY_FOLDER}, not {ascii(name)[:80]}{letters}"
     return "" if 0 < len(members) == len(set(members)) else "every member is named once, and there is one"
 
 
@@ -112,44 +119,127 @@ def _find_host_fault(host: str) -> str:
     )
 
 
+def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
+    """Renews the certificates of members in place; the command is `trilat keys renew`.
+
+    Private keys, hosts and the lists of members stay as they are.
+
+    Args:
+        folder: the folder that `create_keys` made, with its folder `authority`.
+        members: whose certificates are renewed; none: those of all members whose folders are there.
+        days: how long the keys hold from now on.
+
+    Returns:
+        The renewed folders.
+
+    Raises:
+        UsageError: the authority, a member's folder or a file in it is missing or damaged.
+        LogRefused: the disk refused it.
+    """
+    folder = Path(folder)
+    if not 0 <= days <= MOST_DAYS:
+        raise UsageError(f"keys hold for 0 to {MOST_DAYS} days, not {days}")
+    try:
+        before = x509.load_pem_x509_certificate(_read(folder / _AUTHORITY_FOLDER / AUTHORITY))
+        key: Any = serialization.load_pem_private_key(
+            _read(folder / _AUTHORITY_FOLDER / PRIVATE_KEY), password=None
+        )
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"{folder / _AUTHORITY_FOLDER}: no authority ({error}): without it, make new keys for all with "
+            "trilat keys new"
+        ) from None
+    if key.public_key() != before.public_key():
+        raise UsageError(f"{folder / _AUTHORITY_FOLDER}: the private key is not that of the certificate")
+    present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
+    chosen = list(members) or present
+    if missing := [name for name in chosen if name not in present]:
+        raise UsageError(f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}")
+    ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+    authority = _sign_authority(key, ends)
+    renewed = {name: _renew(folder / name, before, key, ends) for name in chosen}  # all of them, or none
+    for name, (certificate, listed) in renewed.items():
+        write_whole(folder / name / AUTHORITY, _encode(authority), mode=0o600)
+        write_whole(folder / name / CERTIFICATE, _encode(certificate), mode=0o600)
+        write_whole(folder / name / MEMBERS, listed, mode=0o600)  # last: it says when the keys end
+    write_whole(folder / _AUTHORITY_FOLDER / AUTHORITY, _encode(authority), mode=0o600)
+    return [folder / name for name in chosen]
+
+
+def _renew(
+    folder: Path, authority: x509.Certificate, key: Any, ends: datetime.datetime
+) -> tuple[x509.Certificate, str]:
+    """Returns the new certificate of a member, and its list of members with the new end."""
+    try:
+        before = x509.load_pem_x509_certificate(_read(folder / CERTIFICATE))
+        before.verify_directly_issued_by(authority)
+        listed = json.loads(_read(folder / MEMBERS))
+        names = before.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        certificate = _sign_member(before.subject, before.public_key(), names, key, ends)
+        return certificate, _list_members(listed["member"], listed["members"], ends)
+    except UsageError:
+        raise
+    except Exception as error:  # cryptography's errors have no common base
+        raise UsageError(f"{folder}: damaged, or not of this authority ({error!r})") from None
+
+
 def _make_all(folder: Path, members: Sequence[str], hosts: Sequence[str], days: int) -> None:
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
-    key, issuer = ec.generate_private_key(ec.SECP256R1()), _name("trilat-net authority")
-    constraints = x509.BasicConstraints(ca=True, path_length=0)
-    authority = (
-        _certificate(issuer, issuer, key, ends)
-        .add_extension(constraints, critical=True)
-        .sign(key, hashes.SHA256())
-    )
+    key = ec.generate_private_key(ec.SECP256R1())
+    authority = _sign_authority(key, ends)
     _write(folder / _AUTHORITY_FOLDER, authority, authority, key)
     for member in members:
         own = ec.generate_private_key(ec.SECP256R1())
-        builder = _certificate(_name(member), issuer, own, ends).add_extension(
-            _alternatives(hosts), critical=False
-        )
-        uses = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
-        certificate = builder.add_extension(uses, critical=False).sign(key, hashes.SHA256())
+        certificate = _sign_member(_name(member), own.public_key(), _alternatives(hosts), key, ends)
         _write(folder / member, authority, certificate, own)
-        listed = json.dumps({"member": member, "members": list(members)})
-        _put(folder / member / MEMBERS, f"{listed}\n".encode())
+        _put(folder / member / MEMBERS, _list_members(member, members, ends).encode())
+
+
+def _list_members(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
+    listed = {"member": member, "members": list(members), "ends": ends.isoformat()}
+    return f"{json.dumps(listed)}\n"
+
+
+def _sign_authority(key: ec.EllipticCurvePrivateKey, ends: datetime.datetime) -> x509.Certificate:
+    constraints = x509.BasicConstraints(ca=True, path_length=0)
+    builder = _certificate(_ISSUER, key.public_key(), ends)
+    return builder.add_extension(constraints, critical=True).sign(key, hashes.SHA256())
+
+
+def _sign_member(
+    subject: x509.Name,
+    own: Any,
+    names: x509.SubjectAlternativeName,
+    key: ec.EllipticCurvePrivateKey,
+    ends: datetime.datetime,
+) -> x509.Certificate:
+    """Returns the certificate for a member's public key, signed by the key of the authority."""
+    uses = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
+    builder = _certificate(subject, own, ends).add_extension(names, critical=False)
+    return builder.add_extension(uses, critical=False).sign(key, hashes.SHA256())
 
 
 def _name(common: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
 
 
-def _certificate(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
-) -> x509.CertificateBuilder:
+_ISSUER = _name("trilat-net authority")
+
+
+def _certificate(subject: x509.Name, own: Any, ends: datetime.datetime) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key.public_key())
+        .issuer_name(_ISSUER)
+        .public_key(own)
         .serial_number(x509.random_serial_number())
         .not_valid_before(datetime.datetime.now(datetime.UTC) - _BEFORE)
-        .not_valid_after(ends)
+        .not_valid_after(ends + STOPPING_TIME)
     )
+
+
+def _encode(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
@@ -201,11 +291,15 @@ def _refuse_of_others(path: Path, facts: os.stat_result) -> None:
         raise UsageError(f"{path}: others may write it, and so say who takes part: chmod go-w {path}")
 
 
-def read_member_keys(folder: str | Path) -> MemberKeys:
+def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     """Returns the keys in a member's folder; the command is `trilat keys info`.
 
     >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
     'm'
+
+    Args:
+        folder: the folder of one member.
+        stops: true if the keys serve to stop arms alone: they may have ended, while their certificate holds.
 
     Raises:
         UsageError: something is missing, has ended, or does not belong together.
@@ -225,22 +319,30 @@ def read_member_keys(folder: str | Path) -> MemberKeys:
         member, members = named["member"], tuple(named["members"])
         authority, certificate = map(x509.load_pem_x509_certificate, pems)
         key = serialization.load_pem_private_key(private, password=None)
+        ends = certificate.not_valid_after_utc
+        if "ends" in named:  # keys of earlier versions end with their certificate
+            ends = min(ends, datetime.datetime.fromisoformat(named["ends"]))
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise UsageError(f"{folder}: damaged, no keys of `trilat keys new` ({error})") from None
     except Exception as error:  # cryptography's errors have no common base
         raise UsageError(f"{folder}: the authority has not signed this certificate ({error!r})") from None
-    if fault := _find_name_fault(members) or _find_fault(folder, member, members, certificate, key):
+    last = certificate.not_valid_after_utc if stops else ends
+    if fault := _find_name_fault(members) or _find_fault(folder, member, members, certificate, key, last):
         raise UsageError(f"{folder}: {fault}")
-    ends = certificate.not_valid_after_utc
     return MemberKeys(member, members, ends, _make_settings(folder.resolve(), members))
 
 
 def _find_fault(
-    folder: Path, member: str, members: Sequence[str], certificate: x509.Certificate, key: Any
+    folder: Path,
+    member: str,
+    members: Sequence[str],
+    certificate: x509.Certificate,
+    key: Any,
+    ends: datetime.datetime,
 ) -> str:
     common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
-    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    begins = certificate.not_valid_before_utc
     private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)
     for fault, text in (
         (find_rights_of_others(private), f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
@@ -248,7 +350,10 @@ def _find_fault(
         (member not in members, f"{MEMBERS} does not list {member}"),
         (key.public_key() != certificate.public_key(), "the private key is not that of the certificate"),
         (begins > now, f"the certificate begins on {begins:{_DATE}}: is the clock of this machine right?"),
-        (ends <= now, f"the certificate ended on {ends:{_DATE}}: make new keys for all with trilat keys new"),
+        (
+            ends <= now,
+            f"the certificate ended on {ends:{_DATE}}: {_RENEWAL}",
+        ),
     ):
         if fault:
             return text
@@ -264,7 +369,7 @@ def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
         "root_ca_certificate": str(folder / AUTHORITY),
         "enable_mtls": True,
         "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
+        "close_link_on_expiration": False,  # no date ends a session; see `Connection.require_keys_until`
         **files,
     }
     return {
