@@ -121,6 +121,11 @@ lock: $(VENV)/uv.stamp
 		--group long -c requirements/dev.lock -o requirements/long.lock
 	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
 		--group docs -c requirements/dev.lock -o requirements/docs.lock
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		--group build --group release -c requirements/dev.lock -o requirements/release.lock
+	.ci/distributions
+	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
+		build/distributions/trilat-net-core/pyproject.toml -c requirements/runtime.lock -o requirements/core.lock
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

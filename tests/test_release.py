@@ -45,6 +45,24 @@ def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
     assert "secrets." not in text
 
 
+def test_workflows_install_by_hash_or_what_they_built() -> None:
+    """A package of somebody else could put its own files among those that are published."""
+    installed = 0
+    for path in WORKFLOWS:
+        for line in re.findall(r"pip install (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE):
+            words = [word for word in line.split() if word != "--disable-pip-version-check"]
+            if words[0] == "--no-index":
+                assert any(word.startswith("dist") for word in words), line
+            else:
+                assert words[:2] == ["--require-hashes", "-r"], line
+                assert len(words) == 3, line
+                assert "--hash=sha256:" in (ROOT / words[2]).read_text(encoding="utf-8"), line
+            installed += 1
+        for line in re.findall(r"python -m build (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE):
+            assert "--no-isolation" in line.split(), line  # else pip gets what builds it, without hashes
+    assert installed >= 8
+
+
 def test_what_the_workflows_run_is_there() -> None:
     for path in WORKFLOWS:
         for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values():
