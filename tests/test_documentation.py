@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from importlib import resources
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -137,6 +138,17 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 # --- commands ---------------------------------------------------------------------------------------------
 
+PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = {"docs/links.md"}, {"docs/certificate.md", "docs/policies.md"}
+"""Pages whose blocks run on every push; those of the others run in `make test-long`."""
+
+
+def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
+    """Returns pages as parameters of a test; all but those that run on every push are long."""
+    assert pushed <= pages
+    slow = pytest.mark.long
+    return [pytest.param(page, marks=() if page in pushed else slow, id=page) for page in sorted(pages)]
+
+
 COMMAND_PAGES = {
     "docs/arms.md",
     "docs/errata.md",
@@ -165,8 +177,7 @@ def prepare(page: str, folder: Path) -> None:
         (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("page", sorted(COMMAND_PAGES - {"docs/lab.md"}))
+@pytest.mark.parametrize("page", list_pages(COMMAND_PAGES - {"docs/lab.md"}, PUSHED_COMMAND_PAGES))
 def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     for block in find_blocks(page):
@@ -270,13 +281,27 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 """By page what it says of the results of its code."""
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("page", sorted(PYTHON_PAGES - OF_THEIR_OWN))
+@pytest.mark.parametrize("page", list_pages(PYTHON_PAGES - OF_THEIR_OWN, PUSHED_PYTHON_PAGES))
 def test_code_of_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
     printed = run_python(page, tmp_path, names)
-    CHECKS.get(page, lambda *_: None)(printed, names)
+    if page in CHECKS:
+        CHECKS[page](printed, names)
+    else:
+        assert printed.splitlines() == list_shown(page)
+
+
+def list_shown(page: str) -> list[str]:
+    """Returns the lines that a page shows of what its code prints: the block right after the code."""
+    blocks = find_blocks(page)
+    text = (ROOT / page).read_text(encoding="utf-8")
+    shown: list[str] = []
+    for code, after in pairwise(blocks):
+        between = text.partition(code.text)[2].partition(after.text)[0]
+        if code.language == "python" and after.language == "" and between.split() == ["```", "```text"]:
+            shown += after.text.splitlines()
+    return shown
 
 
 @pytest.mark.long
@@ -286,6 +311,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
     names: dict[str, Any] = {"__name__": "page"}
     run_python("docs/sweep.md", tmp_path, names)
     assert len(names["results"].rows) == names["plan"].cells == 135
+    assert names["least"].keys() <= {0.0, 100.0}
 
 
 @pytest.mark.long
