@@ -47,11 +47,13 @@ class ArmSettings(NamedTuple):
         tau_rate_limit_nm_s: limit of a torque's rate; None: there is none.
         learnt: which share of the true parameters the estimates begin with.
         qd_limit_rad_s: limit of the speeds; one that the arms' own motion passes is a fault.
+        start_rad_s: speed of each joint of every arm as it starts, up to that limit.
     """
 
     tau_rate_limit_nm_s: float | None = 300.0
     learnt: float = 0.0
     qd_limit_rad_s: float = 10.0
+    start_rad_s: tuple[float, float] = (0.0, 0.0)
 
 
 def draw_settings(seed: int) -> ArmSettings:
@@ -60,7 +62,10 @@ def draw_settings(seed: int) -> ArmSettings:
         return ArmSettings()
     rate_nm_s = rng.choice([100.0, 100.0 * 10.0 ** rng.random(), None])
     speed_rad_s = rng.choice([10.0, 10.0, round(rng.uniform(0.8, 1.5), 2)])
-    return ArmSettings(rate_nm_s, round(rng.random(), 3), speed_rad_s)
+    learnt = round(rng.random(), 3)
+    most_rad_s = speed_rad_s * rng.random()
+    start_rad_s = (round(rng.uniform(-most_rad_s, most_rad_s), 3), round(most_rad_s, 3))
+    return ArmSettings(rate_nm_s, learnt, speed_rad_s, start_rad_s)
 
 
 class Fault(NamedTuple):

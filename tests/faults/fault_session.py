@@ -55,6 +55,8 @@ def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS
     keys: dict[str, Any] = {"limits.qd_limit_rad_s": arms.qd_limit_rad_s}
     if arms.tau_rate_limit_nm_s is not None:
         keys["limits.tau_rate_limit_nm_s"] = arms.tau_rate_limit_nm_s
+    if any(arms.start_rad_s):
+        keys |= {f"sites.{name}.qd0_rad_s": list(arms.start_rad_s) for name in SITES}
     if arms.learnt:
         keys["control.theta_hat0"] = (arms.learnt * load_scenario("free").arms["s"].theta).tolist()
     return load_scenario("free", {"duration_s": timetable.length_s, **KEYS, **keys})

@@ -17,7 +17,15 @@ from trilat_net.scenario import Scenario
 
 from .fault_schedule import SITES
 from .fault_session import FaultSession, Published
-from .rest_invariants import RESIDUAL, RESTING, check_energy, check_rest, check_storage, check_travel
+from .rest_invariants import (
+    RESIDUAL,
+    RESTING,
+    check_energy,
+    check_rest,
+    check_speed,
+    check_storage,
+    check_travel,
+)
 
 SILENT_TICKS = 20
 _LIFE = {("waiting", "return"), ("return", "run"), ("return", "hold"), ("run", "hold"), ("hold", "return")}
@@ -266,4 +274,5 @@ INVARIANTS: dict[str, Invariant] = {
     "I12 energy": check_energy,
     "I13 rest": check_rest,
     "I14 travel": check_travel,
+    "I15 speed": check_speed,
 }
