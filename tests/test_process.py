@@ -29,6 +29,20 @@ def test_a_signal_is_remembered_and_ends_nothing() -> None:
         assert interrupt.exit_code == 128 + signal.SIGTERM  # the first counts
 
 
+def test_only_a_later_second_signal_insists(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 5.0
+    monkeypatch.setattr(process.os, "times", lambda: SimpleNamespace(elapsed=now_s))
+    with Interrupt() as interrupt:
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGINT):
+            os.kill(os.getpid(), number)
+            assert not interrupt.insists()
+        now_s += 1.0
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert not interrupt.insists()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert interrupt.insists()
+
+
 def test_handlers_are_put_back() -> None:
     before = [signal.getsignal(name) for name in ENDING_SIGNALS]
     with Interrupt():

@@ -88,6 +88,8 @@ class LinePrinter:
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))  # the terminal, or window, has gone
 ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None)
 """Signals that end a program in order."""
+_SAME_WISH_S = 0.2
+"""Signals that come within this time are one wish: a terminal and a parent process may both deliver it."""
 
 
 class Interrupt:
@@ -101,7 +103,8 @@ class Interrupt:
 
     def __init__(self, *, compiles: bool = False) -> None:
         self.number, self.compiles = 0, compiles
-        self._arrived = 0
+        self._asked_s: float | None = None  # when the first SIGINT or SIGTERM came
+        self._insists = False
         self._before: dict[int, Any] = {}
         self.raises = False
 
@@ -122,7 +125,10 @@ class Interrupt:
 
     def _take(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number
-        self._arrived += 1
+        if number != _HANG_UP:  # a terminal that closes, and its shell, send one each
+            now_s = os.times().elapsed
+            self._insists |= self._asked_s is not None and now_s - self._asked_s > _SAME_WISH_S
+            self._asked_s = now_s if self._asked_s is None else self._asked_s
         if self.raises:
             raise KeyboardInterrupt
 
@@ -145,8 +151,8 @@ class Interrupt:
         return self.number != 0
 
     def insists(self) -> bool:
-        """True once a second signal has arrived."""
-        return self._arrived > 1
+        """True once a second SIGINT or SIGTERM has arrived, later than one that a parent passes on."""
+        return self._insists
 
     @property
     def exit_code(self) -> int:

@@ -139,3 +139,63 @@ def test_what_a_file_says_reaches_no_terminal_as_it_is(tmp_path: Path) -> None:
     done = trilat("log", "info", path, cwd=tmp_path)
     assert "\x1b" not in done.out + done.err
     assert "\x07" not in done.out + done.err
+
+
+# Advice on files that do not end as a finished one does: every command gives the same.
+
+PADDED = Path(__file__).parents[1] / "log" / "inputs" / "padded_after_end.mcap"
+READING = (["log", "info"], ["log", "check"], ["log", "recover"], ["verify"], ["certify"], ["report"])
+
+
+@pytest.mark.parametrize("words", READING, ids=" ".join)
+def test_an_empty_file_is_empty_to_every_command(words: list[str], tmp_path: Path) -> None:
+    written(tmp_path, b"", "empty.mcap")
+    done = trilat(*words, "empty.mcap", cwd=tmp_path)
+    assert done.code != 0
+    assert "is empty" in done.out + done.err
+    assert "trilat log recover" not in done.out + done.err  # it could save nothing
+    assert list(tmp_path.iterdir()) == [tmp_path / "empty.mcap"]
+
+
+def test_bytes_behind_the_end_lose_nothing(tmp_path: Path) -> None:
+    data = PADDED.read_bytes()
+    written(tmp_path, data, "padded.mcap")
+    for words in (["log", "info"], ["log", "check"]):
+        done = trilat(*words, "padded.mcap", cwd=tmp_path)
+        assert "was finished, and 512 bytes follow its end mark" in done.err, done
+        assert "was not finished" not in done.out + done.err
+    done = trilat("log", "recover", "padded.mcap", cwd=tmp_path)
+    assert done.code == 0
+    assert "which was finished" in done.out
+    saved = tmp_path / "padded.recovered.mcap"
+    checked = trilat("log", "check", saved.name, cwd=tmp_path)
+    assert checked.code == 0, checked
+    assert "512 bytes" not in checked.out + checked.err
+
+
+def test_a_padded_log_is_verified_as_it_is(tmp_path: Path) -> None:
+    written(tmp_path, WHOLE + bytes(4096))
+    for words in (["log", "info"], ["verify"]):
+        done = trilat(*words, "run.mcap", cwd=tmp_path)
+        assert done.code == 0, done
+        assert "4096 bytes follow its end mark" in done.err, done
+    assert trilat("log", "recover", "run.mcap", cwd=tmp_path).code == 0
+
+
+def without_ends(payload: bytes) -> bytes:
+    """An event that is no end, in the place of one."""
+    return payload.replace(b"\xa3end", b"\xa3law")
+
+
+def test_an_unknown_end_is_said_everywhere(tmp_path: Path) -> None:
+    written(tmp_path, edited(WHOLE, event=without_ends))
+    sentence = "the end of m1, m2 and s is unknown"
+    for words in (["log", "info"], ["log", "check"], ["verify"]):
+        done = trilat(*words, "run.mcap", cwd=tmp_path)
+        assert sentence in done.out + done.err, done
+    facts = json.loads(trilat("log", "info", "run.mcap", "--json", cwd=tmp_path).out)
+    assert facts["session"]["unknown_ends"] == ["m1", "m2", "s"]
+    trilat("report", "run.mcap", cwd=tmp_path)
+    (summary,) = tmp_path.rglob("summary.json")
+    assert json.loads(summary.read_text())["session"]["unknown_ends"] == ["m1", "m2", "s"]
+    assert sentence in next(tmp_path.rglob("report.html")).read_text()

@@ -330,3 +330,25 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
 def test_scenario_is_that_of_member_and_not_of_stranger(tmp_path: Path) -> None:
     recorder_alone(tmp_path, Relay(), MONO_NS + 10_000_000)
     assert open_log(tmp_path / "run.mcap").scenario.sha256 == SCENARIO.sha256
+
+
+def test_a_recorder_that_ends_waits_for_what_sites_hold() -> None:
+    """Of a site that goes on it waits only until nothing is missing."""
+    desk = Desk()
+    ending_ns = desk.clock.monotonic_ns()
+    desk.whole("m")
+    desk.take("s", topics.STATE, *states("s")[:20], *states("s")[25:])
+    assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
+    desk.clock.sleep_until(ending_ns + 2 * SETTLE_NS)
+    assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
+    desk.take("s", topics.STATE, *states("s")[20:25])
+    assert desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())
+
+
+def test_a_silent_site_without_an_end_may_still_hold_records() -> None:
+    desk = Desk()
+    desk.whole("m")
+    desk.take("s", topics.STATE, *states("s")[:20])
+    ending_ns = desk.clock.monotonic_ns()
+    desk.clock.sleep_until(ending_ns + 3 * SETTLE_NS)
+    assert not desk.recording.is_up_to_date(ending_ns, desk.clock.monotonic_ns())

@@ -52,7 +52,7 @@ def find_epochs_ns(data: bytes) -> set[int]:
         kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
         for kind in kinds:
             with suppress(WireError):
-                message = decode(payload, kind, messages.READABLE)
+                message: AnyMessage = decode(payload, kind, messages.READABLE)
                 sent_ns = identify_message(message, 1).sent_ns
                 if isinstance(message, messages.Event):
                     epochs_ns |= {message.epoch_unix_ns} if message.epoch_unix_ns else set()
@@ -95,9 +95,10 @@ class ContentCheck:
 
     def identify(self, payload: bytes) -> str:
         """Returns the topic that a message belongs to by its own content; "" if it is none of the session."""
-        for kind in CHANNEL_TYPES.values():
+        kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
+        for kind in kinds:
             try:
-                message = decode(payload, kind, messages.READABLE)
+                message: AnyMessage = decode(payload, kind, messages.READABLE)
             except WireError:
                 continue
             identity = identify_message(message, 1)

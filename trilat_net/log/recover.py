@@ -211,7 +211,7 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
     if not digest or kept is not None:
         return b""
     with suppress(OSError, LogError), open_regular(path.with_name(SCENARIO)) as stream:
-        text = stream.read(_MAX_SCENARIO_BYTES)
+        text: bytes = stream.read(_MAX_SCENARIO_BYTES)
         if hashlib.sha256(text).hexdigest() == digest:
             survey.attachments[SCENARIO] = text
             return text

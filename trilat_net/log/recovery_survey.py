@@ -143,7 +143,7 @@ class RecoverySurvey:
         if session is None:
             return
         epochs_ns = self._find_epochs_ns()
-        if not epochs_ns or session.get("epoch_unix_ns") in map(str, epochs_ns):
+        if not epochs_ns or session.get("epoch_unix_ns", "") in set(map(str, epochs_ns)):
             return
         self.is_foreign_session = True
         del self.metadata[SESSION]
