@@ -16,7 +16,7 @@ from functools import partial
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import TrilatError, UsageError
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.published import COMMON_TOPICS, pack_diagnostics
+from trilat_net.log.ros2.published import COMMON_TOPICS, pack_session_diagnostics
 from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
 from trilat_net.log.ros2.topic_names import DIAGNOSTICS, FRAMES, RobotTable, TopicTable
 from trilat_net.net import topics
@@ -329,7 +329,7 @@ class Bridge:
     def _diagnose(self) -> None:
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
         if self._diagnostics.heard:
-            self._diagnostics.put(pack_diagnostics(self._ends.session, self._epoch_unix_ns, records))
+            self._diagnostics.put(pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records))
 
 
 def describe_target(

@@ -199,7 +199,7 @@ def _name_array(name: str) -> str:
     return "mode_number" if name == "mode" else name
 
 
-def pack_diagnostics(session: str, epoch_unix_ns: int, records: Sequence[State]) -> bytes:
+def pack_session_diagnostics(session: str, epoch_unix_ns: int, records: Sequence[State]) -> bytes:
     """Returns a message for `/diagnostics` by the newest record of every site."""
     newest_ns = max((record.t_ns for record in records), default=0)
     parts: list[cdr.Diagnosis] = []

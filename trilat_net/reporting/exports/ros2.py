@@ -20,7 +20,7 @@ from ...log.log_layout import SCENARIO, collect_provenance
 from ...log.log_reader import Log
 from ...log.mcap_writer import McapWriter
 from ...log.ros2 import cdr, ros2_messages
-from ...log.ros2.published import SiteMessages, list_topics, pack_diagnostics
+from ...log.ros2.published import SiteMessages, list_topics, pack_session_diagnostics
 from ...log.ros2.topic_names import (
     DIAGNOSTICS,
     FRAMES,
@@ -154,7 +154,7 @@ def _diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
             log_ns = max([log_ns, *(int(part.log_time_ns[at]) for part, at in newest)])
             publish_ns = max([publish_ns, *(int(part.publish_time_ns[at]) for part, at in newest)])
             records = [part.record(at) for part, at in newest]
-            data = pack_diagnostics(session, _find_epoch_ns(log), records)
+            data = pack_session_diagnostics(session, _find_epoch_ns(log), records)
             yield log_ns, publish_ns, [(DIAGNOSTICS, data)]
 
 
