@@ -313,7 +313,11 @@ class Recording:
         lines = []
         for name, site in self._sites.items():
             account = site.accounts[topics.STATE]
-            total = " records, its end is unknown" if site.made is None else f" of {account.expected} records"
+            total = (
+                " records, its end is unknown"
+                if site.made is None
+                else f" of {account.expected} records"
+            )
             lines.append(
                 f"recorder: {name}: {account.received}{total}, {account.missing} missing, "
                 f"{account.duplicate} duplicate, largest gap {account.largest_gap}"

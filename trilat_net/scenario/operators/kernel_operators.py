@@ -16,7 +16,7 @@ from msgspec import Meta
 from ... import fields
 from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
-from ...core.live_hand import HandRules, HandReach
+from ...core.live_hand import HandReach, HandRules
 from ...errors import ScenarioError
 from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
