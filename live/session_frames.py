@@ -7,6 +7,7 @@ as one site knows the session shows of a peer nothing but its pose at one tick: 
 site has in use, or to which the picture of the site's user has come (`SessionView.find_shown`).
 """
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -87,7 +88,9 @@ class ArmFrames:
             return None
         how, rows = hand.device, hand.device.rows(self._model.counts.axes)
         device = {"rows": rows, "scale": how.scale, "jump_m_s": how.jump_m_s}
-        return {"mode": hand.mode, "limit": hand.actor.limit, "device": device}
+        centre, _, outer_m, *_ = self._model.reach
+        reach = {"centre": list(centre), "most": outer_m if outer_m < math.inf else None}
+        return {"mode": hand.mode, "limit": hand.actor.limit, "device": device, "reach": reach}
 
     def pose(self, q: Array) -> Json:
         """Returns the arm at its joints' coordinates q, shape (n,), rad."""

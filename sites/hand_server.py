@@ -14,6 +14,7 @@ import numpy as np
 
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
 from trilat_net.core.site_arrays import SiteArrays
+from trilat_net.core.site_setup import MotionLimits
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError
@@ -51,14 +52,21 @@ def _read_messages(
 class HandServer:
     """The live hand of one site.
 
-    `news` are ticks, and sentences on who has taken hold and let go that no event names yet.
+    `news` are ticks, and sentences on who has taken hold and let go that no event names yet. `limits` are
+    those of the site's motion.
     """
 
     def __init__(
-        self, site: Site, hand: LiveHand, arm: ArmModel, inbox: Inbox, dropped: Counter[str]
+        self,
+        site: Site,
+        hand: LiveHand,
+        arm: ArmModel,
+        inbox: Inbox,
+        dropped: Counter[str],
+        limits: MotionLimits | None = None,
     ) -> None:
         self._site, self._hand, self._inbox, self._dropped = site.name, hand, inbox, dropped
-        self._rules = hand.rules(site.rate_hz, arm)
+        self._rules = hand.rules(site.rate_hz, arm, limits)
         self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)

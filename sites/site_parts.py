@@ -137,7 +137,14 @@ class SiteParts:
             publish = bus.publisher(topics.key(session, name, topics.VIEW))
             self.hand = RemoteHand(at, self.boot, inbox, publish, dropped, self.clock)
             return
-        self.hand = HandServer(self.site, live, self.scenario.arms[name], inbox, dropped)
+        self.hand = HandServer(
+            self.site,
+            live,
+            self.scenario.arms[name],
+            inbox,
+            dropped,
+            self.scenario.motion_limits(name),
+        )
 
     def _meet_outside_arm(self) -> None:
         name, session, dropped = self.name, self.options.session, self.stats.dropped

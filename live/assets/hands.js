@@ -142,7 +142,14 @@ export class Hands {
   shift(card, right, up) {
     const at = this.arms.painter.project(card, card.hold.to);
     const unit = card.canvas.height / (2 * card.view.half);
-    card.hold.to = this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to);
+    card.hold.to = this.within(card, this.arms.painter.unproject(card, [at[0] + right * unit, at[1] - up * unit], card.hold.to));
+  }
+
+  within(card, to) { // the nearest place that the arm can get to: steps of keys and sticks add up, and would lead the target away
+    const { centre, most } = card.about.hand.reach;
+    const way = to.map((x, n) => x - centre[n]);
+    const distance = Math.hypot(...way);
+    return most === null || distance <= most ? to : way.map((x, n) => centre[n] + (x * most) / distance);
   }
 
   rumble(card, pad) { // of the wall at the arm that it holds, ten times a second, each a little longer than that

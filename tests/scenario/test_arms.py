@@ -13,6 +13,7 @@ import trilat_net
 from tests.core.chain_references import chain_references
 from tests.scenario.chains import SIX, six
 from trilat_net.analysis.arm_rows import joint_positions_m
+from trilat_net.core.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verify import verify
 from trilat_net.scenario import load_scenario, parse_embedded
@@ -376,3 +377,47 @@ def test_a_planar_arm_beside_a_chain_is_the_same_arm() -> None:
     x, y, z = mixed.arms["m1"].end_effector([0.3, -1.0])
     assert [x, y] == pytest.approx(planar.end_effector([0.3, -1.0]), abs=1e-15)
     assert z == 0.0
+
+
+# Reach
+
+REACHES = {
+    "planar": load_scenario("play", {"arm.l2_m": 0.6}).arms["m1"],
+    "six joints": six(**{"arm.base_xyz_m": [0.3, -0.2, 0.1]}).arms["s"],
+    "seven joints": load_scenario("seven_joints").arms["s"],
+    "sliding": load_scenario(
+        "six_joints",
+        {
+            "urdf": {
+                "arm6.urdf": ARM6.replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"')
+            },
+            "expect": {},
+        },
+    ).arms["s"],
+}
+
+
+@pytest.mark.parametrize("name", REACHES)
+@given(turns=st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7))
+@settings(max_examples=40)
+def test_no_pose_leaves_the_reach_of_an_arm(name: str, turns: list[float]) -> None:
+    arm = REACHES[name]
+    q = [math.pi * turn for turn in turns[: arm.counts.joints]]
+    place = arm.end_effector(q)
+    assert arm.reach.find_nearest(place) == pytest.approx(place, abs=1e-9)
+
+
+def test_the_reach_of_two_links_is_exact() -> None:
+    reach = REACHES["planar"].reach
+    assert (reach.inner_m, reach.outer_m) == (pytest.approx(0.4), pytest.approx(1.6))
+    for elbow, radius in ((0.0, reach.outer_m), (math.pi, reach.inner_m)):
+        assert math.hypot(*REACHES["planar"].end_effector([0.7, elbow])) == pytest.approx(radius)
+
+
+def test_a_hand_at_the_joints_stays_between_stops_and_limits() -> None:
+    arm = six().arms["s"]
+    reach = arm.find_joint_reach(MotionLimits(q_min=(-1.0,), q_max=(7.0,)))
+    assert reach.find_nearest([9.0] * 6) == (2.0 * math.pi,) * 6
+    assert reach.find_nearest([-9.0] * 6) == (-1.0,) * 6
+    planar = REACHES["planar"].find_joint_reach(MotionLimits(q_max=(1.0, 2.0)))
+    assert planar.find_nearest([5.0, -5.0]) == (1.0, -5.0)

@@ -27,7 +27,7 @@ from ..core.chain import (
 )
 from ..core.live_hand import HandReach
 from ..core.rotation import rotation_matrix, turn_between
-from ..core.site_setup import ChainSetup, Gains, Law, RestGains, TaskSetup
+from ..core.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError
@@ -261,14 +261,17 @@ class ArmModel(NamedTuple):
         inner = 0.0 if sliding else max(0.0, 2.0 * max(lengths) - sum(lengths))
         return HandReach(first.origin_m, inner, outer)
 
-    @property
-    def joint_reach(self) -> HandReach:
-        """The joint angles between its stops."""
-        if self.chain is None:
-            return HandReach()
-        joints = self.chain.joints
-        low, high = (tuple(getattr(joint, end) for joint in joints) for end in ("lower", "upper"))
-        return HandReach(low=low, high=high)
+    def find_joint_reach(self, limits: MotionLimits) -> HandReach:
+        """Returns the joint angles between its stops and its limits of position."""
+        joints = () if self.chain is None else self.chain.joints
+        low, high = (
+            np.broadcast_to(np.array(limit, dtype=np.float64), self.counts.joints)
+            for limit in (limits.q_min, limits.q_max)
+        )
+        if joints:
+            low = np.maximum(low, [joint.lower for joint in joints])
+            high = np.minimum(high, [joint.upper for joint in joints])
+        return HandReach(low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     @property
     def shares_pose(self) -> bool:

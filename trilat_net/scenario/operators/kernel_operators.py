@@ -17,6 +17,7 @@ from ... import fields
 from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
 from ...core.live_hand import HandReach, HandRules
+from ...core.site_setup import MotionLimits
 from ...errors import ScenarioError
 from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
@@ -300,21 +301,25 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 words = f"one of {', '.join(DIRECTIONS)} for each of {axes} axes, and no two of one line"
                 raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
-    def rules(self, rate_hz: int, arm: ArmModel) -> HandRules:
-        """Returns what somebody who holds an arm may do."""
+    def rules(self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None) -> HandRules:
+        """Returns what somebody who holds an arm may do; `limits`: of the motion of its site."""
         if self.mode == "force":
             strongest = STRONGEST * self.force_limit_n
             return HandRules(arm.counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest)
         if self.mode == "joint":
-            limits, size = self.speed_limit_rad_s, arm.counts.joints
-            acceleration, reach = self.acceleration_limit_rad_s2, arm.joint_reach
+            size = arm.counts.joints
+            speed_limit = self.speed_limit_rad_s
+            acceleration = self.acceleration_limit_rad_s2
+            reach = arm.find_joint_reach(limits or MotionLimits())
         else:
-            limits, size = self.speed_limit_m_s, arm.counts.axes
-            acceleration, reach = self.acceleration_limit_m_s2, arm.reach
+            size = arm.counts.axes
+            speed_limit = self.speed_limit_m_s
+            acceleration = self.acceleration_limit_m_s2
+            reach = arm.reach
         return HandRules(
             size,
             rate_hz,
-            limits,
+            speed_limit,
             farthest=FARTHEST,
             acceleration_limit=acceleration if acceleration < fields.MAX_QUANTITY else math.inf,
             reach=reach if self.is_open else HandReach(),
