@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -11,10 +12,12 @@ from typing import Any
 
 import msgspec
 import pytest
+import typer
 
 import trilat_net as tn
-from tests.cli.running import COMMAND, PLAIN, trilat
+from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log_editing import edited, opened
+from trilat_net.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
 from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.imported_code import CodeKey, allowed_code, import_class, remembered_settings
@@ -61,6 +64,7 @@ EXECUTING: list[tuple[list[str], int]] = [
     (["verify", "run.mcap", "--virtual"], 4),
     (["report", "run.mcap", "-o", "page"], 4),
     (["rerun", "run.mcap", "--closed-loop"], 4),
+    (["twin", "run.mcap"], 4),
     (HANDS, 2),
 ]
 READING: list[tuple[list[str], int]] = [
@@ -70,6 +74,7 @@ READING: list[tuple[list[str], int]] = [
     (["figure", "run.mcap", "--list"], 0),
     (["compare", "run.mcap", "run.mcap"], 0),
     (["metrics", "run.mcap"], 0),
+    (["identify", "hand", "run.mcap"], 2),
     (["log", "info", "run.mcap"], 0),
     (["log", "check", "run.mcap"], 0),
     (["log", "recover", "run.mcap", "-o", "whole.mcap"], 0),
@@ -166,6 +171,58 @@ def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> Non
 def test_the_table_has_all_that_was_asked_for() -> None:
     assert len(CASES) >= 26
     assert {law for _, _, law in CASES} == set(FILES)
+
+
+def list_commands(command: Any, *words: str) -> Iterator[str]:
+    """Every command of the program, by its words."""
+    if not hasattr(command, "commands"):
+        yield " ".join(words)
+        return
+    for name, inner in command.commands.items():
+        yield from list_commands(inner, *words, name)
+
+
+@pytest.mark.push
+def test_the_page_lists_every_command() -> None:
+    """A row of `docs/code-that-runs.md` says of each command whose code it runs."""
+    page = Path(__file__).parents[2] / "docs" / "code-that-runs.md"
+    rows = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| `trilat ")]
+    named = {
+        " ".join(word for word in words.removeprefix("trilat ").split() if word.islower() and word[0] != "-")
+        for row in rows
+        for words in re.findall("`([^`]+)`", row.split(" | ")[0])
+    }
+    assert named == set(list_commands(typer.main.get_command(app)))
+
+
+RUNNING_OWN: dict[str, list[str]] = {
+    "sim": ["sim", "own.toml", "-o", "sim.mcap"],
+    "test": ["test", "own.toml", "--jobs", "1"],
+    "linear": ["linear", "own.toml"],
+    "sweep": ["sweep", "own.toml", "--over", "link.delay_ms=0:20:20", "--jobs", "1"],
+    "experiment run": ["experiment", "run", "own-reaching.toml", "--jobs", "1"],
+}
+ONLY_NAMING_OWN: dict[str, list[str]] = {
+    "scenario show": ["scenario", "show", "own.toml"],
+    "scenario check": ["scenario", "check", "own.toml"],
+    "experiment check": ["experiment", "check", "own-reaching.toml"],
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [*RUNNING_OWN, *ONLY_NAMING_OWN])
+def test_command_runs_own_code_as_the_page_says(name: str, place: Path) -> None:
+    (place / "mylaws.py").write_text(LAW)
+    setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
+    (place / "own.toml").write_text(trilat("scenario", "show", "paper", *setting, cwd=place).succeeds())
+    trilat("experiment", "new", "own-reaching.toml", cwd=place).succeeds()
+    shorten(place / "own-reaching.toml")
+    protocol = (place / "own-reaching.toml").read_text(encoding="utf-8")
+    (place / "own-reaching.toml").write_text(protocol.replace('"paper"', '"./own.toml"', 1))
+    words = {**RUNNING_OWN, **ONLY_NAMING_OWN}[name]
+    done = subprocess.run([*COMMAND, *words], cwd=place, capture_output=True, text=True)
+    assert "Traceback" not in done.stderr, done.stderr
+    assert bool(imports(place)) == (name in RUNNING_OWN), done
 
 
 def imports(place: Path) -> list[str]:
