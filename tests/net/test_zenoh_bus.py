@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.net.connection import find_free_endpoints
+from trilat_net.net.connection import find_free_endpoints, is_loopback
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from trilat_net.net.zenoh_config import MOST_PUT_BYTES
 
@@ -175,3 +175,17 @@ def test_routers_that_connect_to_each_other_are_one() -> None:
     finally:
         for bus in (*members, *routers):
             bus.close()
+
+
+def test_members_meet_at_a_socket_of_their_user(tmp_path: Path) -> None:
+    """A Unix socket in a folder that nobody else may enter, in place of a port of loopback."""
+    place = f"unixsock-stream/{tmp_path}/m1.sock"
+    with closing(ZenohBus([place])) as site, closing(ZenohBus([], [place])) as peer:
+        inbox, publish = peer.inbox("trilat/x/m1/event"), site.publisher("trilat/x/m1/event")
+
+        def arrived() -> bool:
+            publish(b"1")
+            return inbox.poll() is not None
+
+        until(arrived)
+    assert is_loopback(place)

@@ -261,7 +261,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         urdf: the texts of the files that describe arms, by their names.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*$", max_length=64)]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
     duration_s: Annotated[float, Meta(gt=0.0, le=86_400.0)]
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     scheme: Literal["second_order", "digital"]

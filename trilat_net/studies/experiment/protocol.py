@@ -29,7 +29,7 @@ from .synthetic_participant import ParticipantModel, Share
 from .tasks import AnyTask, ReachTrial
 
 Wait = Annotated[float, Meta(ge=0.0, le=60.0)]
-Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}$")]
+Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
 """It becomes part of file names."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 Counted = Annotated[int, Meta(ge=0, le=1000)]
