@@ -38,6 +38,7 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import raise_priority
+from trilat_net.wording import count_nouns
 
 from .page_entrance import Strangers, choose_to_leave, is_full
 from .page_files import PageFiles
@@ -320,7 +321,7 @@ class PageServer:
     def tell_refused(self) -> None:
         """Tells the people at the terminal what was refused."""
         for reason, count in sorted((+self.refused).items()):
-            self._say(f"the page refused {count} messages or requests: {reason}")
+            self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, of: str, error: Exception) -> None:
         """Counts a failure, and says it the first time: no failure of the page is one of the session."""

@@ -19,6 +19,7 @@ from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
+from trilat_net.wording import count_nouns
 
 from .backfill import GapRepair
 from .site_reception import InboundQueue, SiteMessage, SiteReception
@@ -316,7 +317,7 @@ class Recording:
             total = (
                 " records, its end is unknown"
                 if site.made is None
-                else f" of {account.expected} records"
+                else f" of {count_nouns(account.expected, 'record')}"
             )
             lines.append(
                 f"recorder: {name}: {account.received}{total}, {account.missing} missing, "
@@ -325,16 +326,21 @@ class Recording:
                 + (f", {account.unmade} not made while it was away" if account.unmade else "")
             )
         if self._overflowed:
-            lines.append(f"recorder: {self._overflowed} messages turned away because the queue was full")
+            lines.append(
+                f"recorder: {count_nouns(self._overflowed, 'message')} turned away because the queue was full"
+            )
         return lines + [
-            f"recorder: {count} messages dropped: {reason}" for reason, count in self.dropped.items()
+            f"recorder: {count_nouns(count, 'message')} dropped: {reason}"
+            for reason, count in self.dropped.items()
         ]
 
     def problem(self) -> str | None:
         """Describes what is missing; None if nothing is."""
         for name, site in self._sites.items():
             if site.made is None:
-                return f"{name} disappeared after {site.accounts[topics.STATE].received} records"
+                return (
+                    f"{name} disappeared after {count_nouns(site.accounts[topics.STATE].received, 'record')}"
+                )
             if shortage := site.shortage():
                 return f"missing of {name}: {shortage}"
         return None

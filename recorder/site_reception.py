@@ -25,6 +25,7 @@ from trilat_net.net.topics import count_messages, count_under_way, number_messag
 from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
+from trilat_net.wording import count_nouns
 
 CAPACITY = 60_000
 """Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""
@@ -157,7 +158,9 @@ class SiteReception:
             message = SiteMessage(event.n, event.n, event.t_ns, event)
             sender, ticks = event.member, event.ticks if event.kind in ("join", "end") else 0
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
-                raise WireError("out of range", f"{self.name} says it made {event.ticks} ticks")
+                raise WireError(
+                    "out of range", f"{self.name} says it made {count_nouns(event.ticks, 'tick')}"
+                )
         else:
             tick = self._decoders[channel](payload)
             number = number_message(channel, tick.tick, self._rate_hz)

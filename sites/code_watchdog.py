@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.net.clock import Clock
+from trilat_net.wording import count_nouns
 
 try:
     import resource
@@ -112,7 +113,8 @@ class WatchedCode:
         if not self.hiccups:
             return ""
         return (
-            f"{self._name} took longer than from one tick to the next at {self.hiccups} ticks, at most "
+            f"{self._name} took longer than from one tick to the next at "
+            f"{count_nouns(self.hiccups, 'tick')}, at most "
             f"{self.longest_ns * 1e-6:.3g} ms, at tick {self.longest_tick}"
         )
 

@@ -22,6 +22,7 @@ from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.clock import Clock
 from trilat_net.scenario.operators.kernel_operators import DeviceSettings
+from trilat_net.wording import count_nouns
 
 from .devices import Device, DeviceState, Vector
 
@@ -122,7 +123,10 @@ class DeviceHand:
 
     def describe(self) -> str:
         """Returns what came of it, in a line."""
-        told = f"{self.states} states of the device, dropped {self.jumps} jumps, {self.unreadable} unreadable"
+        told = (
+            f"{count_nouns(self.states, 'state')} of the device, dropped "
+            f"{count_nouns(self.jumps, 'jump')}, {self.unreadable} unreadable"
+        )
         if not self.trips_ns:
             return told
         p50, p99 = np.percentile(self.trips_ns, [50, 99]) / 1e6

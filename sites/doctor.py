@@ -41,6 +41,7 @@ from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.wording import count_nouns
 
 from .machine_load import describe_load, measure_busy_share
 from .session_ping import ping_session
@@ -211,7 +212,9 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
         before = now
     apart_ns = abs(clock.unix_ns() - wall - (clock.monotonic_ns() - begun))
     if backwards:
-        yield DoctorFinding("clock", "fail", f"the monotonic clock went back {backwards} times in 0.1 s")
+        yield DoctorFinding(
+            "clock", "fail", f"the monotonic clock went back {count_nouns(backwards, 'time')} in 0.1 s"
+        )
     elif apart_ns > STEP_NS:
         text = f"the wall clock stepped by {apart_ns / 1e6:.1f} ms in 0.1 s; that distorts no record"
         yield DoctorFinding("clock", "warn", text)
@@ -357,7 +360,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {place}")
     cores = process.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    text = f"{cores} processors, of which {load:.1f} are busy"
+    text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
     warning = describe_load(measure_busy_share(SystemClock()))
     is_short = cores < 2 or load >= cores or bool(warning)
     yield DoctorFinding("processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text)

@@ -24,6 +24,7 @@ from trilat_net.net.requests import HandMessage, HandViewMessage
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
+from trilat_net.wording import count_nouns
 
 POLL_NS = 500_000
 HERE_NS = 100_000_000
@@ -125,4 +126,7 @@ def run_hand(
             if not hand.asked and clock.monotonic_ns() > give_up_ns:
                 raise SessionError(f"{name} did not ask its hand {at.program} within {timeout_s:g} s")
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-        say(f"{name}: its hand was asked {hand.asked} times, {hand.skipped} views skipped")
+        say(
+            f"{name}: its hand was asked {count_nouns(hand.asked, 'time')}, "
+            f"{count_nouns(hand.skipped, 'view')} skipped"
+        )

@@ -25,6 +25,7 @@ from trilat_net.net.wire import decode, encode
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
+from trilat_net.wording import count_nouns
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""
@@ -93,7 +94,9 @@ class HandServer:
         pushes = self._hand.mode == "force"
         target, other = (message.force, message.target)[:: 1 if pushes else -1]
         if message.grip and (other or len(target) != self._rules.size):
-            self._dropped[f"hand: no {'force' if pushes else 'target'} of {self._rules.size} numbers"] += 1
+            self._dropped[
+                f"hand: no {'force' if pushes else 'target'} of {count_nouns(self._rules.size, 'number')}"
+            ] += 1
         elif message.grip and math.hypot(*target) > self._rules.farthest:
             self._dropped["hand: out of range"] += 1
         else:

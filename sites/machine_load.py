@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.net.clock import Clock
+from trilat_net.wording import count_nouns
 
 MEASURED_NS = 200_000_000
 """Time over which the load is measured."""
@@ -49,7 +50,9 @@ def describe_load(busy_share: float | None) -> str:
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""
     cores = process.count_cores()
-    processors = f"{cores} processors are" if cores > 1 else "one processor is"
+    processors = (
+        f"{count_nouns(cores, 'processor is', 'processors are')}" if cores > 1 else "one processor is"
+    )
     return (
         f"this machine's {processors} {busy_share:.0%} busy with other programs, so that ticks may be "
         "late and the recorder may miss records: end those programs, or lower the rate, as in "

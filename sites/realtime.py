@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from trilat_net import process
+from trilat_net.wording import count_nouns
 
 FIFO_PRIORITY = 50
 NICE = -10
@@ -30,7 +31,7 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
         sites: how many sites of the session run on this machine.
     """
     cpus = os.cpu_count() or 1
-    shared = f"normal ({sites} sites share {cpus} processors)"
+    shared = f"normal ({count_nouns(sites, 'site shares', 'sites share')} {count_nouns(cpus, 'processor')})"
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),

@@ -30,6 +30,7 @@ from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPubl
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
+from trilat_net.wording import count_nouns
 
 from .ros2_topics import RELIABLE, Ends, SiteTopics
 from .running_session import RunningSession, open_hand
@@ -122,7 +123,9 @@ class DominanceTopic:
         """Takes a message, in a thread of Zenoh's; raises ValueError if that cannot be."""
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
-            raise ValueError(f"has {len(shares)} numbers; the peers are {', '.join(self._peers)}")
+            raise ValueError(
+                f"has {count_nouns(len(shares), 'number')}; the peers are {', '.join(self._peers)}"
+            )
         if self._sender.admit(attachment.gid) > RIVAL_NS:
             self._asked = None
         self._wanted = dict(zip(self._peers, shares, strict=True))
@@ -177,7 +180,10 @@ class RobotArm:
             return
         at = find_joint_places(self._joints, found)
         if len(found.velocity) != len(found.position):
-            raise ValueError(f"has {len(found.position)} positions and {len(found.velocity)} velocities")
+            raise ValueError(
+                f"has {count_nouns(len(found.position), 'position')} and "
+                f"{count_nouns(len(found.velocity), 'velocity')}"
+            )
         q, qd = (_check_finite([row[n] for n in at]) for row in (found.position, found.velocity))
         with self._lock:
             self._sender.admit(attachment.gid)
@@ -205,7 +211,9 @@ class RobotArm:
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
     """Returns where joints, of some names each, stand in a message; ValueError: one is not there once."""
     if len(found.names) != len(found.position):
-        raise ValueError(f"has {len(found.names)} names and {len(found.position)} positions")
+        raise ValueError(
+            f"has {count_nouns(len(found.names), 'name')} and {count_nouns(len(found.position), 'position')}"
+        )
     at = {name: n for n, name in enumerate(found.names)}
     lacking = [called[0] for called in names if not at.keys() & set(called)]
     if lacking:

@@ -46,6 +46,7 @@ from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks, describe_change
 from trilat_net.scenario.scenario_types import Change
 from trilat_net.scenario.validate import check_outside_arms
+from trilat_net.wording import count_nouns
 
 from . import realtime
 from .external_arm import ExternalArm
@@ -364,7 +365,8 @@ class RunningSite:
         dropped = sum(stats.dropped.values())
         return (
             f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, |e| {apart:.3g} {unit}, torque "
-            f"{torque_nm:.3g} N m, {stats.overruns} ticks late, {dropped} messages dropped"
+            f"{torque_nm:.3g} N m, {count_nouns(stats.overruns, 'tick')} late, "
+            f"{count_nouns(dropped, 'message')} dropped"
         )
 
     def report(self, output: TickRecord) -> None:
@@ -419,14 +421,14 @@ class RunningSite:
         about, why = self._find_cause()
         if unheard := [meter.peer.name for meter in self._timing.meters if meter.unheard]:
             why += f"; {', '.join(unheard)} did not hear it at the end"
-        self._publish("end", f"{parts.name} made {self._ticks} ticks{why}", about=about)
+        self._publish("end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about)
         code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
             self._await_recorders()
         dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
         parts.say(
-            f"{self._ticks} ticks, {parts.stats.overruns} of them late by a period or more"
+            f"{count_nouns(self._ticks, 'tick')}, {parts.stats.overruns} of them late by a period or more"
             + (f"; dropped: {dropped}" if dropped else "")
         )
         if self._failure is not None:
@@ -434,7 +436,9 @@ class RunningSite:
         if parts.monitor.ended_by:
             raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
         if not code and self._away:
-            raise PeerLeft(f"{parts.name} made {self._ticks} ticks; {self._away}, and did not come back")
+            raise PeerLeft(
+                f"{parts.name} made {count_nouns(self._ticks, 'tick')}; {self._away}, and did not come back"
+            )
         return code
 
     @property

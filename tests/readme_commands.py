@@ -90,7 +90,8 @@ class LiveSession(NamedTuple):
     """A session, and what is done with it while it runs.
 
     Attributes:
-        start: begins the session; it is interrupted at the end, as by Ctrl-C.
+        start: begins the session, in which m2 starts too fast and is in fault, so that there is something to
+            reset; it is interrupted at the end, as by Ctrl-C.
         watch: goes on until the session ends.
         meanwhile: one after another, once the session answers.
     """
@@ -101,15 +102,15 @@ class LiveSession(NamedTuple):
 
 
 LIVE = LiveSession(
-    "trilat live play --duration 600 --no-browser",
+    "trilat live play --set sites.m2.qd0_rad_s=[8.0,0.0] --duration 600 --no-browser",
     "trilat watch --session play --timeout 60",
     [
         "trilat ping --session play --timeout 60",
+        "trilat reset --session play m2",
         "trilat set --session play link 'm1->s' --delay 350ms --loss 5%",
         "trilat set --session play dominance s m1=0.9 m2=0.1 --ramp 1s",
         "trilat stop --session play",
         "trilat enable --session play",
-        "trilat reset --session play s",
     ],
 )
 ALONE = [

@@ -30,6 +30,7 @@ from trilat_net.net import topics
 from trilat_net.net.clock import NS_PER_S
 from trilat_net.net.topics import number_message
 from trilat_net.scenario import Scenario, parse_embedded
+from trilat_net.wording import count_nouns
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
@@ -224,7 +225,7 @@ class SessionReader:
         if not reader.complete:
             header.torn[path] = "the file was not finished"
         elif reader.damaged:
-            header.torn[path] = f"damaged in {len(reader.damaged)} places"
+            header.torn[path] = f"damaged in {count_nouns(len(reader.damaged), 'place')}"
 
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
         """Returns a file's epoch in Unix time, ns, and the session; refuses one of another session."""

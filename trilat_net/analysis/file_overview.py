@@ -33,6 +33,7 @@ from ..net.topics import count_messages, number_message
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario.describe import list_arm_notes
 from ..scenario.expect import END_WINDOW_S
+from ..wording import count_nouns
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     LinkSummary,
@@ -157,7 +158,9 @@ class FileOverview(Result):
     def headline(self) -> str:
         """Returns which files, and how many messages."""
         messages = sum(channel["messages"] for channel in self.facts["channels"].values())
-        return f"{', '.join(file['path'] for file in self.facts['files'])}: {messages} messages"
+        return (
+            f"{', '.join(file['path'] for file in self.facts['files'])}: {count_nouns(messages, 'message')}"
+        )
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat log info --json`."""

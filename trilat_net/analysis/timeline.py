@@ -20,6 +20,7 @@ from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
 from ..scenario.run_changes import describe_change, find_orderer
 from ..scenario.scenario_types import Change
+from ..wording import count_nouns
 
 
 class AppliedChange(NamedTuple):
@@ -46,7 +47,7 @@ class AppliedChange(NamedTuple):
     def text(self) -> str:
         """The value after it."""
         if self.change.order:
-            ticks = f", {self.change.ticks} ticks" if self.change.ticks else ""
+            ticks = f", {count_nouns(self.change.ticks, 'tick')}" if self.change.ticks else ""
             return self.change.order.replace("_", " ") + ticks
         if self.change.link:
             return self.change.after.describe()

@@ -9,6 +9,7 @@ import typer
 from ..files import refuse_existing, write_whole
 from ..reporting import terminal_output as terminal
 from ..reporting.result_text import TextTable
+from ..wording import count_nouns
 from . import options
 from .options import value
 
@@ -174,7 +175,8 @@ def keys_new_command(
     for one in made:
         terminal.print_line(f"{one}: for {one.name}")
     terminal.print_line(
-        f"they are valid for {days} days; use them as in: trilat site {made[0].name} --keys {made[0]} ..."
+        f"they are valid for {count_nouns(days, 'day')}; use them as in: trilat site "
+        f"{made[0].name} --keys {made[0]} ..."
     )
 
 

@@ -8,6 +8,7 @@ import typer
 
 from ..reporting import terminal_output as terminal
 from ..reporting.exports import list_export_formats
+from ..wording import count_nouns
 from . import options
 
 _LOSSY_EXIT_CODE = 3
@@ -137,7 +138,7 @@ def log_export_command(
     with terminal.progress_bar(f"writing {exporter.path}") as progress:
         told = exporter.export(*logs, progress=progress)
     records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
-    told = told or f"{sum(records.values())} records of {', '.join(records)}"
+    told = told or f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
     if as_json:
         terminal.print_json({"file": exporter.path.as_posix(), "format": form, "records": records})
     else:

@@ -15,6 +15,7 @@ from ..net.clock import Clock, SystemClock, make_system_clock
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.result_text import TextTable
+from ..wording import count_nouns
 from . import options
 from .options import flag, seconds, value
 
@@ -361,7 +362,8 @@ def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
         before.append(now)
         rate = (now[1] - then[1]) / (now[0] - then[0]) if now[0] > then[0] else 0.0
         text = (
-            f"{progress.position_ns / 1e9:8.1f} s   x{rate:.2f}   {progress.published} messages   "
+            f"{progress.position_ns / 1e9:8.1f} s   x{rate:.2f}   "
+            f"{count_nouns(progress.published, 'message')}   "
             f"latest {progress.late_max_us / 1e3:.2f} ms late"
         )
         terminal.err.file.write(f"\r{text:<72}")
@@ -395,8 +397,8 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
     terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
     late = outcome.lateness
-    total = f"{sum(outcome.counts.values())} messages in {outcome.took_s:.2f} s"
-    rounds = f", {outcome.rounds} rounds" if outcome.rounds > 1 else ""
+    total = f"{count_nouns(sum(outcome.counts.values()), 'message')} in {outcome.took_s:.2f} s"
+    rounds = f", {count_nouns(outcome.rounds, 'round')}" if outcome.rounds > 1 else ""
     how = f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us" if late else ""
     held = f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
     dropped = "" if outcome.cut else "; none dropped"
@@ -404,7 +406,9 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
     if outcome.recorders:
         has = "has everything" if outcome.stored else "has not confirmed that it has everything"
         given = (
-            f"; {outcome.refilled} messages that it had missed were sent again" if outcome.refilled else ""
+            f"; {count_nouns(outcome.refilled, 'message')} that it had missed were sent again"
+            if outcome.refilled
+            else ""
         )
         terminal.print_text(f"the recorder {has}{given}")
 
@@ -420,12 +424,14 @@ def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
         terminal.print_error(
-            f"a subscriber took nothing for 5 s and was cut off, {outcome.cut} times: it lacks the messages "
+            "a subscriber took nothing for 5 s and was cut off, "
+            f"{count_nouns(outcome.cut, 'time')}: it lacks the messages "
             "that were played then"
         )
     if outcome.strays:
         terminal.print_error(
-            f"{outcome.strays} messages lie more than a minute from their place in the file, and were "
+            f"{count_nouns(outcome.strays, 'message lies', 'messages lie')} more than a "
+            "minute from their place in the file, and were "
             "played late; with a larger --preload they are played in order"
         )
 

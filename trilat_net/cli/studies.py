@@ -18,6 +18,7 @@ import typer
 from ..errors import UsageError
 from ..net.clock import SystemClock
 from ..reporting import terminal_output as terminal
+from ..wording import count_nouns
 from . import options
 from .options import flag, value
 
@@ -202,10 +203,11 @@ def _run_tuning(
         laws = ", ".join(space.law for space in asked.spaces)
         terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
         terminal.print_texts(f"  {line}" for line in describe_procedure(asked))
-        cores = "1 core" if workers == 1 else f"{workers} cores"
+        cores = count_nouns(workers, "core")
         duration = format_wall_time(asked.estimate_s(workers))
         terminal.print_text(
-            f"{asked.runs} runs on {cores}: about {duration} at the present speed of this machine"
+            f"{count_nouns(asked.runs, 'run')} on {cores}: about {duration} at the present "
+            "speed of this machine"
         )
     with terminal.progress_bar("searching") as progress:
         found = asked.run(jobs, progress, on)
@@ -408,7 +410,9 @@ def bench_command(
     if stale:
         terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
     folder = prepare_bench_folder(plan, output)
-    terminal.print_note(f"{len(plan.cells)} cells, {plan.runs} runs, into {folder.path}")
+    terminal.print_note(
+        f"{count_nouns(len(plan.cells), 'cell')}, {count_nouns(plan.runs, 'run')}, into {folder.path}"
+    )
     results = _run(folder, jobs, on, confirm=confirm)
     given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
     words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
@@ -469,7 +473,7 @@ def experiment_run_command(
     begun = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
     with terminal.lines_aside(as_json):
         terminal.print_text(
-            f"{len(begun.plan.trials)} trials, into {begun.folder}; it goes on after Ctrl-C by"
+            f"{count_nouns(len(begun.plan.trials), 'trial')}, into {begun.folder}; it goes on after Ctrl-C by"
         )
         terminal.print_text(f"  trilat experiment run {begun.folder}{' --live' if live else ''}")
         if live:

@@ -14,6 +14,7 @@ import typer
 from ..errors import UsageError
 from ..process import join_words
 from ..reporting import terminal_output as terminal
+from ..wording import count_nouns
 from . import options
 from .options import flag, value
 from .studies import parse_seeds, run_apart, show_progress
@@ -137,7 +138,7 @@ def _run_sweep(
     assert plan is not None
     terminal.print_texts(sweep_results.describe_sweep_plan(plan))
     if begun is not None:
-        terminal.print_text(f"  {len(done)} runs are done already")
+        terminal.print_text(f"  {count_nouns(len(done), 'run is', 'runs are')} done already")
     workers = count_workers(jobs, on)
     expected = sweep_run.estimate_sweep(plan, done, workers)
     if not yes:
@@ -167,7 +168,10 @@ def _run_in_folder(
             return run_sweep(folder, jobs, progress, expected.entries, on)
     except KeyboardInterrupt:
         resume = join_words(["trilat", "sweep", "--resume", str(folder.path)])
-        kept = f"{len(folder.read_done())} runs are done and kept; go on with: {resume}"
+        kept = (
+            f"{count_nouns(len(folder.read_done()), 'run is', 'runs are')} done and "
+            f"kept; go on with: {resume}"
+        )
         terminal.err.print(kept, markup=False, soft_wrap=True)
         raise
 

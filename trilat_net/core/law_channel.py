@@ -9,6 +9,8 @@ the sender's record.
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from ..wording import count_nouns
+
 MAX_SENT = 16
 """Most numbers per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
@@ -121,5 +123,7 @@ def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
     for vector in (vector for channel in channels for vector in channel.vectors):
         other = found.setdefault(vector.name, vector)
         if other.length != vector.length:
-            raise ValueError(f"peers send {vector.name} of {other.length} and of {vector.length} numbers")
+            raise ValueError(
+                f"peers send {vector.name} of {other.length} and of {count_nouns(vector.length, 'number')}"
+            )
     return tuple(found.values())

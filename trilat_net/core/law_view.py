@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..wording import count_nouns
 from . import chain_stages, two_link_stages
 from .jit import bind_leaf, leaf
 from .law_channel import SentVector
@@ -150,7 +151,7 @@ class PlainLaw:
                     values = list(getattr(named, vector.name))
                     if len(values) != vector.length:
                         where = f"sent[{place}]" if per_peer else "to_all"
-                        problem = f"has {len(values)} numbers, not {vector.length}"
+                        problem = f"has {count_nouns(len(values), 'number')}, not {vector.length}"
                         raise ValueError(f"{where}.{vector.name} {problem}")
                     sent += map(float, values)
         return sent

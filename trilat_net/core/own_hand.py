@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ..wording import count_nouns
 from .live_hand import SILENCE_NS, HandCommand, HandMemory, HandRules, HandStep, advance_hand, glide
 from .site_arrays import SiteArrays
 from .site_setup import Layout
@@ -160,7 +161,7 @@ class OwnHand:
         """
         numbers = () if goal is None else tuple(float(one) for one in goal)
         if goal is not None and len(numbers) != self._rules.size:
-            raise ValueError(f"it acts with {len(numbers)} numbers, not {self._rules.size}")
+            raise ValueError(f"it acts with {count_nouns(len(numbers), 'number')}, not {self._rules.size}")
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"it acts with {list(numbers)}, which is not finite")
         if (size := math.hypot(*numbers)) > self._rules.farthest:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import LawFailed
+from ..wording import count_nouns
 from .vectors import Vector
 
 MAX_LAW_MEMORY = 1024
@@ -58,7 +59,7 @@ def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
         if not isinstance(other, list | tuple):
             return NotImplemented  # an array's own arithmetic, and its array
         if len(other) != len(numbers):
-            raise ValueError(f"arithmetic of {len(numbers)} numbers with {len(other)}")
+            raise ValueError(f"arithmetic of {count_nouns(len(numbers), 'number')} with {len(other)}")
         return LawVector(map(operate, numbers, other))
 
     return compute
@@ -195,7 +196,9 @@ def call_law(
     parameters = len(now.theta_hat)
     for name, values, length in (("torque", torque, now.joints), ("theta_hat", estimate, parameters)):
         if len(values) != length:
-            raise _law_error(law, site, now.k, f"{name} has {len(values)} numbers, not {length}")
+            raise _law_error(
+                law, site, now.k, f"{name} has {count_nouns(len(values), 'number')}, not {length}"
+            )
     check_results(law, site, now.k, results)
     return results
 
@@ -216,7 +219,7 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
         LawFailed: with the first of them.
     """
     if (count := len(results.memory)) > MAX_LAW_MEMORY:
-        problem = f"memory has {count} numbers, at most {MAX_LAW_MEMORY} are kept"
+        problem = f"memory has {count_nouns(count, 'number')}, at most {MAX_LAW_MEMORY} are kept"
         raise _law_error(law, site, tick, problem)
     for name, values in zip(results._fields, results, strict=True):
         if not all(map(math.isfinite, values)):

@@ -48,6 +48,7 @@ from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer
 from ..scenario.validate import refuse_external_arms
+from ..wording import count_nouns
 
 
 def _float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
@@ -95,7 +96,8 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     refuse_external_arms(scenario, plants)
     if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
         raise ScenarioError(
-            f"the fastest site makes {ratio} ticks within one of the slowest, at most {MAX_ARRIVALS} "
+            f"the fastest site makes {count_nouns(ratio, 'tick')} within one of the "
+            f"slowest, at most {MAX_ARRIVALS} "
             "are taken",
             path="rate_hz",
             source=scenario.name,

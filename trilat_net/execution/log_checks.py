@@ -15,6 +15,7 @@ from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..scenario.code_consent import find_user_laws
 from ..scenario.imported_code import CodeConsents, allowed_code
+from ..wording import count_nouns
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
@@ -132,7 +133,7 @@ def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress
             yield Finding("plain virtual time", f"is another run: {why}", True)
             return
         late, gone = twins.late, twins.lost
-        came = f"{len(late)} late samples" + (f", the first: {late[0]}" if late else "")
+        came = f"{count_nouns(len(late), 'late sample')}" + (f", the first: {late[0]}" if late else "")
         lost = f"; {len(gone)} lost on the way, the first: {gone[0]}" if gone else ""
         yield _virtual_line(f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from)
 
@@ -154,7 +155,7 @@ def _records_line(log: Log, result: VerifyResult) -> Finding:
 
 def _verify_line(result: VerifyResult, recorded: str) -> Finding:
     how = "whole runs, bit for bit" if result.whole_run else "tick by tick to 1e-9: another platform made it"
-    text = f"{result.identical}/{result.records} records identical ({how})"
+    text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({how})"
     if result.gaps:
         text += f"; no records of {_gaps_text(result.gaps)}"
     if result.absences:
@@ -180,14 +181,14 @@ def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
         if left > 0:
             texts.append(f"{site} {', '.join(ranges[:left])}")
         left -= len(ranges)
-    more = f" and {-left} more ranges, which --json names" if left < 0 else ""
+    more = f" and {count_nouns(-left, 'more range')}, which --json names" if left < 0 else ""
     return "; ".join(texts) + more
 
 
 def _virtual_line(label: str, comparison: RecordComparison, excused_from: int | None) -> Finding:
     """Excuses a difference only from the tick at which the first late or lost sample was due."""
     first = comparison.first
-    text = f"{comparison.identical}/{comparison.records} records identical"
+    text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"
     if first is None:
         return Finding(label, text, True)
     excused = excused_from is not None and first.tick >= excused_from

@@ -37,6 +37,7 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result, finite_or_none
 from ..scenario.code_consent import find_user_laws
+from ..wording import count_nouns
 from .rerun_execution import (
     RerunExecution,
     RerunOverrides,
@@ -392,13 +393,19 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
     for effect in again.sites.values():
         name = effect.site
         if effect.stands:
-            yield f"{name}: {effect.stands} records stand as they are: too little is known to execute them"
+            yield (
+                f"{name}: {count_nouns(effect.stands, 'record')} as before: too little is "
+                "known to execute more"
+            )
         if effect.assumed:
-            yield f"{name}: {effect.assumed} ticks have no record in the log: their arrivals are assumed"
+            yield (
+                f"{name}: {count_nouns(effect.assumed, 'tick has', 'ticks have')} no "
+                "record in the log: the arrivals are assumed"
+            )
         if away := again.before.absent_ticks(name):
             yield f"{name}: {away} of them it did not make: it was away, and is executed as if it were not"
         if effect.lacking:
-            yield f"{name}: {effect.lacking} samples that arrived are not in the log: executed without them"
+            yield f"{name}: {count_nouns(effect.lacking, 'arrival')} not in the log: executed without"
         if not effect.executed:
             yield f"{name}: nothing could be executed"
 

@@ -24,6 +24,7 @@ from ..errors import NotRepeatable, UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
+from ..wording import count_nouns
 from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
 
 PUSH_RAD = 1e-6
@@ -140,7 +141,9 @@ def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: floa
     owners = [n for n, name in enumerate(layouts) if site in (None, name) and counts[n] >= int(number or 1)]
     if not owners or (number and not site):
         each = zip(layouts, joints, estimates, strict=True)
-        there = ", ".join(f"{name} ({n} joints, {m} estimates)" for name, n, m in each)
+        there = ", ".join(
+            f"{name} ({count_nouns(n, 'joint')}, {count_nouns(m, 'estimate')})" for name, n, m in each
+        )
         names = ", ".join(f"{scenario.names[0]}.{one}" for one in ("q1", "qd1", "theta1", "q"))
         raise UsageError(f"--push {target}: no such number; as in {names}, or q, of {there}")
     if not LEAST_PUSH <= abs(size) <= MOST_PUSH:

@@ -49,6 +49,7 @@ from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
+from ..wording import count_nouns
 from .resumption import read_output, take_parts
 from .virtual_network import Network, PromptNetwork
 
@@ -105,7 +106,7 @@ class SiteChannels:
     def end(self, t_ns: int | None = None) -> SiteEntry:
         """Returns the entry of the event that ends the site's run, by default at its last tick."""
         when_ns = self._t_ns if t_ns is None else t_ns
-        return self.new_event("end", f"{self._site} made {self.ticks} ticks", when_ns)
+        return self.new_event("end", f"{self._site} made {count_nouns(self.ticks, 'tick')}", when_ns)
 
     def new_event(self, kind: str, text: str, t_ns: int) -> SiteEntry:
         """Returns the entry of a new event of the site."""

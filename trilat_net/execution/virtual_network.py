@@ -17,6 +17,7 @@ import numpy as np
 from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, TickRecord
 from ..errors import LogError
 from ..log.site_log import SiteLog
+from ..wording import count_nouns
 from .resumption import ArrivalEntry, make_arrival
 
 
@@ -144,7 +145,8 @@ def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[i
         return known
     if 2 * len(at) < ticks:
         raise LogError(
-            f"{part.name} has records of {len(at)} of {ticks} ticks: too few to execute what lies between"
+            f"{part.name} has records of {len(at)} of {count_nouns(ticks, 'tick')}: too few "
+            "to execute what lies between"
         )
     missing = [tick for tick in range(known.first, known.last) if tick not in at]
     assumed: dict[int, list[list[int]]] = {}

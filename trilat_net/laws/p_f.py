@@ -7,6 +7,7 @@ from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
 from ..errors import ScenarioError
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints
+from ..wording import count_nouns
 from .conditions import LawSituation
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
@@ -46,7 +47,8 @@ class PF(ControlLaw):
         """Refuses more sites than two: nobody could tell whose contact is felt."""
         if sites != 2:
             raise ScenarioError(
-                f"p_f reflects the force of one slave to one master, and here are {sites} sites: with more "
+                "p_f reflects the force of one slave to one master, and here are "
+                f"{count_nouns(sites, 'site')}: with more "
                 "of them the contact that a site feels is ambiguous; "
                 "choose p_d, pd_d or adaptive, or two sites",
                 path=f"{path}.law",
@@ -63,7 +65,8 @@ class PF(ControlLaw):
             return ""
         masters = roles.count("master")
         return (
-            f"reflects force between one master and one slave; this has {len(roles)} sites, {masters} of "
+            "reflects force between one master and one slave; this has "
+            f"{count_nouns(len(roles), 'site')}, {masters} of "
             "them masters: leave p_f out, or take contact"
         )
 

@@ -19,6 +19,7 @@ from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..core.site_setup import Layout
 from ..errors import ScenarioError
 from ..fields import Frozen, reword_problem
+from ..wording import count_nouns
 
 
 class SentVectorSpec(Frozen, frozen=True):
@@ -68,12 +69,16 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
             continue
         raise ScenarioError(problem, path=f"{path}.sends.{name}")
     if (count := channel.received) > (most := MAX_SENT * joints):
-        problem = f"sends {count} numbers to each peer, and at most {most} are taken, {MAX_SENT} per joint"
+        problem = (
+            f"sends {count_nouns(count, 'number')} to each peer, and at most {most} "
+            f"are taken, {MAX_SENT} per joint"
+        )
         raise ScenarioError(problem, path=f"{path}.sends")
     if channel.floats > MAX_RECORD_SENT:
         count, most = channel.floats, MAX_RECORD_SENT
         problem = (
-            f"sends {count} numbers to {channel.peers} peers together, and a record holds at most {most}"
+            f"sends {count_nouns(count, 'number')} to "
+            f"{count_nouns(channel.peers, 'peer')} together, and a record holds at most {most}"
         )
         raise ScenarioError(problem, path=f"{path}.sends")
 

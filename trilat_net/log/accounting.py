@@ -19,6 +19,7 @@ from ..net.messages import READABLE, Event
 from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
+from ..wording import count_nouns
 from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 
@@ -190,7 +191,7 @@ class Account:
         named = f" ({' '.join(gaps)}{' ...' if len(self._gaps) > len(gaps) else ''})" if gaps else ""
         silence = f", longest silence {self.silence_ns / 1e6:.1f} ms" if self.silence_ns else ""
         unmade = f", not made {self.unmade}" if self.unmade else ""
-        starts = f", of {len(before) + 1} starts" if before else ""
+        starts = f", of {count_nouns(len(before) + 1, 'start')}" if before else ""
         return (
             ", ".join(f"{name} {count}" for name, count in counts.items())
             + f", largest gap {self.largest_gap}{named}{silence}{unmade}{starts}"
@@ -270,9 +271,10 @@ class Coverage(NamedTuple):
     def __str__(self) -> str:
         lacking = {site: n for site in self.expected if (n := self._share(site)) < 1.0}
         if not lacking:
-            return f"all {sum(self.expected.values())} ticks"
+            return f"all {count_nouns(sum(self.expected.values()), 'tick')}"
         return ", ".join(
-            f"{site} {self.judged.get(site, 0)} of {self.expected[site]} ticks ({_percent(share)})"
+            f"{site} {self.judged.get(site, 0)} of "
+            f"{count_nouns(self.expected[site], 'tick')} ({_percent(share)})"
             for site, share in lacking.items()
         )
 
@@ -451,7 +453,10 @@ class SessionAccounts:
             if account is not None and account.missing:
                 gaps = account.gap_texts(SHOWN_GAPS, self._bases.get(topic, 0))
                 more = " ..." if len(account.gaps) > len(gaps) else ""
-                yield f"{site}: {account.missing} of {account.expected} records: {' '.join(gaps)}{more}"
+                yield (
+                    f"{site}: {account.missing} of "
+                    f"{count_nouns(account.expected, 'record')}: {' '.join(gaps)}{more}"
+                )
 
     @property
     def unknown_ends(self) -> list[str]:
@@ -465,8 +470,11 @@ class SessionAccounts:
             account = self._accounts.get(topic)
             count = 0 if account is None else self._bases.get(topic, 0) + account.expected
             if count < self._ticks[site]:
-                last = f"tick {count - 1}" if count else "none"
-                yield f"{site}: its end is unknown; its last record is {last}, of {self._ticks[site]} ticks"
+                last = (f"tick {count - 1}") if count else "none"
+                yield (
+                    f"{site}: its end is unknown; its last record is {last}, of "
+                    f"{count_nouns(self._ticks[site], 'tick')}"
+                )
 
 
 def open_session_accounts(

@@ -20,6 +20,7 @@ from ..errors import LogRefused, UsageError
 from ..files import publish_file, refuse_existing, sync_folder
 from ..net import topics
 from ..net.clock import SystemClock
+from ..wording import count_nouns
 from .log_layout import active_path
 from .mcap_records import MAGIC
 
@@ -323,4 +324,7 @@ def _describe_content(path: Path) -> str:
     counts = summary.statistics.channel_message_counts
     topic = {number: channel.topic for number, channel in summary.channels.items()}
     records = sum(count for n, count in counts.items() if topic[n].endswith(f"/{topics.STATE}"))
-    return f"{records} records and {summary.statistics.message_count - records} other messages"
+    return (
+        f"{count_nouns(records, 'record')} and "
+        f"{count_nouns(summary.statistics.message_count - records, 'other message')}"
+    )

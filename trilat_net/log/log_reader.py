@@ -38,6 +38,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.sample_uses import PictureDelay
+from ..wording import count_nouns
 from .accounting import LAST, SessionAccounts, describe_unknown_ends
 from .data_tables import (
     EVENTS_TABLE,
@@ -116,7 +117,7 @@ class Log(Result, Mapping[str, SiteLog]):
             seconds = max((float(self[name].t_s[-1]) for name in self.sites if len(self[name])), default=0.0)
             records = sum(len(self[name]) for name in self.sites)
             missing = sum(map(self.missing, self.sites)) or "none"
-            holds = f"{seconds:.3f} s, {records} records, {missing} missing"
+            holds = f"{seconds:.3f} s, {count_nouns(records, 'record')}, {missing} missing"
             holds += f"; {describe_unknown_ends(self.unknown_ends)}" if self.unknown_ends else ""
             holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
         except LogError:
@@ -191,7 +192,7 @@ class Log(Result, Mapping[str, SiteLog]):
         if problem:
             lost = len(channel.payloads) - len(messages)
             self.unreadable.append(
-                f"{self.source}: {lost} messages on {topic} cannot be read: {problem[:200]}"
+                f"{self.source}: {count_nouns(lost, 'message')} on {topic} cannot be read: {problem[:200]}"
             )
             self._contents.channels[topic] = readable
             self._contents.complete = False

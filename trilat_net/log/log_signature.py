@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from ..errors import LogError, UsageError
 from ..files import find_rights_of_others, open_regular, reading, refuse_existing, write_whole
+from ..wording import count_nouns
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
@@ -120,7 +121,7 @@ def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress |
     for path in paths:
         if problem := _find_problem(path, key, progress):
             found.add(str(path), None, problem)
-    files = "file is" if len(paths) == 1 else f"{len(paths)} files are"
+    files = "file is" if len(paths) == 1 else count_nouns(len(paths), "file is", "files are")
     return found.tell(f"the {files} as the owner of {key_file} signed")
 
 
@@ -145,7 +146,10 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
         return f"{file} was not made by the owner of this key, or was changed"
     integrity, chain = _read_chain(path, progress)
     if chain != stated.chain:
-        return f"what was signed is another content ({stated.chain.get('messages', '?')} messages)"
+        return (
+            "what was signed is another content "
+            f"({count_nouns(stated.chain.get('messages', '?'), 'message')})"
+        )
     return "" if integrity.state is DigestState.INTACT else integrity.text
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from ..wording import count_nouns
 from . import mcap_records
 from .findings import Findings
 
@@ -147,7 +148,7 @@ class FileCheck:
         body = content[_INDEX_HEAD_BYTES:]
         if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
             raise mcap_records.UnreadableRecord(
-                f"a message index of {len(body)} bytes says that it has {length}"
+                f"a message index of {count_nouns(len(body), 'byte')} says that it has {length}"
             )
         self._indexes[channel] = frame.offset
         if not np.array_equal(_sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))):
@@ -165,7 +166,11 @@ class FileCheck:
         if scanner.torn is not None:
             self._add("whole", scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
         elif scanner.finished and 0 < self._end < scanner.size:
-            self._add("whole", self._end, f"{scanner.size - self._end} bytes follow the end mark")
+            self._add(
+                "whole",
+                self._end,
+                f"{count_nouns(scanner.size - self._end, 'byte follows', 'bytes follow')} the end mark",
+            )
         if scanner.finished and not scanner.damaged:
             self._compare_end()
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import LogError
 from ..net import topics
+from ..wording import count_nouns
 from . import mcap_records
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .running_digest import DIGESTS, Integrity, RunningDigest
@@ -283,7 +284,8 @@ class McapReader:
         self._room -= amount
         if self._room < 0:
             raise LogError(
-                f"{self._source}: holds absurdly much for a file of {self.size} bytes: up to byte "
+                f"{self._source}: holds absurdly much for a file of "
+                f"{count_nouns(self.size, 'byte')}: up to byte "
                 f"{frame.end} alone it would take more than {KEPT_RATIO} times that in memory, and more than "
                 f"{KEPT_BYTES >> 20} MiB"
             )

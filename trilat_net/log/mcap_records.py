@@ -24,6 +24,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from ..wording import count_nouns
+
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""
 RECORD_HEAD = struct.Struct("<BQ")
@@ -86,7 +88,9 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
         raise UnreadableRecord("a chunk has no head") from None
     data_offset = _FIXED_HEAD.size + letters + _SIZE.size
     if data_offset + packed != length:
-        raise UnreadableRecord(f"a chunk of {length} bytes says that it has {data_offset + packed}")
+        raise UnreadableRecord(
+            f"a chunk of {count_nouns(length, 'byte')} says that it has {data_offset + packed}"
+        )
     return ChunkHead(start_ns, end_ns, size, crc, compression, data_offset)
 
 
@@ -95,11 +99,11 @@ def unpack_chunk(content: bytes) -> bytes:
     head = parse_chunk_head(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
-        text = f"a chunk says that it unpacks to {head.size} bytes, at most {limit} are taken"
+        text = f"a chunk says that it unpacks to {count_nouns(head.size, 'byte')}, at most {limit} are taken"
         raise UnreadableRecord(text)
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
-        raise UnreadableRecord(f"a chunk of {head.size} bytes unpacks to {len(data)}")
+        raise UnreadableRecord(f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {len(data)}")
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableRecord("a chunk's CRC differs")
     return data
@@ -110,7 +114,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
         if head.compression == "zstd":
             declared = zstandard.get_frame_parameters(data).content_size
             if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):  # the library would believe it
-                raise UnreadableRecord(f"a chunk of {head.size} bytes unpacks to {declared}")
+                raise UnreadableRecord(f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}")
             return zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompress(data, head.size)
         if head.compression == "lz4":
             # one byte more, so that one that is too long shows
@@ -164,7 +168,7 @@ class Damage(NamedTuple):
     problem: str
 
     def __str__(self) -> str:
-        return f"{self.length} bytes from byte {self.offset} on: {self.problem}"
+        return f"{count_nouns(self.length, 'byte')} from byte {self.offset} on: {self.problem}"
 
 
 class RecordScanner:
@@ -209,7 +213,9 @@ class RecordScanner:
                 if frame.opcode == Opcode.CHUNK:
                     self.head(frame)
                 elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != FOOTER_BYTES:
-                    raise UnreadableRecord(f"a record (footer) of {frame.length} bytes is none")
+                    raise UnreadableRecord(
+                        f"a record (footer) of {count_nouns(frame.length, 'byte')} is none"
+                    )
             except UnreadableRecord as error:
                 # the length of the record before may be what is wrong: search what it hid, too
                 found = self._resume(sure, offset, str(error))
@@ -251,7 +257,9 @@ class RecordScanner:
             raise UnreadableRecord("there is no record")
         if length > self.size - offset - RECORD_HEAD_BYTES:
             name = _opcode_name(opcode)
-            raise UnreadableRecord(f"a record ({name}) of {length} bytes reaches beyond the end of the file")
+            raise UnreadableRecord(
+                f"a record ({name}) of {count_nouns(length, 'byte')} reaches beyond the end of the file"
+            )
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:

@@ -25,6 +25,7 @@ from ..net import topics
 from ..net.messages import VERSION, json_schema
 from ..results import Result
 from ..scenario import parse_embedded
+from ..wording import count_nouns
 from . import mcap_records
 from .accounting import Coverage, SessionAccounts, open_session_accounts, parse_counts
 from .content_check import ContentCheck
@@ -266,7 +267,9 @@ class _FileCopy:
         try:
             self._take(frame, content, data)
         except UnreadableRecord as error:
-            self._result.lose(f"{frame.size} bytes at byte {frame.offset}: {error}", frame.size)
+            self._result.lose(
+                f"{count_nouns(frame.size, 'byte')} at byte {frame.offset}: {error}", frame.size
+            )
 
     def _report_damaged(self) -> None:
         for damage in self._scanner.damaged[self._reported :]:
@@ -471,8 +474,9 @@ class _FileCopy:
         self._result.salvaged = self._out.messages - before
         why = f" before {problem}" if problem else ""
         self._result.lose(
-            f"the end of a chunk that was cut off at byte {torn.offset}; of its {torn.length} bytes "
-            f"{self._result.salvaged} messages could be saved{why}",
+            f"the end of a chunk that was cut off at byte {torn.offset}; of its "
+            f"{count_nouns(torn.length, 'byte')} "
+            f"{count_nouns(self._result.salvaged, 'message')} could be saved{why}",
             torn.length,
         )
 
@@ -491,7 +495,7 @@ class _FileCopy:
     def _report_unnamed(self) -> None:
         result, stated = self._result, self._survey.count
         for number, count in self._unnamed.items():
-            result.lose(f"{count} messages of channel {number}, which no record names")
+            result.lose(f"{count_nouns(count, 'message')} of channel {number}, which no record names")
         for topic in self._bare:
             result.lose(f"the schema of {topic}")
         for topic in self._misnamed:
@@ -509,7 +513,9 @@ class _FileCopy:
                 f"that was run stands beside the log as {SCENARIO}, recover puts it in"
             )
         if stated is not None and self._out.messages < stated and result.lossless:
-            result.lose(f"{stated - self._out.messages} of the {stated} messages that it says it has")
+            result.lose(
+                f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"
+            )
 
     def _finish(self) -> None:
         result, accounts = self._result, self._accounts

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
+from ..wording import count_nouns
 from .log_layout import SESSION
 
 DIGESTS = "trilat.chain"
@@ -92,7 +93,10 @@ class RunningDigest:
         found = self.facts()
         if found == dict(stated):
             since = f", since it was recovered from {recovered['from']}" if "from" in recovered else ""
-            agrees = f"the digest chain agrees over {self.messages} messages and all metadata{since}"
+            agrees = (
+                f"the digest chain agrees over {count_nouns(self.messages, 'message')} "
+                f"and all metadata{since}"
+            )
             return Integrity(DigestState.INTACT, agrees)
         if damaged and stated.get("about") == found["about"] and stated.get("messages") != found["messages"]:
             return Integrity(DigestState.OPEN, "its digest chain cannot be compared: the file is damaged")

@@ -23,6 +23,7 @@ from ..net import messages, topics
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
+from ..wording import count_nouns
 from .accounting import Account, SessionAccounts, describe_unknown_ends, parse_counts
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (
@@ -373,7 +374,9 @@ class SessionCheck:
         messages, chunks = counts["messages"], counts["chunks"]
         yield found["whole"].tell(f"finished, {counts['bytes'] / 1e6:.1f} MB")
         yield found["checksums"].tell(f"{counts['crcs']} compared, all agree")
-        yield found["records"].tell(f"{messages} messages in {chunks} chunks, built as the format says")
+        yield found["records"].tell(
+            f"{count_nouns(messages, 'message')} in {count_nouns(chunks, 'chunk')}, built as the format says"
+        )
         yield found["index"].tell("is what is there")
         if not self.ours:
             if "chain" in found:
@@ -383,7 +386,7 @@ class SessionCheck:
         yield self._check_accounts()
         yield found["chain"].tell(self._chain_text)
         kinds = f"every message is one of version {self._version}"
-        views = f", and {self._views} views" if self._views else ""
+        views = f", and {count_nouns(self._views, 'view')}" if self._views else ""
         yield found["schema"].tell(kinds + views)
         yield found["times"].tell("log times never go back, publish times are the senders'")
         yield self._check_rates()
@@ -402,7 +405,7 @@ class SessionCheck:
                 gaps.append(f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}")
             reordered += sum(account.reordered for account in self._counted.list_starts(topic))
         received = sum(check.received for check in self.channels.values())
-        text = f"{received} messages of {len(self.channels)} channels"
+        text = f"{count_nouns(received, 'message')} of {count_nouns(len(self.channels), 'channel')}"
         if missing:
             text += f", {missing} missing in {len(gaps)} range{'s' * (len(gaps) > 1)}"
         elif finding.passed:
@@ -498,4 +501,4 @@ def _find_unexplained(log: Log, site: str) -> str:
     counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
     if inner <= max([stated.get("missing", 0), *counts]):
         return ""
-    return f"{inner} records of {site} are missing in between, and nothing in the log explains it"
+    return f"missing in between: {count_nouns(inner, 'record')} of {site}, and nothing in the log explains it"

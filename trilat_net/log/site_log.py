@@ -22,6 +22,7 @@ from ..errors import LogError, WireError
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..scenario.run_changes import count_skipped_ticks
+from ..wording import count_nouns
 from . import record_columns
 from .orientations import align_signs, find_quaternions, split_quaternions
 from .record_columns import Ints
@@ -233,7 +234,9 @@ class SiteLog:
         if not len(self):
             return f"<{self.name}: no records>"
         first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
-        records = f"{len(self)} records of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
+        records = (
+            f"{count_nouns(len(self), 'record')} of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
+        )
         return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
 
     def _repr_html_(self) -> str:
@@ -268,7 +271,7 @@ class SiteLog:
             rows = np.array([row[first : first + count] for row in self.mem], dtype=np.float64)
             return rows.reshape(len(self), count)
         except ValueError:  # they are of several lengths, or too short
-            needed = f"{first + count} numbers in `mem`"
+            needed = f"{count_nouns(first + count, 'number')} in `mem`"
             raise LogError(f"{self._source}: a record of {self.name} does not have {needed}") from None
 
     def record(self, n: int) -> State:

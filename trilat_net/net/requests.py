@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
+from ..wording import count_nouns
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64
@@ -124,7 +125,7 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
-            raise ValueError(f"tau_x must be {len(self.q)} finite numbers, as q is")
+            raise ValueError(f"tau_x must be {count_nouns(len(self.q), 'finite number')}, as q is")
 
 
 class ArmEnable(Request, frozen=True, kw_only=True):

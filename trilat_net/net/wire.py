@@ -20,6 +20,7 @@ from ..core.chain import MAX_JOINTS
 from ..core.site_setup import Layout
 from ..core.ticks import Arrival, TickRecord
 from ..errors import WireError
+from ..wording import count_nouns
 from .messages import (
     MODE_WORDS,
     STATE_VECTORS,
@@ -165,7 +166,7 @@ def split_states(block: bytes) -> Iterator[bytes]:
         WireError: the block is oversized, or ends in the middle of a record.
     """
     if len(block) > MAX_BYTES:
-        raise WireError("oversized", f"{len(block)} bytes, at most {MAX_BYTES}")
+        raise WireError("oversized", f"{count_nouns(len(block), 'byte')}, at most {MAX_BYTES}")
     unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
     unpacker.feed(block)
     start = 0
@@ -213,7 +214,7 @@ def make_decoder(
 
     def read(payload: bytes) -> Any:
         if len(payload) > limit:
-            raise WireError("oversized", f"{len(payload)} bytes, at most {limit}")
+            raise WireError("oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}")
         try:
             message: Any = parse(payload)
         except (ValueError, RecursionError) as error:
@@ -252,5 +253,5 @@ def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) ->
     for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
         if (count := len(vector)) != length:
             joints = name == "q" and 1 <= count <= MAX_JOINTS  # so that reasons are few
-            reason = f"of {count} joints; the scenario has {length}" if joints else "malformed"
-            raise WireError(reason, f"{name} has {count} numbers, not {length}")
+            reason = f"of {count_nouns(count, 'joint')}; the scenario has {length}" if joints else "malformed"
+            raise WireError(reason, f"{name} has {count_nouns(count, 'number')}, not {length}")

@@ -29,6 +29,7 @@ from typing import Any, Literal, NamedTuple
 
 from ..errors import UsageError
 from ..files import open_regular
+from ..wording import count_nouns
 from . import topics
 
 LEASE_MS = 5_000
@@ -239,7 +240,7 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
     """Returns the problems of a file in one line."""
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
-    return f"{source}: {len(problems)} settings cannot be taken: {'; '.join(problems)}"
+    return f"{source}: {count_nouns(len(problems), 'setting')} cannot be taken: {'; '.join(problems)}"
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from ..analysis.certificate.stability_certificate import Certificate, StabilityF
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
+from ..wording import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
@@ -138,7 +139,7 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     links = {name: x for name, x in balance.work.items() if "->" in name}
     given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
-        links = {f"{len(links)} links": np.sum(list(links.values()), axis=0)}
+        links = {f"{count_nouns(len(links), 'link')}": np.sum(list(links.values()), axis=0)}
     gained, lost = sum(balance.work.values()), sum(balance.dissipation.values())
     rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
     entries = {

@@ -15,6 +15,7 @@ from ..theory.linear_edge import EdgeScan
 from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
 from ..theory.port_response import QUOTED_AT_HZ, Transparency
+from ..wording import count_nouns
 from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
@@ -194,7 +195,7 @@ def _describe_passivity(one: Passivity, unit: str = "", kind: str = "") -> str:
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
     shown = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_SHOWN_BANDS]]
-    more = f" and {len(bands) - _SHOWN_BANDS} ranges more" if len(bands) > _SHOWN_BANDS else ""
+    more = f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more" if len(bands) > _SHOWN_BANDS else ""
     return f"at {', '.join(shown)} Hz{more}"
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from ..analysis.file_overview import FileOverview
 from ..log.accounting import describe_unknown_ends
 from ..results import JsonObject
+from ..wording import count_nouns
 from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
@@ -118,7 +119,9 @@ def _compose_channels(channels: dict[str, JsonObject], session: JsonObject | Non
     for topic, channel in channels.items():
         if gaps := channel["gaps"]:
             words = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in gaps[:_MOST_GAPS])
-            more = f" and {len(gaps) - _MOST_GAPS} more ranges" if len(gaps) > _MOST_GAPS else ""
+            more = (
+                f" and {count_nouns(len(gaps) - _MOST_GAPS, 'more range')}" if len(gaps) > _MOST_GAPS else ""
+            )
             yield f"{topic.removeprefix(prefix)} lacks {words}{more}"
 
 
@@ -131,7 +134,9 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
         return
     faulty = {topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic}
     if len(accounts) > len(faulty):
-        yield f"the recorder accounts for {len(accounts) - len(faulty)} channels without a fault"
+        yield (
+            f"the recorder accounts for {count_nouns(len(accounts) - len(faulty), 'channel')} without a fault"
+        )
     for topic, text in faulty.items():
         yield f"{topic.removeprefix(prefix)}: {sanitize(text)}"
 
@@ -151,14 +156,19 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
-    chunks = ", ".join(f"{count} chunks {name}" for name, count in file["compression"].items()) or "no chunks"
+    chunks = (
+        ", ".join(f"{count_nouns(count, 'chunk')} {name}" for name, count in file["compression"].items())
+        or "no chunks"
+    )
     ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
     end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
     part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
     size = _size(file["size_bytes"])
     yield from _rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
     for damage in file["damaged"][:_MOST_GAPS]:
-        yield from _rows(("", f"byte {damage['offset']}, {damage['length']} bytes: {damage['problem']}"))
+        yield from _rows(
+            ("", f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}: {damage['problem']}")
+        )
 
 
 def _counts(channel: JsonObject) -> tuple[int, str | None, str]:

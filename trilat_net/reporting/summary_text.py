@@ -22,6 +22,7 @@ from ..log.log_reader import Log
 from ..log.recover import Recovery
 from ..log.session_check import LogCheckResult
 from ..results import Result
+from ..wording import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
@@ -124,7 +125,7 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
     first, *later = states
     words = [first.link.describe()]
     if len(later) > 2:
-        words.append(f"{len(later) - 1} changes")
+        words.append(f"{count_nouns(len(later) - 1, 'change')}")
         later = later[-1:]
     words += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
     return ", then ".join(words)
@@ -137,7 +138,7 @@ def format_clock(use: link_summary.ClockSummary) -> str:
     if use.drift_ppm is not None:
         words.append(f"drift {use.drift_ppm:+.2f} ppm")
     if use.faults:
-        words.append(f"{use.faults} samples came before they were sent: a clock has stepped")
+        words.append(f"{count_nouns(use.faults, 'sample')} came before being sent: a clock has stepped")
     return ", ".join(words)
 
 

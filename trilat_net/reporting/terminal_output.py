@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from ..process import join_words
+from ..wording import count_nouns
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
@@ -242,7 +243,8 @@ def warn_if_unfinished(path: Path) -> None:
         survey = RecoverySurvey(scanner)
     if scanner.finished:
         print_note(
-            f"{path}: was finished, and {scanner.trailing} bytes follow its end mark, which other "
+            f"{path}: was finished, and "
+            f"{count_nouns(scanner.trailing, 'byte follows', 'bytes follow')} its end mark, which other "
             f"programs may refuse; make a file without them with: trilat log recover {path}"
         )
     elif survey.why_empty:

@@ -31,6 +31,7 @@ from ..core.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, T
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError
+from ..wording import count_nouns
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 
@@ -411,7 +412,10 @@ def _place_base(
 
 def _chain_model(arm: Arm, task: Task, read: UrdfChain) -> ArmModel:
     if len(arm.armature_kg_m2) not in (1, len(read.joints)):
-        problem = f"has {len(arm.armature_kg_m2)} numbers, and the arm has {len(read.joints)} joints"
+        problem = (
+            f"has {count_nouns(len(arm.armature_kg_m2), 'number')}, "
+            f"and the arm has {count_nouns(len(read.joints), 'joint')}"
+        )
         raise ScenarioError(problem, path="armature_kg_m2")
     armature = np.broadcast_to(arm.armature_kg_m2, len(read.joints)).tolist()
     joints = tuple(

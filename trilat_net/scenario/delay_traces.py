@@ -31,6 +31,7 @@ from ..core.vectors import Array, Points
 from ..errors import ScenarioError, UsageError
 from ..files import decode_text, open_regular
 from ..results import Result
+from ..wording import count_nouns
 from .ping_output import read_ping
 
 MAX_TRACE_POINTS = 200_000
@@ -99,7 +100,9 @@ def format_trace(rows: Sequence[TracePoint]) -> str:
     if not rows:
         raise ValueError("has no points")
     if len(rows) > MAX_TRACE_POINTS:
-        raise ValueError(f"has {len(rows)} points, at most {MAX_TRACE_POINTS} are taken: cut or thin it out")
+        raise ValueError(
+            f"has {count_nouns(len(rows), 'point')}, at most {MAX_TRACE_POINTS} are taken: cut or thin it out"
+        )
     before_us = -1
     points = []
     for number, (t_s, delay_ms) in enumerate(rows, start=1):
@@ -210,7 +213,7 @@ class MeasuredTrace(Result):
         """Returns the lines of its text."""
         facts = self.to_dict()
         lost = f"{facts['lost_percent']:.2f} % lost, {facts['lost_in_a_row']:.1f} in a row"
-        lines = [f"{facts['samples']} samples in {facts['span_s']:.1f} s, {lost}"]
+        lines = [f"{count_nouns(facts['samples'], 'sample')} in {facts['span_s']:.1f} s, {lost}"]
         if "min_ms" in facts:
             shown = ("min", "p50", "mean", "p99", "max", "deviation")
             lines.append("delay, ms: " + ", ".join(f"{name} {facts[f'{name}_ms']:.2f}" for name in shown))

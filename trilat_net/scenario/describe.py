@@ -19,6 +19,7 @@ from ..core.philox import link_key
 from ..core.vectors import Array
 from ..laws.conditions import LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
+from ..wording import count_nouns
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .rest_bounds import find_rest_bounds
@@ -111,7 +112,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
     return [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
         f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
-        + ", ".join(f"{scenario.ticks(name)} ticks of {name}" for name in scenario.names),
+        + ", ".join(f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names),
         *(links if len(set(words.values())) > 1 else [f"every link: {next(iter(words.values()))}"]),
         *(f"view of {name}: {one.view.describe()}" for name, one in scenario.sites.items() if one.view),
         f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
@@ -138,8 +139,8 @@ def _describe_arms(scenario: Scenario) -> list[str]:
         chain, model = read_arm(arm, scenario.urdf), scenario.arms[owners[0]]
         mass = sum(joint.inertia[0] for joint in chain.joints)
         lines.append(
-            f"arm of {', '.join(owners)}: {arm.urdf}, {len(chain.joints)} joints from {chain.base} to "
-            f"{chain.tip}, {mass:.4g} kg move"
+            f"arm of {', '.join(owners)}: {arm.urdf}, {count_nouns(len(chain.joints), 'joint')} "
+            f"from {chain.base} to {chain.tip}, {mass:.4g} kg move"
         )
         assert model.chain is not None
         for joint, drive in zip(chain.joints, model.chain.joints, strict=True):

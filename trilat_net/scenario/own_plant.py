@@ -20,6 +20,7 @@ from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError
 from ..fields import Frozen, is_number
 from ..laws.interface import make_instance
+from ..wording import count_nouns
 from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
 
 if TYPE_CHECKING:
@@ -157,7 +158,10 @@ class PlantPlayer:
         found = self._ask(tick, lambda: self._step(tau))
         for name, vector in zip(("q", "qd", "tau_x"), found, strict=False):
             if len(vector) != len(tau):
-                problem = f"{name} has {len(vector)} numbers, and the arm has {len(tau)} joints"
+                problem = (
+                    f"{name} has {count_nouns(len(vector), 'number')}, and the arm "
+                    f"has {count_nouns(len(tau), 'joint')}"
+                )
                 raise self._failed(tick, problem)
             if not all(map(math.isfinite, vector)):
                 raise self._failed(tick, f"{name} is {vector}, which is not finite")
@@ -173,7 +177,9 @@ class PlantPlayer:
             return []
         poses = [[float(one) for one in pose] for pose in self._program.poses()]
         if [len(pose) for pose in poses] != [7] * self._bodies:
-            raise ValueError(f"poses() is {poses}, not seven numbers for each of {self._bodies} bodies")
+            raise ValueError(
+                f"poses() is {poses}, not seven numbers for each of {count_nouns(self._bodies, 'body')}"
+            )
         if not all(math.isfinite(one) for pose in poses for one in pose):
             raise ValueError(f"poses() is {poses}, which is not finite")
         return [one for pose in poses for one in pose]

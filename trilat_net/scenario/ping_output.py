@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from ..core.vectors import Array
 
+from ..wording import count_nouns
+
 _SEQUENCE_NUMBERS = 2**16
 """After so many probes `ping` counts from 0 again."""
 _MOST_PROBES = 2**24
@@ -182,7 +184,7 @@ def _arrange_probes(
         if highest >= end:
             raise ValueError(f"its summary counts {sent} packets, but its lines reach number {highest}")
         if received > len(answers):
-            text = f"its summary counts {received} answers, but its lines have {len(answers)}"
+            text = f"its summary counts {count_nouns(received, 'answer')}, but its lines have {len(answers)}"
             raise ValueError(f"{text}: it was printed with -q, or lines are missing")
     if end - begin > _MOST_PROBES:
         raise ValueError(f"its summary counts {end - begin} packets, at most {_MOST_PROBES} are read")

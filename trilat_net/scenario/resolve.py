@@ -36,6 +36,7 @@ from ..fields import (
 )
 from ..files import open_regular
 from ..laws.sent_vectors import read_sends
+from ..wording import count_nouns
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
@@ -215,7 +216,9 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
             own = check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}")
             groups[name][group] = own if "urdf" in own else _join_group(tables.get(group, {}), own)
     if len(written) > MAX_SITES:
-        raise ScenarioError(f"has {len(written)} sites, at most {MAX_SITES} are taken", path="sites")
+        raise ScenarioError(
+            f"has {count_nouns(len(written), 'site')}, at most {MAX_SITES} are taken", path="sites"
+        )
     if len(written) < 2:
         raise ScenarioError(
             f"an experiment has at least two sites, this one has {len(written)}", path="sites"
@@ -378,11 +381,13 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
         if found := find_count_problem(table, kind, counts):
             raise ScenarioError(found.problem, path=f"{place}.{found.key}")
     for key, value in site["limits"].items():
-        wanted, owner = counts.joints, f"the arm has {counts.joints} joints"
+        wanted, owner = counts.joints, f"the arm has {count_nouns(counts.joints, 'joint')}"
         if key == "qd_des_limit_rad_s":
-            wanted, owner = counts.shared, f"sites share {counts.shared} coordinates"
+            wanted, owner = counts.shared, f"sites share {count_nouns(counts.shared, 'coordinate')}"
         if isinstance(value, list) and len(value) != wanted:
-            raise ScenarioError(f"has {len(value)} numbers, and {owner}", path=f"{path}.limits.{key}")
+            raise ScenarioError(
+                f"has {count_nouns(len(value), 'number')}, and {owner}", path=f"{path}.limits.{key}"
+            )
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:

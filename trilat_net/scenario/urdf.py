@@ -28,6 +28,7 @@ from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
 from ..core.elementary import sincos
 from ..errors import ScenarioError
 from ..fields import MAX_QUANTITY, suggest_nearest
+from ..wording import count_nouns
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000
@@ -276,7 +277,7 @@ def _list_names(names: Sequence[str]) -> str:
 
 def _parse_xml(text: str) -> Element:
     if len(text) > MAX_CHARACTERS:
-        _refuse("", f"has {len(text)} characters, at most {MAX_CHARACTERS} are read")
+        _refuse("", f"has {count_nouns(len(text), 'character')}, at most {MAX_CHARACTERS} are read")
     for word in ("<!DOCTYPE", "<!ENTITY"):
         if word in text:
             line = text.count("\n", 0, text.index(word)) + 1
@@ -409,7 +410,8 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
     if not 1 <= moving <= MAX_JOINTS:
         _refuse(
             f"base {_link(base)}, tip {_link(tip)}",
-            f"{moving} joints move between them, must be 1 to {MAX_JOINTS}: name others",
+            f"{count_nouns(moving, 'joint moves', 'joints move')} between them, must be 1 "
+            f"to {MAX_JOINTS}: name others",
         )
     return path[::-1]
 
@@ -595,7 +597,7 @@ def _parse_number(word: str, what: str, place: str, most: float) -> float:
 def _read_vector(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> Three:
     words = element.get(key, "").split()
     if len(words) != 3:
-        _refuse(place, f"its <{element.tag} {key}> has {len(words)} numbers, must have three")
+        _refuse(place, f"its <{element.tag} {key}> has {count_nouns(len(words), 'number')}, must have three")
     x, y, z = (_parse_number(word, f"{element.tag} {key}", place, most) for word in words)
     return x, y, z
 

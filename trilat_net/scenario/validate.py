@@ -18,6 +18,7 @@ from ..errors import ScenarioError
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
 from ..laws.sent_vectors import check_sends
+from ..wording import count_nouns
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase
@@ -224,7 +225,8 @@ def _check_joint_space(scenario: Scenario) -> None:
             )
         if spaces[name] == "joints" and joints != counts[first]:
             raise ScenarioError(
-                f"its arm has {joints} joints, and that of {first} has {counts[first]}: joint angles are "
+                f"its arm has {count_nouns(joints, 'joint')}, and that of {first} has "
+                f"{counts[first]}: joint angles are "
                 "compared one by one, so all arms need as many joints, or a task (task.space)",
                 path=f"sites.{name}.arm",
             )
@@ -285,7 +287,8 @@ def _check_received(scenario: Scenario) -> None:
                 first, other = lengths.setdefault(name, (peer, length))
                 if other != length:
                     raise ScenarioError(
-                        f"has {length} numbers, and {name} of {first} has {other}; {site} gets both: give "
+                        f"has {count_nouns(length, 'number')}, and {name} of {first} has "
+                        f"{other}; {site} gets both: give "
                         "them one length or two names",
                         path=f"sites.{peer}.control.sends.{name}",
                     )
@@ -369,7 +372,9 @@ def _check_task_poses(scenario: Scenario) -> None:
                 )
         if len(followed) > joints:
             raise ScenarioError(
-                f"follows {', '.join(followed)} with {joints} joints: name at most {joints} axes", path=path
+                f"follows {', '.join(followed)} with {count_nouns(joints, 'joint')}: name "
+                f"at most {count_nouns(joints, 'axis')}",
+                path=path,
             )
         directions, sizes, _ = np.linalg.svd(J)
         if sizes[-1] < RANK_TOLERANCE * sizes[0]:

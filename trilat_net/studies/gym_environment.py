@@ -32,6 +32,7 @@ from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
 from ..scenario.own_plant import make_plant_players
+from ..wording import count_nouns
 from .reachable_places import can_reach
 
 if TYPE_CHECKING:
@@ -134,7 +135,8 @@ class ReachTask:
         else:
             around = f"{self._radius_m:g} m around the start of {self._site}"
             raise UsageError(
-                f"the task has no goal: the end effector can reach none of {scene.draws} places "
+                "the task has no goal: the end effector can reach none of "
+                f"{count_nouns(scene.draws, 'place')} "
                 f"within {around}; start from another pose (sites.NAME.q0_rad), or give a task of your own"
             )
         self.goal = place
@@ -378,9 +380,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         try:
             values = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise UsageError(f"an action: it is {self._size} numbers, not {action!r:.80}") from None
+            raise UsageError(
+                f"an action: it is {count_nouns(self._size, 'number')}, not {action!r:.80}"
+            ) from None
         if values.shape != (self._size,):
-            found = f"{values.size} numbers" if values.ndim == 1 else f"an array of shape {values.shape}"
+            found = (
+                f"{count_nouns(values.size, 'number')}"
+                if values.ndim == 1
+                else f"an array of shape {values.shape}"
+            )
             raise UsageError(f"an action: it acts with {found}, not {self._size}")
         if not np.isfinite(values).all():
             raise UsageError(f"an action: it acts with {values.tolist()}, which is not finite")

@@ -39,6 +39,7 @@ from ..scenario import Scenario, find_site
 from ..scenario.operators.kernel_operators import Multisine
 from ..theory.characteristic_roots import Complex
 from ..theory.port_passivity import HandMatrices
+from ..wording import count_nouns
 
 LEAST_SEGMENTS, LEAST_KNOWN = 5, 0.98
 """How many segments an interval needs; which share of a segment's records."""
@@ -109,7 +110,10 @@ class HandImpedance(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
-        yield f"hand at {self.site}: {self.segments} segments of {self.segment_s:g} s, intervals of 95 %"
+        yield (
+            f"hand at {self.site}: {count_nouns(self.segments, 'segment')} of "
+            f"{self.segment_s:g} s, intervals of 95 %"
+        )
         axes = "xyz"[: len(self.K)]
         pairs = [(i, j) for i in range(len(axes)) for j in range(len(axes))]
         rows = [
@@ -149,7 +153,8 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     if len(phasors) < LEAST_SEGMENTS:
         needed_s = start_s + (0.5 * LEAST_SEGMENTS + 1.0) * segment_s
         raise UsageError(
-            f"{site}: {len(phasors)} whole segments of {segment_s:g} s while the sines act, and intervals "
+            f"{site}: {count_nouns(len(phasors), 'whole segment')} of {segment_s:g} s while "
+            "the sines act, and intervals "
             f"need {LEAST_SEGMENTS}: at least {needed_s:g} s of them"
         )
     F, X = np.split(np.array(phasors), [force.shape[1]], axis=2)
@@ -224,7 +229,8 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> tuple[Ar
     lengths = np.linalg.svd(whole / np.maximum(np.linalg.norm(whole, axis=0), 1e-300), compute_uv=False)
     if len(whole) < whole.shape[1] or lengths[-1] * FARTHEST_CONDITION < lengths[0]:
         raise UsageError(
-            f"{site}: its end effector moved along fewer than {axes} axes, or at too few frequencies to tell "
+            f"{site}: its end effector moved along fewer than {count_nouns(axes, 'axis')}, "
+            "or at too few frequencies to tell "
             "mass, damping and stiffness apart: let sines of other frequencies act on another joint"
         )
     every = np.arange(count)

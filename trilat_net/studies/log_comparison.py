@@ -18,6 +18,7 @@ from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
 from ..theory.linear_analysis import certify_run
+from ..wording import count_nouns
 from .intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 
@@ -44,7 +45,7 @@ class LogComparison(Result):
 
     def headline(self) -> str:
         """Returns what is compared."""
-        return f"{', '.join(self.metrics.columns)}: {len(self.metrics.rows)} quantities"
+        return f"{', '.join(self.metrics.columns)}: {count_nouns(len(self.metrics.rows), 'quantity')}"
 
     def blocks(self) -> Iterator[Block]:
         """Yields the differences of the experiments, the quantities of the logs, and remarks per log."""

@@ -46,6 +46,7 @@ from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
+from ..wording import count_nouns
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
 from .measure_run import (
@@ -220,7 +221,7 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
     ended = "; ".join(problems) or "ended in order"
     session = ExpectationResult("session", not problems, ended, "ends in order")
     judged = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    identical, records = f"{verdict.identical} identical{judged}", f"{verdict.records} records"
+    identical, records = f"{verdict.identical} identical{judged}", f"{count_nouns(verdict.records, 'record')}"
     again = ExpectationResult("executed again", verdict.passed, identical, records)
     return result._replace(outcomes=[*result.outcomes, session, again], log=kept)
 
@@ -334,7 +335,10 @@ class TrialReport(Result):
 
     def headline(self) -> str:
         """Returns how many runs held."""
-        return f"{sum(result.held for result in self.results)} of {len(self.results)} runs as expected"
+        return (
+            f"{sum(result.held for result in self.results)} of "
+            f"{count_nouns(len(self.results), 'run')} as expected"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat test --json`."""

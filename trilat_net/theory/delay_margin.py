@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
+from ..wording import count_nouns
 from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 
@@ -97,7 +98,7 @@ class DelayMargin(NamedTuple):
         texts = [interval.words for interval in self.intervals]
         if texts == [""]:
             return f"stable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
-        more = f", and in {len(texts) - _SHOWN} more ranges" if len(texts) > _SHOWN else ""
+        more = f", and in {count_nouns(len(texts) - _SHOWN, 'more range')}" if len(texts) > _SHOWN else ""
         return f"stable for common delays {', '.join(texts[:_SHOWN])}{more}"
 
 

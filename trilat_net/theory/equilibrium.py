@@ -20,6 +20,7 @@ from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.kernel_operators import Chirp, Multisine
+from ..wording import count_nouns
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw
@@ -288,7 +289,7 @@ def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equi
     at, task = lay_out_arguments(conditions.sites[0]), conditions.sites[0].layout.task
     if len(pose) != at.coordinates or not np.isfinite(pose).all():
         count = "two" if at.coordinates == 2 else str(at.coordinates)
-        numbers = f"{count} angles in rad" + (", one per joint" if at.coordinates != 2 else "")
+        numbers = f"{count_nouns(count, 'angle')} in rad" + (", one per joint" if at.coordinates != 2 else "")
         if task:
             numbers = (
                 f"a place in m{' and a rotation vector in rad' * (at.coordinates > 3)} of the end effectors"

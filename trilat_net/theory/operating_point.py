@@ -30,6 +30,7 @@ from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
+from ..wording import count_nouns
 from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
 
@@ -158,7 +159,7 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
             varying.append(age)
     if varying:
         least, most = 1e3 * min(age.least_s for age in varying), 1e3 * max(age.most_s for age in varying)
-        where = "one link" if len(varying) == 1 else f"{len(varying)} links"
+        where = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
         notes.append(
             f"the age of the samples in use varies on {where}, {least:.4g} to {most:.4g} ms: the continuous "
             "loop is linearised at the mean of each, and leaves out the effect of the variation itself"

@@ -30,6 +30,7 @@ from ..errors import UsageError
 from ..results import finite_or_none
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES
+from ..wording import count_nouns
 from . import frequency_search, port_response
 from .characteristic_roots import compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
@@ -259,7 +260,10 @@ def _place_hands(
         q, ports = own[np.newaxis, : site.layout.joints], port_response.find_site_ports(loop, site.name)
         J = build_arm_rows(scenario, site.name).place_end_effector(q, np.zeros_like(q)).J[0]
         if any(len(one.B) != len(J) for one in hands):
-            raise UsageError(f"{site.name}: its end effector moves along {len(J)} axes, a hand along others")
+            raise UsageError(
+                f"{site.name}: its end effector moves along {count_nouns(len(J), 'axis')}, "
+                "a hand along others"
+            )
         place = np.zeros((len(J), len(loop.inputs)))
         if site.layout.task:  # its ports are axes
             for n, port in zip(list_followed_axes(site), ports, strict=True):

@@ -17,6 +17,7 @@ from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...results import JsonObject
 from ...scenario.imported_code import ImportedLaw
+from ...wording import count_nouns
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premises import Premise
@@ -247,7 +248,10 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
         finding = ObservedFinding.NEGATIVE
         text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
     else:
-        finding, text = ObservedFinding.PASSIVE, f"{len(least)} energies, the largest {largest:.4g} J"
+        finding, text = (
+            ObservedFinding.PASSIVE,
+            f"{count_nouns(len(least), 'energy')}, the largest {largest:.4g} J",
+        )
         text += f"; but a premise fails: {', '.join(failed)}" * bool(failed)
     numbers = (least, largest, residual, sampling, curves)
     return ObservedEnergy(finding, f"{finding}: {text}", premises, *numbers)

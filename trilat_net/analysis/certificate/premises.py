@@ -19,6 +19,7 @@ from ...log.running_digest import Integrity
 from ...log.session_check import judge_integrity
 from ...net.messages import HALTED_MODES
 from ...scenario import Scenario
+from ...wording import count_nouns
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses
 from ..following import TaskFollowing
@@ -271,7 +272,10 @@ def _check_following(run: FunctionalFacts) -> Premise:
     for site in log.sites:
         held = ~find_unlimited(log.scenario.sites[site].limits, log[site].qd_des)
         if held.any():
-            away.append(f"{site} with a reference as fast as it may be at {np.count_nonzero(held)} ticks")
+            away.append(
+                f"{site} with a reference as fast as it may be at "
+                f"{count_nouns(np.count_nonzero(held), 'tick')}"
+            )
     words = "hold, brake, return or stop" if stops else "hold, brake or return"
     text = f"{words}: {_list(away)}" if away else "every site follows its peers all the time"
     return Premise("following", not away, text)
@@ -281,7 +285,7 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
     """No torque is cut off; of a chain the joints are named at which one is."""
     cut = {site: energy.motion.cut for site, energy in run.energies.items()}
     ticks = [
-        f"{site}{_name_joints(run, site, rows)} at {np.count_nonzero(rows.any(axis=1))} ticks"
+        f"{site}{_name_joints(run, site, rows)} at {count_nouns(np.count_nonzero(rows.any(axis=1)), 'tick')}"
         for site, rows in cut.items()
         if rows.any()
     ]

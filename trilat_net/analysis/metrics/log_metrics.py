@@ -20,6 +20,7 @@ from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
 from ...scenario.arms import TASK_AXES
+from ...wording import count_nouns
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows
@@ -84,7 +85,7 @@ class LogMetrics(Result):
     def headline(self) -> str:
         """Returns what was measured, in one line."""
         known = sum(one.value is not None for _, one in self._each())
-        return f"{self.log}: {known} numbers of {self.scenario}, {', '.join(self.sites)}"
+        return f"{self.log}: {count_nouns(known, 'number')} of {self.scenario}, {', '.join(self.sites)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat metrics --json`."""

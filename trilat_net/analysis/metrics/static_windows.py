@@ -296,7 +296,10 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
     gains, none = spec.control.gains(arm.theta), np.zeros(len(spec.q0_rad))
     if gains.law is Law.OWN:
-        return none, f"the law {identify_law(spec.control)} states no stiffness that holds e at rest"
+        return (
+            none,
+            f"the law {identify_law(spec.control)} states no stiffness that holds e at rest",
+        )
     if not spec.arm.known:
         return none, "theta of the arm is not known"
     if np.any(gains.k_f):

@@ -30,6 +30,7 @@ from ...log.log_reader import Log
 from ...log.orientations import MATRIX_ENTRIES, expand_poses
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
+from ...wording import count_nouns
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
 
 _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
@@ -95,7 +96,10 @@ def _write(
     texts[EXPORT_MANIFEST] = {**about, "sessions": sessions}
     for place, content in texts.items():
         (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n")
-    return f"{len(index)} frames in {len(starts)} episodes; {lost} frames lie in gaps and are left out"
+    return (
+        f"{count_nouns(len(index), 'frame')} in {count_nouns(len(starts), 'episode')}; "
+        f"{count_nouns(lost, 'frame')} left out, in gaps"
+    )
 
 
 def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:

@@ -19,6 +19,7 @@ from ...core.exogenous import TorqueKind, TorqueSource
 from ...core.live_hand import HandReach, HandRules
 from ...core.site_setup import MotionLimits
 from ...errors import ScenarioError
+from ...wording import count_nouns
 from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
 
@@ -199,7 +200,9 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         """Returns too many or too few phases."""
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
-            return fields.KeyProblem("phases_rad", f"must be {count} angles, as many as frequencies")
+            return fields.KeyProblem(
+                "phases_rad", f"must be {count_nouns(count, 'angle')}, as many as frequencies"
+            )
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
@@ -298,7 +301,10 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         if isinstance(device, dict) and isinstance(frame := device.get("frame"), list):
             lines = {tuple(map(abs, DIRECTIONS.get(str(word), ()))) for word in frame}
             if not len(frame) == axes == len(lines - {()}):
-                words = f"one of {', '.join(DIRECTIONS)} for each of {axes} axes, and no two of one line"
+                words = (
+                    f"one of {', '.join(DIRECTIONS)} for each of "
+                    f"{count_nouns(axes, 'axis')}, and no two of one line"
+                )
                 raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
     def rules(self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None) -> HandRules:

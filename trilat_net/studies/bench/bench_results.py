@@ -13,6 +13,7 @@ import numpy as np
 from ...analysis.run_end import EndBehaviour, Stability
 from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
+from ...wording import count_nouns
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, explain_no_cell
@@ -182,7 +183,10 @@ class BenchResults(Result):
 
     def headline(self) -> str:
         """Returns which study, and how many runs."""
-        return f"{self.plan.study}: {len(self.places)} cells, {len(self.runs)} runs"
+        return (
+            f"{self.plan.study}: {count_nouns(len(self.places), 'cell')}, "
+            f"{count_nouns(len(self.runs), 'run')}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat bench --json`."""
@@ -334,11 +338,17 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     plan = results.plan
     seeds = max(len(cell.seeds) for cell in plan.cells)
     yield f"{plan.study}: {STUDIES[plan.study].about}"
-    yield f"{len(plan.cells)} cells, {len(results.runs)} runs: one per cell without randomness, else {seeds}"
+    yield (
+        f"{count_nouns(len(plan.cells), 'cell')}, "
+        f"{count_nouns(len(results.runs), 'run')}: one per cell without randomness, else {seeds}"
+    )
     unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
     refuted = sum(run.confirmed is False for run in results.runs)
     confirmed = sum(bool(run.confirmed) for run in unstable)
-    yield f"not stable: {len(unstable)} runs, {confirmed} confirmed by one of 100 s; {refuted} refuted by it"
+    yield (
+        f"not stable: {count_nouns(len(unstable), 'run')}, {confirmed} confirmed by one "
+        f"of 100 s; {refuted} refuted by it"
+    )
     for task in dict.fromkeys(cell.task for cell in plan.cells):
         yield f"{task}: {TASKS[task].about}"
     for law, form in results.plan.laws:

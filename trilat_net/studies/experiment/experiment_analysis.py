@@ -25,6 +25,7 @@ from ...files import find_version, make_folder, make_subfolder, write_whole
 from ...reporting import style
 from ...reporting.result_text import Block, TextTable, compose, format_number
 from ...results import Result
+from ...wording import count_nouns
 from ..study_folder import encode_csv
 from .completion_times import (
     COMPLETION,
@@ -320,7 +321,8 @@ class ExperimentAnalysis(Result):
         sooner = censored - timed_out
         failed = f" and {sooner} failed sooner" if sooner else ""
         return (
-            f"{timed_out} of {trials} trials ran into the time limit of {self._limit_s:g} s{failed}; their "
+            f"{timed_out} of {count_nouns(trials, 'trial')} ran into the time limit of "
+            f"{self._limit_s:g} s{failed}; their "
             "completion times are right-censored, and completion is summarised by the median of Kaplan and "
             f"Meier per {self.unit} and condition"
         )
@@ -333,7 +335,10 @@ class ExperimentAnalysis(Result):
         if not missing:
             return ""
         plural = "questionnaire has" if unscored == 1 else "questionnaires have"
-        return f"{missing} of {asked} answers are missing; {unscored} {plural} no score for that reason"
+        return (
+            f"{missing} of {count_nouns(asked, 'answer is', 'answers are')} missing; "
+            f"{unscored} {plural} no score for that reason"
+        )
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
         """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
@@ -436,8 +441,13 @@ class ExperimentAnalysis(Result):
         yield from self._write_model_blocks()
         for one in self.missing_answers:
             under = f", {one.condition}" if one.condition else ""
-            without = f"; {one.unscored} of {one.forms} have no score for that reason" if one.missing else ""
-            yield f"{one.questionnaire}{under}: {one.missing} of {one.asked} answers are missing{without}"
+            without = (
+                (f"; {one.unscored} of {one.forms} have no score for that reason") if one.missing else ""
+            )
+            yield (
+                f"{one.questionnaire}{under}: {one.missing} of "
+                f"{count_nouns(one.asked, 'answer is', 'answers are')} missing{without}"
+            )
         yield from (f"{name}: no number, because {reason}" for name, reason in self.absent.items())
         if self.missing_answers or self.absent:
             yield ""
@@ -607,7 +617,10 @@ class PowerOfExperiment(Result):
         )
         if self.power is not None and self.simulated is not None:
             drawn = f"{self.simulated.found:.3f} {_span(self.simulated.interval)} of 500 drawn experiments"
-            yield f"with {self.participants} participants: power {self.power:.3f}; found in {drawn}"
+            yield (
+                f"with {count_nouns(self.participants, 'participant')}: power "
+                f"{self.power:.3f}; found in {drawn}"
+            )
 
 
 def compute_experiment_power(

@@ -19,6 +19,7 @@ from ...files import digest_file, make_results_folder, make_subfolder, write_who
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
+from ...wording import count_nouns
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..study_folder import RunJournal, build_resume_hint, encode_csv
 from .completion_times import COMPLETION, find_median, is_completed
@@ -256,7 +257,10 @@ class Experiment(Result):
         as longer than any.
         """
         status, rows = self.status(), [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
-        yield f"{self.plan.protocol.name}: {status.done} of {status.total} trials, in {self.folder}"
+        yield (
+            f"{self.plan.protocol.name}: {status.done} of "
+            f"{count_nouns(status.total, 'trial')}, in {self.folder}"
+        )
         table = []
         for condition in self.plan.protocol.conditions:
             of = [row for row in rows if row["condition"] == condition]

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from ...core.vectors import Array
 from ...errors import UsageError
+from ...wording import count_nouns
 
 ONSET_SHARE = 0.05
 """Of its peak: a movement begins and ends where its speed crosses it."""
@@ -278,7 +279,7 @@ def sus_score(answers: Sequence[int]) -> float:
     Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry (1996).
     """
     if len(answers) != 10:
-        raise UsageError(f"{len(answers)} answers: SUS has 10 questions")
+        raise UsageError(f"{count_nouns(len(answers), 'answer')}: SUS has 10 questions")
     for number, answer in enumerate(answers, 1):
         if answer not in (1, 2, 3, 4, 5):
             raise UsageError(f"answer {number} = {answer}: an answer of SUS is 1, 2, 3, 4 or 5")

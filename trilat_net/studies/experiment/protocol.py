@@ -23,6 +23,7 @@ from ...fields import Frozen, Positive
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
+from ...wording import count_nouns
 from .questionnaires import Name, Questionnaire, find_form
 from .staircase import COMPARISON, STANDARD, Staircase
 from .synthetic_participant import ParticipantModel, Share
@@ -72,7 +73,8 @@ class Training(Frozen, frozen=True):
         parts = ", ".join(f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items())
         later = f", and {self.retention} more after {self.rest_s:g} s" if self.retention else ""
         return (
-            f"In these the expert's part of the authority went from {parts}; {self.before} trials before and "
+            f"In these the expert's part of the authority went from {parts}; "
+            f"{count_nouns(self.before, 'trial')} before and "
             f"{self.after} after them{later} were made without it and are compared"
         )
 
@@ -298,9 +300,15 @@ class ExperimentPlan(Result):
         yield f"{protocol.name}: {protocol.title or protocol.task.words}"
         yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.words}"
         trials = self.trials[-1].trial - protocol.practice
-        each = f"{len(protocol.conditions)} conditions of {protocol.practice} + {trials} trials"
+        each = (
+            f"{count_nouns(len(protocol.conditions), 'condition')} of "
+            f"{protocol.practice} + {count_nouns(trials, 'trial')}"
+        )
         longest_s = protocol.foreperiod_s[1] + protocol.task.longest_s
-        yield f"{each}: {len(self.trials)} trials of at most {longest_s:g} s; design {protocol.design}"
+        yield (
+            f"{each}: {count_nouns(len(self.trials), 'trial')} of at most {longest_s:g} "
+            f"s; design {protocol.design}"
+        )
         yield TextTable(
             ("", "order of conditions"), [(name, ", ".join(one)) for name, one in facts["orders"].items()]
         )
@@ -392,12 +400,13 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
     if not 1 <= size <= 2 or len(set(protocol.users)) < size:
         yield f"users are one or two sites, not {', '.join(protocol.users)}"
     elif len(names) % size:
-        yield f"{len(names)} participants make no pairs: their number must be even"
+        yield f"{count_nouns(len(names), 'participant')}: pairs need an even number"
     rows = len(list_orders(protocol.design, list(protocol.conditions), protocol.seed))
     if protocol.design in ("williams", "latin") and len(protocol.groups) % rows:
         whose = "pairs" if size == 2 else "participants"
         yield (
-            f"a {protocol.design} design of {len(protocol.conditions)} conditions has {rows} orders: the "
+            f"a {protocol.design} design of "
+            f"{count_nouns(len(protocol.conditions), 'condition')} has {count_nouns(rows, 'order')}: the "
             f"number of {whose} must be a multiple of {rows}, is {len(protocol.groups)}"
         )
 

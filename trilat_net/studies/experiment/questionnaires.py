@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from ...errors import UsageError
 from ...fields import Frozen
+from ...wording import count_nouns
 from .movement_measures import raw_tlx, sus_score
 
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
@@ -73,7 +74,9 @@ class Questionnaire(Frozen, frozen=True):
         scale = range(self.least, self.most + 1, self.step)
         valid = [value in scale if value is not None else not self.is_forced for value in values]
         if len(values) != len(self.items) or not all(valid):
-            raise UsageError(f"{self.name}: {len(self.items)} answers of {self.least} to {self.most}")
+            raise UsageError(
+                f"{self.name}: {count_nouns(len(self.items), 'answer')} of {self.least} to {self.most}"
+            )
         return dict(zip(self.items, values, strict=True))
 
     def score(self, answers: Answers) -> float | None:

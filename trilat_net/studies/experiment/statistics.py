@@ -24,6 +24,7 @@ from ...core.vectors import Array
 from ...errors import UsageError
 from ...fields import split_unit
 from ...files import import_extra
+from ...wording import count_nouns
 from ..intervals import mean_interval, wilson_interval
 
 Row = Mapping[str, Any]
@@ -288,7 +289,8 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     freedom = len(records) - len(people) - len(means) + 1
     if len(means) < 2 or freedom < 1:
         raise UsageError(
-            f"{measure}: {len(records)} means of {len(people)} participants; two conditions need more"
+            f"{measure}: {len(records)} means of {count_nouns(len(people), 'participant')}; "
+            "two conditions need more"
         )
     frame = frames.DataFrame(records, columns=["pair", "participant", "condition", "measure"])
     frame["condition"] = frames.Categorical(frame["condition"], categories=list(means))

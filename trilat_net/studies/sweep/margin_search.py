@@ -24,6 +24,7 @@ from ...results import Result
 from ...scenario import Scenario
 from ...scenario.code_consent import list_imported_code
 from ...theory.linear_edge import find_root_crossings
+from ...wording import count_nouns
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
@@ -285,7 +286,10 @@ class SweepMargins(Result):
         """Returns how many edges were found where."""
         edges = sum(len(one.margin.spans) for one in self.found)
         low, high = self.within.low, self.within.high
-        return f"{self.plan.base.name}: {edges} edges of {self.within.key} from {low:g} to {high:g}"
+        return (
+            f"{self.plan.base.name}: {count_nouns(edges, 'edge')} of {self.within.key} "
+            f"from {low:g} to {high:g}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat sweep --margin --json`."""
@@ -327,7 +331,7 @@ class SweepMargins(Result):
         remarks = dict.fromkeys(one.remark for one in self.found if one.remark)
         parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
         if islands := sum(len(one.margin.spans) > 1 for one in self.found):
-            where = f"in {islands} of {len(self.found)} places"
+            where = f"in {islands} of {count_nouns(len(self.found), 'place')}"
             parts.append(f"Stability is not monotone {where}: they have several edges.")
         fixed = "; ".join(describe_fixed_gains(self.plan))
         advice = FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")

@@ -24,6 +24,7 @@ from ...scenario.code_consent import allow_own_code
 from ...scenario.imported_code import name_law_classes
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
+from ...wording import count_nouns
 from ..study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 
@@ -375,7 +376,7 @@ def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
             raise UsageError(f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}")
         asked = range(own, own + asked)
     if len(asked) > MAX_SEEDS:
-        raise UsageError(f"{len(asked)} seeds are more than {MAX_SEEDS}")
+        raise UsageError(f"{count_nouns(len(asked), 'seed is', 'seeds are')} more than {MAX_SEEDS}")
     for seed in asked:
         if not 0 <= seed < 2**63:
             raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")

@@ -26,6 +26,7 @@ from ...execution.fused import RunTotals
 from ...files import write_whole
 from ...results import Result
 from ...scenario.scenario_reader import read_source
+from ...wording import count_nouns
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv, format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
@@ -305,8 +306,12 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     sizes = " x ".join(str(len(one.texts)) for one in plan.axes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
     count = len(plan.seeds)
-    seeds = f"seed {plan.seeds[0]}" if count == 1 else f"{count} seeds each where anything is random"
-    lines = [f"{plan.base.name}: {plan.cells} cells ({sizes}{laws}), {seeds}"]
+    seeds = (
+        f"seed {plan.seeds[0]}"
+        if count == 1
+        else f"{count_nouns(count, 'seed')} each where anything is random"
+    )
+    lines = [f"{plan.base.name}: {count_nouns(plan.cells, 'cell')} ({sizes}{laws}), {seeds}"]
     for one in plan.axes:
         texts = one.texts
         count = len(texts)
@@ -323,7 +328,7 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
     words = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
-    yield f"{len(rows)} runs of {results.plan.cells} cells: {words}"
+    yield f"{count_nouns(len(rows), 'run')} of {count_nouns(results.plan.cells, 'cell')}: {words}"
     extended = [row for row in rows if row["extended"]]
     if extended:
         longest_s = max(row["ran_s"] for row in extended)
@@ -366,7 +371,7 @@ def _of_seeds(results: SweepResults) -> Iterator[str]:
 
 
 def _cells(count: int) -> str:
-    return "1 cell" if count == 1 else f"{count} cells"
+    return count_nouns(count, "cell")
 
 
 def list_next_commands(folder: Path) -> list[str]:

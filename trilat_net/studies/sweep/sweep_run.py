@@ -22,6 +22,7 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.code_consent import list_imported_code
 from ...scenario.laws import identify_law
+from ...wording import count_nouns
 from .. import executor
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from . import sweep_cell
@@ -249,10 +250,13 @@ def refuse_oversized_sweep(plan: SweepPlan, expected: DurationEstimate, jobs: in
     if expected.runs <= MAX_RUNS and expected.seconds <= MAX_SWEEP_S:
         return
     sizes = " x ".join(str(count) for count in plan.shape if count > 1)
-    seeds = f", {len(plan.seeds)} seeds each" if len(plan.seeds) > 1 else ""
+    seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
     raise UsageError(
-        f"{plan.cells} cells ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} on "
-        f"{jobs or count_cores()} cores; larger steps make it fewer, --yes runs it all the same"
+        f"{count_nouns(plan.cells, 'cell')} ({sizes}{seeds}) would take about "
+        f"{format_wall_time(expected.seconds)} on "
+        ""
+        f"{count_nouns(jobs or count_cores(), 'core')}; larger steps make it fewer, --yes "
+        "runs it all the same"
     )
 
 
@@ -321,7 +325,7 @@ def _run_cells(
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:
     """Returns the speed in words."""
-    on = "1 process" if speed.jobs == 1 else f"{speed.jobs} processes"
+    on = count_nouns(speed.jobs, "process")
     times = speed.simulated_s / (speed.wall_s * speed.jobs) if speed.wall_s else math.nan
     took = f"{speed.simulated_s:.4g} s simulated in {format_wall_time(speed.wall_s)} by {on}"
     return f"speed: {times:.3g} times real time per process; {took}"

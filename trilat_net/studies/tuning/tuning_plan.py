@@ -26,6 +26,7 @@ from ...process import count_cores
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_code import name_law_classes
+from ...wording import count_nouns
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import search_space
 from .candidate import (
@@ -439,7 +440,8 @@ def plan_tuning(
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
-            f"a candidate would take {ticks} ticks, at most {MAX_TICKS} are given: shorten it with --duration"
+            f"a candidate would take {count_nouns(ticks, 'tick')}, at most "
+            f"{MAX_TICKS} are given: shorten it with --duration"
         )
         raise ScenarioError(problem, path="duration_s", source=found.source)
     check_comparable(scenario)

@@ -21,6 +21,7 @@ from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
 from ...reporting.result_text import Block, TextTable, format_number
+from ...wording import count_nouns
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
@@ -129,7 +130,8 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     clamp = " to ".join(f"{value:g}" for value in dict.fromkeys((clamps.min(), clamps.max())))
     informed = any(space.law == "known" for space in plan.spaces)
     lines = [
-        f"{plan.budget} candidates per law, {(plan.budget + 1) // 2} of a Latin hypercube, the others "
+        f"{count_nouns(plan.budget, 'candidate')} per law, {(plan.budget + 1) // 2} of a "
+        "Latin hypercube, the others "
         f"refined; seed {plan.seed}",
         f"{scenario.duration_s:g} s of {scenario.name}, its seed {scenario.seed}, "
         f"torques clamped at {clamp} N m",
@@ -140,7 +142,10 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         shares = ", ".join(f"{weight:g}" for weight in weights)
         lines.append(f"of Kp, Kd, K and d the joints have {shares} times the number, by their inertia")
     if plan.others:
-        lines.append(f"every candidate is the mean of {1 + len(plan.others)} seeds, with its 95 % interval")
+        lines.append(
+            f"every candidate is the mean of {count_nouns(1 + len(plan.others), 'seed')}, "
+            "with its 95 % interval"
+        )
     if plan.objective is Objective.SETTLING:
         lines.append("sought: the time from which the largest |e| stays below 0.01 rad, against effort")
     if plan.twin:
