@@ -58,6 +58,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
 """Scenario, law (none: its own) and settings."""
 RATES_NM_S = (100.0, 300.0, 1000.0)
 MOST_ENERGY, MOST_SPEED = 1.05, 1.1
+LEAST_ENERGY_J = 0.0125
+"""Of the arms of `free` whose joints move at 0.05 rad/s."""
 FIRST_S, LONGEST_S = 0.5, 8.0
 _DURATION_S = 1.2
 
@@ -69,7 +71,7 @@ class Stop(NamedTuple):
         case: scenario, law, rate of the torque and site.
         begin_rad_s: the largest speed of a joint at its beginning.
         energy: the largest kinetic energy, less the work of gravity that the law does not know, of hands and
-            of last torques, over that at the beginning (and 1 mJ).
+            of last torques, over that at the beginning (and what an arm at rest may have).
         speed: the largest speed of a joint, less the rise during the blend, over that at the beginning (and
             the speed at which an arm is at rest).
         rest_s: when the arm was at rest.
@@ -115,9 +117,11 @@ def state_bound(number: int, rate_nm_s: float, site: str) -> float:
 def draw_state(
     log: Log, site: str, rng: np.random.Generator, *, synthetic: bool, too_fast: bool
 ) -> tuple[TickRecord, TickRecord]:
-    """Two records in a row from which a site stops."""
+    """Two records in a row from which a site stops, of one that follows its peers."""
     part, scenario = log[site], log.scenario
-    at = int(rng.integers(400, len(part)))
+    follows = np.isin(part.mode, ("return", "run"))
+    rows = np.flatnonzero(follows[1:] & follows[:-1]) + 1
+    at = int(rng.choice(rows))
     before, last = (read_output(part.states[row], part.peers) for row in (at - 1, at))
     if not synthetic:
         return before, last
@@ -191,7 +195,7 @@ def measure_stop(
     return Stop(
         case=case,
         begin_rad_s=float(speed[0]),
-        energy=float(((kinetic_j - work_j - blend_j) / (kinetic_j[0] + 1e-3)).max()),
+        energy=float(((kinetic_j - work_j - blend_j) / (kinetic_j[0] + LEAST_ENERGY_J)).max()),
         speed=float((speed.max() - rise) / max(speed[0], AT_REST_RAD_S)),
         rest_s=float(moving[-1] + 1) * h_s if len(moving) else 0.0,
         stated_s=stated_s,

@@ -7,7 +7,8 @@ The reference of a joint begins at the joint's own angle and speed v, and comes 
 
 where a_i is the deceleration that half of the torque limit gives. If nothing slows the joints down sooner,
 this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_i| / a_i). q_ref is the integral of qd_ref;
-while a torque is at its limit, q_ref moves along with the joint if it would fall further behind otherwise.
+while an arm is fast (see below) or a torque is at its limit, q_ref moves along with a joint that would
+otherwise get farther away from it.
 
 The torque is that of the law on this reference. It is gravity, as far as that is known or learnt, for a law
 that failed, that does not hold by its reference, and for every law while the arm is fast: while B |qd| of
@@ -134,6 +135,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: Row) -> None:
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
     remaining_s = _find_remaining_s(elapsed_s, site)
     share = 1.0 - step_s / remaining_s if remaining_s > step_s + _ROUNDING_S else 0.0
+    fast = is_fast(site)
     for i in range(site.joints):
         q_ref, rate_before = _read_reference(site, i)
         rate = share * rate_before
@@ -142,9 +144,9 @@ def advance_rest_reference(t_ns: int, ticks: int, site: Row) -> None:
         elif abs(rate) > abs(site.qd[i]):
             rate = site.qd[i]
         step = 0.5 * step_s * (rate_before + rate)
-        if abs(site.tau[i]) >= site.tau_limit[i]:
-            # A torque at its limit cannot keep the joint at its reference: a growing distance would only be
-            # energy that the spring gives back later.
+        if fast or abs(site.tau[i]) >= site.tau_limit[i]:
+            # Without its law, or at its limit, the torque does not pay for a growing distance from the
+            # reference, which the spring would give back later as energy of its own.
             own_step = site.q[i] - site.q_before[i]
             if (own_step - step) * (site.q_before[i] - q_ref) >= 0.0:
                 step = own_step
