@@ -138,7 +138,7 @@ def test_columns_and_messages_name_joints_and_links():
 def test_the_page_draws_chains_from_their_joints():
     log = six()
     drawn = charts.Charts(log, None)
-    data = drawn.data()
+    data = drawn.data().data.to_builtins()
     assert [arm["points"] for arm in data["arms"]] == [7, 7, 7]
     table = data["tables"][data["arms"][0]["table"]]
     assert len(table["columns"]) == 3 * 7 * 2

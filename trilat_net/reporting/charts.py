@@ -29,6 +29,7 @@ from .figures import age_and_lateness, arm_poses
 from .page_data import (
     ChainArm,
     Chart,
+    ColumnTable,
     DistributionChart,
     DistributionSeries,
     HistogramChart,
@@ -39,7 +40,6 @@ from .page_data import (
     Palettes,
     PlanarArm,
     StatedLine,
-    Table,
     TableSeries,
     TimeChart,
 )
@@ -82,7 +82,7 @@ class Charts:
         self.factor = 1.0 if planar else PICTURE_SIDE / max(right - left, top - bottom)
         self._changes = list_changes(log)
         self._end_s = recorded_end_s(log)
-        self._tables: list[Table] = []
+        self._tables: list[ColumnTable] = []
         self._known: list[list[bool]] = []  # per table and column, whether there is any value
         self._titles = [f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)]
         counts = max(arm.counts for arm in log.scenario.arms.values())
@@ -127,7 +127,7 @@ class Charts:
     def _store(self, site: str, tick: Ints, values: NDArray[Any]) -> int:
         columns = [_packed(column, "<f4") for column in values.T]
         rate_hz = self._log.scenario.sites[site].rate_hz
-        self._tables.append(Table(rate_hz, _packed(tick, "<i4"), columns))
+        self._tables.append(ColumnTable(rate_hz, _packed(tick, "<i4"), columns))
         self._known.append(np.isfinite(values).any(axis=0).tolist())
         return len(self._tables) - 1
 

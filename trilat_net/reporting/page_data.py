@@ -20,7 +20,7 @@ Colour = int | Literal["limit"]
 """Index of a site in the palette of the page, or "limit" for references, true values and limits."""
 
 
-class Table(msgspec.Struct, frozen=True):
+class ColumnTable(msgspec.Struct, frozen=True):
     """Columns of numbers over the ticks of one site.
 
     Attributes:
@@ -213,7 +213,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
 
     end_s: float
     colours: Palettes
-    tables: list[Table]
+    tables: list[ColumnTable]
     charts: list[Chart]
     changes: list[MarkedChange]
     spans: dict[str, list[ModeSpan]]
