@@ -12,7 +12,8 @@ from live.experiment_stage import Stage, TrialWatch
 from live.page_server import PageServer
 from tests.analysis.logs import BUSY, FOUR
 from tests.chains import six_joints
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import launch, needs_browser, shows
+from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.sites.sessions import Session, gliding, reached
@@ -157,10 +158,10 @@ def use(page: Page) -> None:
 
 
 def test_view_of_waiting_session_has_no_empty_frame(address: str, browser: Browser) -> None:
-    for query in ("", "?as=m1", "?watch"):
+    for query in ("", "as=m1", "watch"):
         with watched_page(browser) as watched:
-            watched.page.goto(address + query)
-            watched.page.wait_for_function("window.trilat?.hello?.running === false")
+            watched.page.goto(with_query(address, query))
+            shows(watched.page, "window.trilat?.hello?.running === false")
             watched.assert_whole(["hello", "hello.stage"])
 
 
@@ -227,7 +228,7 @@ def watched_trial(experiment: Experiment) -> ExperimentTrial:
     return ExperimentTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
 
 
-STAGED_VIEWS = {"participant": "?as=m1", "experimenter": "", "watcher": "?watch"}
+STAGED_VIEWS = {"participant": "as=m1", "experimenter": "", "watcher": "watch"}
 
 
 @pytest.mark.parametrize(
@@ -243,8 +244,8 @@ def test_stage_between_trials_has_no_empty_frame(
         for view, query in STAGED_VIEWS.items():
             with watched_page(browser) as watched:
                 page = watched.page
-                page.goto(server.address + query)
-                page.wait_for_function("window.trilat?.hello?.stage !== undefined")
+                page.goto(with_query(server.address, query))
+                shows(page, "Boolean(window.trilat?.hello?.stage)")
                 watched.assert_whole(OF_STAGED_PAGES)
                 assert page.is_visible("#sheet") == (view == "participant")
                 if page.locator("#sheet button.main:enabled").count():

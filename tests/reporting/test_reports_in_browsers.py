@@ -8,7 +8,8 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.analysis import logs
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import launch, needs_browser, shows
+from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
@@ -117,17 +118,14 @@ def test_report_stays_whole_while_used(name: str, browser: Browser, tmp_path: Pa
         page = open_report(watched, VARIED[name](), tmp_path)
         before = arms_drawn(page)
         page.click("#arms button")
-        page.wait_for_function(
-            "(before) => document.querySelector('#arms .arm').getAttribute('points') !== before",
-            arg=before[0],
-        )
+        until(lambda: arms_drawn(page)[0] != before[0])
         page.click("#arms button")
         assert page.inner_text("#arms button") == "play"
         zoom_in(page)
         toggle_lines(page)
         watched.assert_whole()
         page.set_viewport_size({"width": 500, "height": 900})
-        page.wait_for_function("document.querySelector('.uplot').getBoundingClientRect().width < 500")
+        shows(page, "document.querySelector('.uplot').getBoundingClientRect().width < 500")
         watched.assert_whole()
         page.emulate_media(color_scheme="dark")
         watched.assert_whole()
