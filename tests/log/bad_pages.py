@@ -54,12 +54,12 @@ def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
 
 def shelf() -> dict[str, bytes]:
     """Whole logs of every kind of writer: live and virtual ones, and as other programs write them."""
-    long = recorded("paper", {"duration_s": 3.0})
+    long = recorded("paper", {"duration_s": 1.5})
     live = (GOLDEN / "live-paper.mcap").read_bytes()
     return {
         "short": recorded("paper"),
         "long": long,
-        "another run": recorded("paper", {"duration_s": 3.0, "seed": 5}),
+        "another run": recorded("paper", {"duration_s": 1.5, "seed": 5}),
         "live": live,
         "live elsewhere": (GOLDEN / "live-4g.mcap").read_bytes(),
         "unpacked": rewritten(long, 50_000, compression=CompressionType.NONE),

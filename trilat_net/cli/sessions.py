@@ -1,6 +1,7 @@
 """Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run here."""
 
 import re
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,6 +29,16 @@ def demo_command(scenario: options.ScenarioArgument = "paper", *, run: options.R
     run_and_report(run.load(scenario), run)
 
 
+def _describe_kept(path: Path) -> str:
+    """Returns what the log of a session that was interrupted holds and lacks; "" if it cannot be read."""
+    from ..errors import LogError
+    from ..log.log_reader import open_log
+
+    with suppress(LogError):
+        return f": {open_log(path).headline().partition('; ')[2]}"
+    return ""
+
+
 def run_and_report(chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None) -> None:
     """Runs a scenario live, then verifies and reports; a page may end it as planned, and gets the report."""
     from sites.demo_session import run_demo
@@ -45,7 +56,7 @@ def run_and_report(chosen: "Scenario", run: options.RunOptions, page: "PageAtten
         terminal.print_error(problem)
     there = outcome.log.exists()
     if outcome.interrupted and not (page and there):
-        kept = f"; {outcome.log} holds what there was" if there else ""
+        kept = f"; {outcome.log} holds what there was{_describe_kept(outcome.log)}" if there else ""
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not there:
