@@ -335,7 +335,7 @@ class PageServer:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         counted = {"refused": self.refused, "strangers": Strangers(self.refused)}
         encrypted = self._tls is not None
-        timeouts = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0} if encrypted else {}
+        timeouts: dict[str, Any] = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0} if encrypted else {}
         server = await serve(
             *(self._attend, self._host, self._port),
             ssl=self._tls,
