@@ -334,8 +334,9 @@ class PageServer:
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         counted = {"refused": self.refused, "strangers": Strangers(self.refused)}
-        encrypted = self._tls is not None
-        timeouts: dict[str, Any] = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0} if encrypted else {}
+        timeouts: dict[str, Any] = {}
+        if self._tls is not None:
+            timeouts = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0}
         server = await serve(
             *(self._attend, self._host, self._port),
             ssl=self._tls,

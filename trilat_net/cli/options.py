@@ -350,7 +350,11 @@ class LawFiles(NamedTuple):
         bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
     ] = False
     remember: Annotated[
-        bool, flag("--remember", "Let the --law FILE run for other logs that name its hash, too.")
+        bool,
+        flag(
+            "--remember",
+            "Let the --law FILE run for other logs that name its hash and the same settings, too.",
+        ),
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":

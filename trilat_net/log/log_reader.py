@@ -508,7 +508,7 @@ def open_log(
         law: files of control laws that the log names, which may run when it is executed, see
             docs/code-that-runs.md. Laws of runs that this process has made may.
         other_version: whether these may have another hash than the log names.
-        remember: whether they may run for other logs that name their hashes too.
+        remember: whether they may run for other logs that name their hashes, with the same settings.
 
     Raises:
         UsageError: `law` is none that the log names.
