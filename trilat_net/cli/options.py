@@ -313,7 +313,7 @@ class MemberOptions(NamedTuple):
 
             keys = read_member_keys(keys, stops=True)
         secured = secure_connection(connection, keys, insecure=self.insecure)
-        if text := secured.describe_end():
+        if not stops and (text := secured.describe_end()):  # who stops an arm reads no notes
             terminal.print_note(text)
         return secured
 
