@@ -9,20 +9,18 @@ site has in use, or to which the picture of the site's user has come (`SessionVi
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows, joint_positions_m, upright_axes
+from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
 from trilat_net.core.live_hand import HandInForce
-from trilat_net.core.task_space import PLACE
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.core.vectors import Array
 from trilat_net.log.event_text import describe_event
-from trilat_net.log.orientations import QUATERNION_AXES, SteadyQuaternion
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.laws import identify_law
@@ -160,20 +158,6 @@ class ArmFrames:
         return total
 
 
-class BodyTurns:
-    """Poses of a plant's bodies in one stream of frames: of both signs of a quaternion the nearer one."""
-
-    def __init__(self) -> None:
-        self._signs: defaultdict[int, SteadyQuaternion] = defaultdict(lambda: SteadyQuaternion(w=0))
-
-    def align(self, bodies: Sequence[float]) -> list[Any]:
-        """Returns poses, seven numbers each: x, y, z, m, and the unit quaternion w, x, y, z."""
-        poses = np.reshape(bodies, (-1, PLACE + len(QUATERNION_AXES)))
-        for body, pose in enumerate(poses):
-            pose[PLACE:] = self._signs[body].follow(pose[PLACE:].tolist())
-        return _rounded(poses.ravel())
-
-
 class SessionFrames:
     """The frames of one session; `make` is called at the rate of the pages.
 
@@ -291,7 +275,7 @@ class SessionFrames:
         other = self._view.sites[peer]
         if tick != known["tick"] and other.window.knows(tick):
             q = other.window.rows(tick, tick).q[0]
-            bodies = self._turns[site, peer].align(other.bodies.get(tick, []))
+            bodies = _rounded(self._turns[site, peer].align(other.bodies.get(tick, [])))
             known = {**self._arms[peer].pose(q), "tick": tick, "bodies": bodies}
         self._known[site, peer] = known
         return known
@@ -314,7 +298,7 @@ class SessionFrames:
             "tick": record.tick,
             "used": record.used,
             "mode": record.mode,
-            "bodies": self._turns["", name].align(record.bodies),
+            "bodies": _rounded(self._turns["", name].align(record.bodies)),
             "alarm": None if alarm is None else _show_alarm(alarm),
             "ended": site.ended or self._view.ended,
             "silent_s": 0.0 if self._view.ended else round(self._view.silence_s(site), 1),
