@@ -486,8 +486,8 @@ class ExperimentAnalysis(Result):
                 )
                 for one in self.time_comparisons
             ]
-            heads = ("difference", "longer", "shorter", "median", "p, sign test", "p, Holm")
-            yield TextTable(heads, found, align="lrrrrr")
+            columns = ("difference", "longer", "shorter", "median", "p, sign test", "p, Holm")
+            yield TextTable(columns, found, align="lrrrrr")
             yield ""
 
     def _write_measure_blocks(self) -> Iterator[Block]:
