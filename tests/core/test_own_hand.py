@@ -87,7 +87,7 @@ def test_it_says_when_it_needs_the_arm() -> None:
 @pytest.mark.parametrize(
     ("goal", "problem"),
     [
-        ((1.0,), "1 numbers, not 2"),
+        ((1.0,), "1 number, not 2"),
         ((1.0, 2.0, 3.0), "3 numbers, not 2"),
         ((math.nan, 0.0), "not finite"),
         ((math.inf, 0.0), "not finite"),

@@ -167,10 +167,10 @@ def test_scenarios_arm_as_plant_differs_by_the_integrators_order() -> None:
     [
         ("raise", "RuntimeError: the belt is torn"),
         ("nan", "qd is .*not finite"),
-        ("one", "q has 1 numbers, and the arm has 2 joints"),
+        ("one", "q has 1 number, and the arm has 2 joints"),
         ("alone", "ValueError: not enough values"),
         ("nothing", "TypeError"),
-        ("touch", "tau_x has 1 numbers"),
+        ("touch", "tau_x has 1 number"),
     ],
 )
 def test_a_plant_that_fails_ends_the_run_named(how: str, problem: str, tmp_path: Any) -> None:

@@ -168,7 +168,7 @@ def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
 FAILURES = {
     "nan": "torque[1] is nan, no finite number",
     "raises": "ValueError: out of",
-    "short": "torque has 1 numbers, not 2",
+    "short": "torque has 1 number, not 2",
     "none": "TypeError",
     "remembers": "memory has 1025 numbers, at most 1024 are kept",
     "leaves": "SystemExit: 0",

@@ -145,7 +145,7 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "a message that is none": (
         lambda: edited(DATA, record=lambda r: {**r, "q": [1.0]} if r["tick"] == 3 else r),
         {"schema", "sequence", "accounts"},
-        "q has 1 numbers, not 2",
+        "q has 1 number, not 2",
     ),
     "sent at another time": (
         lambda: edited(DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r),

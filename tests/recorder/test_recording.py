@@ -127,7 +127,7 @@ def test_member_that_says_more_than_clock_allows_is_not_believed(
     assert (account.expected, account.received, account.missing) == (TICKS, TICKS, 0)
     desk.whole("s")
     assert desk.recording.problem() is None
-    assert any(f"1 messages dropped: {reason}" in line for line in desk.recording.summary())
+    assert any(f"1 message dropped: {reason}" in line for line in desk.recording.summary())
 
 
 def test_answer_for_more_than_clock_allows_is_not_believed() -> None:

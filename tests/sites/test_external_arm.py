@@ -422,7 +422,7 @@ class Heard:
         (b"\xc1", "malformed"),
         (bytes(70_000), "oversized"),
         (measurement(v=VERSION + 1), "version"),
-        (measurement(q=[1.0]), "of 1 joints; the scenario has 2"),
+        (measurement(q=[1.0]), "of 1 joint; the scenario has 2"),
         (measurement(qd=[1.0]), "malformed"),
         (measurement(q=[1.0] * 13), "malformed"),
         (measurement(q=[1.0, math.nan]), "not finite"),

@@ -110,7 +110,7 @@ REFUSED = {
         payload(echo=[[0, 0, 0]] * 33),
         b"\x91" * 2_000,
     ],
-    "of 1 joints; the scenario has 2": [payload(q=[1.0])],
+    "of 1 joint; the scenario has 2": [payload(q=[1.0])],
     "oversized": [payload(padding="x" * 3_000), bytes(MAX_BYTES + 1)],  # thousands may wait
     "version": [payload(v=VERSION + 1), payload(v=0)],
     "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],

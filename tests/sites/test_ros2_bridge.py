@@ -342,7 +342,7 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
     assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
-        "refused: t/s/set_dominance has 1 numbers; the peers are m1, m2",
+        "refused: t/s/set_dominance has 1 number; the peers are m1, m2",
         "refused: t/s/set_dominance has a number that is not finite",
         "refused: t/s/set_dominance is not plain CDR, little-endian",
     ]

@@ -393,19 +393,16 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
     for effect in again.sites.values():
         name = effect.site
         if effect.stands:
-            yield (
-                f"{name}: {count_nouns(effect.stands, 'record')} as before: too little is "
-                "known to execute more"
-            )
+            kept = count_nouns(effect.stands, "record stands as it is", "records stand as they are")
+            yield f"{name}: {kept}: too little is known to execute more"
         if effect.assumed:
-            yield (
-                f"{name}: {count_nouns(effect.assumed, 'tick has', 'ticks have')} no "
-                "record in the log: the arrivals are assumed"
-            )
+            unknown = count_nouns(effect.assumed, "tick has", "ticks have")
+            yield f"{name}: {unknown} no record in the log: the arrivals are assumed"
         if away := again.before.absent_ticks(name):
             yield f"{name}: {away} of them it did not make: it was away, and is executed as if it were not"
         if effect.lacking:
-            yield f"{name}: {count_nouns(effect.lacking, 'arrival')} not in the log: executed without"
+            lost = count_nouns(effect.lacking, "sample that arrived is", "samples that arrived are")
+            yield f"{name}: {lost} not in the log: executed without"
         if not effect.executed:
             yield f"{name}: nothing could be executed"
 

@@ -501,4 +501,5 @@ def _find_unexplained(log: Log, site: str) -> str:
     counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
     if inner <= max([stated.get("missing", 0), *counts]):
         return ""
-    return f"missing in between: {count_nouns(inner, 'record')} of {site}, and nothing in the log explains it"
+    lost = count_nouns(inner, f"record of {site} is", f"records of {site} are")
+    return f"{lost} missing in between, and nothing in the log explains it"

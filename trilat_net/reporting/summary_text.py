@@ -138,7 +138,8 @@ def format_clock(use: link_summary.ClockSummary) -> str:
     if use.drift_ppm is not None:
         words.append(f"drift {use.drift_ppm:+.2f} ppm")
     if use.faults:
-        words.append(f"{count_nouns(use.faults, 'sample')} came before being sent: a clock has stepped")
+        early = "sample came before it was sent", "samples came before they were sent"
+        words.append(f"{count_nouns(use.faults, *early)}: a clock has stepped")
     return ", ".join(words)
 
 

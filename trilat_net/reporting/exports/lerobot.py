@@ -98,7 +98,7 @@ def _write(
         (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n")
     return (
         f"{count_nouns(len(index), 'frame')} in {count_nouns(len(starts), 'episode')}; "
-        f"{count_nouns(lost, 'frame')} left out, in gaps"
+        f"{count_nouns(lost, 'frame lies in a gap and is', 'frames lie in gaps and are')} left out"
     )
 
 

@@ -400,7 +400,8 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
     if not 1 <= size <= 2 or len(set(protocol.users)) < size:
         yield f"users are one or two sites, not {', '.join(protocol.users)}"
     elif len(names) % size:
-        yield f"{count_nouns(len(names), 'participant')}: pairs need an even number"
+        lone = count_nouns(len(names), "participant makes", "participants make")
+        yield f"{lone} no pairs: their number must be even"
     rows = len(list_orders(protocol.design, list(protocol.conditions), protocol.seed))
     if protocol.design in ("williams", "latin") and len(protocol.groups) % rows:
         whose = "pairs" if size == 2 else "participants"
