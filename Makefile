@@ -65,21 +65,22 @@ $(VENV)/long.stamp: requirements/long.lock $(VENV)/dev.stamp
 
 test:
 	@$(MAKE) --no-print-directory -j2 $(VENV)/dev.stamp setup
+	@echo "tests, live sessions and linters at once: about six minutes on two cores"
 	@$(MAKE) --no-print-directory -j3 sessions pytest lint # real sessions come first: the others give way
 
 pytest: $(VENV)/dev.stamp
-	nice -n 19 $(BIN)/python -m pytest -q -n $$(getconf _NPROCESSORS_ONLN) --dist worksteal \
+	@TRILAT_TEST_RUN=tests nice -n 19 $(BIN)/python -m pytest -q -p tests.progress -n $$(getconf _NPROCESSORS_ONLN) --dist worksteal \
 		-m "not live and not long" --ignore tests/live
 
 sessions: $(VENV)/dev.stamp
-	flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -m "live and not long" tests/live tests/studies/sweep
+	@TRILAT_TEST_RUN=sessions flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -p tests.progress -m "live and not long" tests/live tests/studies/sweep
 
 push-set: $(VENV)/dev.stamp
 	$(BIN)/python -m tests.push_set
 
 test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not live"
-	$(BIN)/python -m pytest -q -m live
+	TRILAT_TEST_RUN=all-tests $(BIN)/python -m pytest -q -p tests.progress -n auto --dist worksteal -m "not live"
+	TRILAT_TEST_RUN=all-sessions $(BIN)/python -m pytest -q -p tests.progress -m live
 
 containers: setup
 	.ci/compose

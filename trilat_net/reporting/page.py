@@ -38,6 +38,7 @@ from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.joint_motion import explain_absent_operator
 from .figures.twin_differences import draw_twins
 from .page_data import Chart
+from .result_text import escape_text
 from .style import typeset
 
 _PAGE_DPI = 110
@@ -228,7 +229,7 @@ def _render_check_lines(verdicts: Sequence[Finding]) -> str:
     for line in verdicts:
         bad = "✗ failed" if line.judged else "not judged"
         kind, mark = ("passed", "✓ ok") if line.passed else ("failed", bad)
-        items += f'<li class="{kind}"><b>{mark}</b>{escape(line.check)}: {escape(line.text)}</li>'
+        items += f'<li class="{kind}"><b>{mark}</b>{escape(line.check)}: {escape_text(line.text)}</li>'
     return f'<ul class="verdicts">{items}</ul>' if items else ""
 
 
@@ -469,7 +470,7 @@ def _swatch(log: Log, name: str) -> str:
 
 
 def _render_facts(*rows: tuple[str, str]) -> str:
-    lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape(value)}</td></tr>" for key, value in rows)
+    lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape_text(value)}</td></tr>" for key, value in rows)
     return f'<table class="facts">{lines}</table>'
 
 

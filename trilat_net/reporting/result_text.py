@@ -6,11 +6,12 @@ the rooms below have a module here.
 Every cell of a table is text already, and all forms show the same cells in the same order.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
 from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.text import Text
 
@@ -23,6 +24,15 @@ if TYPE_CHECKING:
 _COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "FAIL": "red"}
 MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {"note": "note"}
 """Of findings, by their state."""
+
+
+HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
+"""A hash in hexadecimal digits, or the beginning of one: it stays on one line, so that it can be copied."""
+
+
+def escape_text(text: str) -> str:
+    """Returns a text as HTML in which no line breaks within a hash."""
+    return HASH.sub(r'<span style="white-space:nowrap">\g<0></span>', escape(text))
 
 
 class TextTable(NamedTuple):
@@ -60,8 +70,11 @@ class TextTable(NamedTuple):
         from rich.table import Table
 
         table = Table(box=None, pad_edge=False, show_header=any(self.titles))
-        for title, right in zip(self.titles, self.to_the_right, strict=True):
-            table.add_column(Text(sanitize(title)), justify="right" if right else "left", overflow="fold")
+        for n, (title, right) in enumerate(zip(self.titles, self.to_the_right, strict=True)):
+            cells = [row[n] for row in self.rows if n < len(row)]
+            widest = max((len(found) for cell in cells for found in HASH.findall(cell)), default=None)
+            side: Any = "right" if right else "left"
+            table.add_column(Text(sanitize(title)), justify=side, overflow="fold", min_width=widest)
         for row in self.rows:
             heading = "bold" if len(row) == 1 < len(self.headers) else ""
             table.add_row(*(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row))
@@ -82,7 +95,7 @@ class TextTable(NamedTuple):
 
         def line(cells: Sequence[str], kind: str) -> str:
             pairs = zip(cells, sides, strict=False)
-            made = (f'<{kind} style="text-align:{side}">{escape(cell)}</{kind}>' for cell, side in pairs)
+            made = (f'<{kind} style="text-align:{side}">{escape_text(cell)}</{kind}>' for cell, side in pairs)
             return f"<tr>{''.join(made)}</tr>"
 
         head = f"<thead>{line(self.titles, 'th')}</thead>" if any(self.titles) else ""
@@ -127,7 +140,7 @@ class MarkedText(NamedTuple):
 
     def html(self) -> str:
         """Returns it in HTML."""
-        text = escape(sanitize(self.lines()[0], MAX_LETTERS))
+        text = escape_text(sanitize(self.lines()[0], MAX_LETTERS))
         return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
 
 
