@@ -20,9 +20,9 @@ from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_to
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
 from trilat_net.core.vectors import Array
-from trilat_net.log.event_text import describe_event
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
+from trilat_net.scenario.event_text import describe_event
 from trilat_net.scenario.laws import identify_law
 
 from .session_view import SessionView, SiteView, Tail
@@ -339,4 +339,5 @@ def _show_alarm(alarm: LifeAlarm) -> Json:
 def show_event(event: Event) -> Json:
     """Returns an event as a page lists it."""
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    return {"t": t_s, "member": event.member, "kind": event.kind, "text": describe_event(event)}
+    text = describe_event(event.kind, event.text, event.command)
+    return {"t": t_s, "member": event.member, "kind": event.kind, "text": text}

@@ -12,12 +12,12 @@ import numpy as np
 
 from ..core.session_life import HELD_OVERRUN_TICKS
 from ..core.ticks import find_alarm
-from ..log.event_text import describe_event
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..net.messages import MODES, ModeMeaning
 from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
+from ..scenario.event_text import describe_event
 from ..scenario.run_changes import describe_change, find_orderer
 from ..scenario.scenario_types import Change
 from ..wording import count_nouns
@@ -92,7 +92,9 @@ def list_changes(log: Log) -> list[AppliedChange]:
             for text in texts:
                 change = msgspec.json.decode(text, type=Change)
                 event = said.get((site, text))
-                sentence = describe_change(change) if event is None else describe_event(event)
+                sentence = describe_change(change)
+                if event is not None:
+                    sentence = describe_event(event.kind, event.text, event.command)
                 found.append(AppliedChange(change, site, tick, sentence))
     before_s = recorded_end_s(log)
     kept = (c for c in found if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS)

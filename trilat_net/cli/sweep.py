@@ -132,7 +132,7 @@ def _run_sweep(
     from ..studies.sweep import sweep_results, sweep_run
 
     begun, plan, done = None, asked, []
-    if path is not None and (plan is None or (path / sweep_run.PLAN_FILE).exists()):
+    if path is not None and (plan is None or (path / sweep_results.PLAN_FILE).exists()):
         begun = sweep_run.open_sweep_folder(path, plan)
         plan, done = begun.plan, begun.read_done()
     assert plan is not None

@@ -81,8 +81,8 @@ class EpisodePicture:
             axes.text(0.03, 0.97, name, transform=axes.transAxes, va="top", fontsize=9.0)
         first = next(iter(self._panels.values()))
         first.text(0.03, 0.03, title, transform=first.transAxes, va="bottom", fontsize=8.0)
-        self._canvas.draw()
-        pixels: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[:, :, :3].copy()
+        self._canvas.draw()  # type: ignore[no-untyped-call]
+        pixels: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[no-untyped-call]
         return pixels
 
 

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-
 from ..wording import count_nouns
 
 _SEQUENCE_NUMBERS = 2**16

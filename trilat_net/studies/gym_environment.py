@@ -440,7 +440,7 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
     return [
         name + "".join(f"[{index}]" for index in place)
         for name, box in parts.items()
-        for place in np.ndindex(box.shape)  # type: ignore[arg-type] - a box has one
+        for place in np.ndindex(box.shape or ())
     ]
 
 

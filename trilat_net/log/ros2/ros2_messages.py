@@ -21,7 +21,7 @@ from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
-from ..event_text import describe_event
+from ...scenario.event_text import describe_event
 from ..mcap_writer import McapWriter
 from ..site_log import find_task_errors
 from . import cdr
@@ -80,7 +80,7 @@ _MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mo
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
     """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below 0."""
-    text = describe_event(event)
+    text = describe_event(event.kind, event.text, event.command)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
     yield EVENTS, cdr.pack_string(f"{event.member}: {text}")
     yield LINES, cdr.pack_log(stamp_ns, level, event.member, text)

@@ -5,8 +5,7 @@ from typing import Any, get_args
 
 import pytest
 
-from trilat_net.log.event_text import describe_event
-from trilat_net.net.messages import Event
+from trilat_net.scenario.event_text import describe_event
 from trilat_net.scenario.run_changes import describe_change, find_orderer
 from trilat_net.scenario.scenario_types import Change, SiteOrder
 
@@ -26,10 +25,10 @@ CHANGES = {
 }
 
 
-def event_of(table: dict[str, Any], text: str = "s takes in {}") -> Event:
-    """The event of a change, as older programs wrote it, with the command in its text."""
+def event_of(table: dict[str, Any], text: str = "s takes in {}") -> tuple[str, str, str]:
+    """Kind, text and command of an event, as older programs wrote them: the text quotes the command."""
     command = json.dumps(table)
-    return Event(member="s", boot=1, kind="change", text=text.format(command), command=command)
+    return "change", text.format(command), command
 
 
 @pytest.mark.parametrize("sentence", CHANGES)
@@ -38,8 +37,8 @@ def test_a_change_is_a_sentence(sentence: str) -> None:
     assert describe_change(Change(**table), "the experimenter") == sentence
     without = sentence.replace(" by the experimenter", "")
     assert describe_change(Change(**table)) == without
-    assert describe_event(event_of(table)) == without
-    assert describe_event(event_of(table, sentence)) == sentence
+    assert describe_event(*event_of(table)) == without
+    assert describe_event(*event_of(table, sentence)) == sentence
 
 
 @pytest.mark.parametrize("order", [order for order in get_args(SiteOrder) if order])
@@ -62,5 +61,4 @@ def test_who_ordered_a_stop_is_found_again() -> None:
 
 @pytest.mark.parametrize("command", ["{", "{}", '{"at_s": "x"}', '{"at_s": 1.0, "link": "a->b"}', "[]", "3"])
 def test_a_strangers_command_keeps_its_text(command: str) -> None:
-    event = Event(member="s", boot=1, kind="change", text=f"s takes in {command}", command=command)
-    assert describe_event(event)
+    assert describe_event("change", f"s takes in {command}", command)
