@@ -59,7 +59,7 @@ class RecoverySurvey:
         self.count: int | None = None
         self._scanner = scanner
         self._sessions: list[dict[str, str]] = []
-        self._scenarios: list[bytes] = []
+        self._scenarios: list[tuple[bytes, bool]] = []  # and whether a checksum covers it
         self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
         self._indexes: dict[int, Any] = {}  # of chunks, by offset
         footer = scanner.footer()
@@ -120,15 +120,21 @@ class RecoverySurvey:
                 self._indexes[record.chunk_start_offset] = record
             case _:
                 if record.name == SCENARIO and mcap_records.has_right_crc(content):
-                    self._scenarios.append(record.data)
+                    is_covered = content[-4:] != bytes(4)
+                    self._scenarios.append((record.data, is_covered))
                 self.attachments.setdefault(record.name, record.data)
 
     def _choose_session(self) -> None:
-        """Chooses the session and the scenario that belong together; a checksum of 0 covers nothing."""
+        """Chooses the session and the scenario that belong together.
+
+        A scenario that no session names counts if a checksum covers it: one of 0 covers nothing, and a page
+        that was zeroed leaves it behind.
+        """
         self.attachments.pop(SCENARIO, None)
-        if self._scenarios:
-            self.attachments[SCENARIO] = self._scenarios[0]
-        digests = {hashlib.sha256(text).hexdigest(): text for text in self._scenarios}
+        covered = [text for text, is_covered in self._scenarios if is_covered]
+        if covered:
+            self.attachments[SCENARIO] = covered[0]
+        digests = {hashlib.sha256(text).hexdigest(): text for text, _ in self._scenarios}
         for session in self._sessions:
             if session.get("scenario_sha256") in digests:
                 self.metadata[SESSION] = session
