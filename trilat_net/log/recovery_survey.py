@@ -95,7 +95,9 @@ class RecoverySurvey:
         self.is_chunked = bool(self._chunks)
         self._choose_session()
         self.is_foreign_session = False
-        self._reject_foreign_session()
+        epochs_ns = self._find_epochs_ns()
+        self.is_session_log |= bool(epochs_ns)
+        self._reject_foreign_session(epochs_ns)
         self.misplaced = self._find_misplaced_chunks()
         is_torn_chunk = scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
         self.is_chunked |= is_torn_chunk
@@ -143,12 +145,11 @@ class RecoverySurvey:
         if self._sessions:
             self.metadata[SESSION] = self._sessions[0]
 
-    def _reject_foreign_session(self) -> None:
+    def _reject_foreign_session(self, epochs_ns: set[int]) -> None:
         """Leaves out a session, its scenario and its channels if the messages are of another session."""
         session = self.metadata.get(SESSION)
         if session is None:
             return
-        epochs_ns = self._find_epochs_ns()
         if not epochs_ns or session.get("epoch_unix_ns", "") in set(map(str, epochs_ns)):
             return
         self.is_foreign_session = True
