@@ -123,7 +123,8 @@ def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> No
         code, text = order("enable s", whose)
         assert code != 0
         assert f"these are the keys of {whose}, and this takes those of operator" in text
-        assert order("enable s", OPERATOR)[0] == 0
+        code, text = order("enable s", OPERATOR)
+        assert code == 0, text
     assert order("stop --end", "m")[0] != 0
     assert order("stop --end", OPERATOR)[0] == 0
     session.ends_well()
