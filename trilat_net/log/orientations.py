@@ -71,8 +71,10 @@ def expand_poses(x: Array) -> Array:
 
     An environment observes poses so, and a hand of one's own gets the same numbers from `HandView`:
 
-    >>> tn.expand_poses(np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])).round(6).tolist()
-    [0.5, 0.0, 0.2, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0]
+    >>> import numpy as np
+    >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])
+    >>> np.rint(10.0 * tn.expand_poses(quarter_turn)).astype(int).tolist()
+    [5, 0, 2, 0, 10, 0, -10, 0, 0]
 
     Args:
         x: what sites share in task space: places, shape (..., 3), m, or places and rotation vectors,
