@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, Page, WebSocketRoute, sync_playwright
 from live.experiment_stage import Stage
 from live.page_server import PageServer
 from tests.live.browsers import launch, needs_browser
+from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
@@ -84,7 +85,7 @@ def form_page(browser: Browser, address: str, stage: Json, screen: str) -> Itera
         problems: list[str] = []
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.route_web_socket("**/socket*", attend)
-        page.goto(f"{address}?as=m1")
+        page.goto(with_query(address, "as=m1"))
         page.wait_for_selector("#sheet form")
         yield page, sent
         assert problems == []
