@@ -8,12 +8,13 @@ from playwright.sync_api import Browser, sync_playwright
 
 from live.page_server import PageServer
 from tests.live.browsers import launch, needs_browser
+from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from trilat_net.core.ticks import LifeReason, find_alarm
 from trilat_net.net.clock import SystemClock
 
-from .recorded_session import QUERIES, SCREENS, RecordedSession, record_session
+from .recorded_session import ROLES, SCREENS, RecordedSession, record_session
 
 pytestmark = [needs_browser, pytest.mark.long]
 
@@ -99,15 +100,15 @@ def test_users_and_watchers_get_neither_button_nor_command(
         assert "trilat " not in page.inner_text("body").replace("trilat live", "")
 
 
-@pytest.mark.parametrize("role", QUERIES)
+@pytest.mark.parametrize("role", ROLES)
 def test_only_experimenters_who_are_cut_off_read_a_command(browser: Browser, role: str) -> None:
     """Their page can stop no arm any more; others tell the experimenter."""
     context = browser.new_context()
     try:
         page = context.new_page()
         with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-            address, _, token = server.address.partition("#")
-            page.goto(address + QUERIES[role] + (f"#{token}" if token else ""))
+            query = {"experimenter": "", "user": "as=m1", "watcher": "watch"}[role]
+            page.goto(with_query(server.address, query))
             until(lambda: page.evaluate("Boolean(window.trilat?.hello)"), 30.0)
             assert "trilat " not in page.inner_text("body").replace("trilat live", "")
         until(lambda: "cut off" in page.inner_text("#todo"), 30.0)
@@ -118,7 +119,7 @@ def test_only_experimenters_who_are_cut_off_read_a_command(browser: Browser, rol
         context.close()
 
 
-@pytest.mark.parametrize("role", QUERIES)
+@pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("screen", SCREENS)
 def test_silence_is_waited_for_and_is_no_end(
     session: RecordedSession, address: str, browser: Browser, screen: str, role: str
@@ -133,7 +134,7 @@ def test_silence_is_waited_for_and_is_no_end(
         until(lambda: "No site" not in page.inner_text("#todo"))
 
 
-@pytest.mark.parametrize("role", QUERIES)
+@pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("screen", SCREENS)
 def test_after_the_end_nothing_is_red_and_nothing_stops(
     session: RecordedSession, address: str, browser: Browser, screen: str, role: str
