@@ -50,6 +50,7 @@ CHAINS = [
         "cp sim.mcap seen.mcap",
         "trilat log view seen.mcap",
         "trilat keys new keys m1 m2 s recorder",
+        "trilat keys renew keys",
         "trilat keys info keys/m1",
         "trilat doctor",
     ],

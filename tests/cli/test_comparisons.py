@@ -87,3 +87,14 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
 )
 def test_bad_input_is_refused_in_one_line(logs: Path, arguments: list[str], facts: list[str]) -> None:
     trilat("compare", *arguments, cwd=logs).refuses(*facts)
+
+
+@pytest.mark.long
+def test_a_built_in_law_is_called_by_its_name(tmp_path: Path) -> None:
+    for law in ("tdpa", "wave", "adaptive"):
+        how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
+        trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()
+    text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
+    assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(text.split())
+    for word in ("somebody", "own law", "law own"):
+        assert word not in text

@@ -2,10 +2,12 @@ import base64
 import json
 import re
 from html.parser import HTMLParser
+from io import StringIO
 
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
@@ -15,6 +17,7 @@ from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
 from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures, write_report_figures
 from trilat_net.reporting.page import render_report, write_report
+from trilat_net.reporting.result_text import TextTable
 
 VERDICTS = [Finding("records", "all <b>there</b>", True), Finding("executed again", "differs", False)]
 
@@ -174,3 +177,16 @@ def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
 
 def test_a_run_that_diverged_has_a_page():
     assert "<tr><th>diverged</th><td>yes</td></tr>" in page(logs.diverged())[0]
+
+
+def test_no_line_breaks_within_a_hash() -> None:
+    digits = "0123456789abcdef" * 4
+    table = TextTable(("name", "sha256"), [("a law with a name of many words", digits), ("b", "decade")])
+    assert f'<span style="white-space:nowrap">{digits}</span>' in table.html()
+    assert "<td style" in table.html()
+    assert ">decade</td>" in table.html()  # a word of letters is no hash
+    for width in (70, 80, 120):
+        console = Console(width=width, file=StringIO())
+        console.print(table.rich())
+        printed = console.file.getvalue()  # type: ignore[attr-defined]
+        assert any(digits in line for line in printed.splitlines())

@@ -197,7 +197,7 @@ def keys_renew_command(
     from ..net.member_keys import renew_keys
 
     for one in renew_keys(folder, members or (), days):
-        terminal.print_line(f"{one}: valid for {days} days from now")
+        terminal.print_line(f"{one}: valid for {count_nouns(days, 'day')} from now")
 
 
 @options.command("lab")
