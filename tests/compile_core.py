@@ -22,6 +22,7 @@ from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.execution.fused import FusedRun
 from trilat_net.process import Interrupt, count_cores, worker_pool
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.wording import count_nouns
 
 OF_TESTS = ("paper", "six joints", "task space")
 SHIPPED = ("paper", "six_joints", "seven_joints", "unlike_arms")
@@ -52,9 +53,9 @@ def compile_part(part: str) -> str:
 
 def compile_parts(parts: Sequence[str], cores: int) -> None:
     """Compiles parts beside each other, and says how far it is."""
-    print(
-        f"compiling {len(parts)} parts of the core on {cores} processors, half a minute each ...", flush=True
-    )
+    parts_text = count_nouns(len(parts), "part")
+    cores_text = count_nouns(cores, "processor")
+    print(f"compiling {parts_text} of the core on {cores_text}, half a minute each ...", flush=True)
     with Interrupt() as interrupt, interrupt.raising(), worker_pool(cores) as pool:
         running = [pool.submit(compile_part, part) for part in parts]
         for done, one in enumerate(as_completed(running), 1):
