@@ -9,6 +9,7 @@ import { renew, Stage } from "./stage.js";
 import { Headset } from "./xr.js";
 
 const $ = (id) => document.getElementById(id);
+const countNouns = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 const page = { hello: null, frame: null, takesPart: null, sent: 0, frames: 0, energies: [] };
 window.trilat = page; // for tests, and for whoever opens the console
 
@@ -203,11 +204,11 @@ function take(frame) {
   advise(frame);
   $("clock").textContent = `${frame.t.toFixed(1)} s`;
   if (page.hello.as) return;
-  const pages = frame.pages === 1 ? "1 page" : `${frame.pages} pages`;
+  const pages = countNouns(frame.pages, "page");
   const behind = Math.max(...parts.names.map((name) => frame.sites[name].late_us));
-  const refused = frame.refused ? ` · ${frame.refused} messages refused` : "";
+  const refused = frame.refused ? ` · ${countNouns(frame.refused, "message")} refused` : "";
   const missing = parts.names.reduce((sum, name) => sum + frame.sites[name].missing, 0);
-  $("counts").textContent = `${pages} · loops late by at most ${behind} µs · ${missing} records missing${refused}`;
+  $("counts").textContent = `${pages} · loops late by at most ${behind} µs · ${countNouns(missing, "record")} missing${refused}`;
 }
 
 let raised = "";
