@@ -17,7 +17,7 @@ from .documentation import find_blocks, read_commands
 ROOT = Path(__file__).parents[1]
 
 FIRST = [
-    "trilat sim two_sites --duration 2 -o sim.mcap",
+    "trilat sim two_sites --duration 20 -o sim.mcap",
     "trilat keys pair lab",
 ]
 """Makes what several chains need."""
