@@ -186,6 +186,7 @@ def record_session(
     clock: Clock,
     say: Callable[[str], None],
     afterwards: Callable[[], None] = lambda: None,
+    warn: Callable[[], None] = lambda: None,
 ) -> int:
     """Records one session, as a process of its own.
 
@@ -198,6 +199,7 @@ def record_session(
         say: prints a line for the user.
         afterwards: works on the finished log of a session that was not interrupted. The recorder remains a
             member until that is done: sites with `--stay` wait for it.
+        warn: warns the user of what may harm the recording, once the connection is open.
 
     Returns:
         The exit code: 0, or 128 and the number of the signal that ended it.
@@ -224,6 +226,7 @@ def record_session(
         )
         if bus is None:
             return interrupt.exit_code
+        warn()
         recorder = Recorder(
             bus, clock, session, boot, storage, interrupt.insists, say, is_ending=interrupt.requested
         )

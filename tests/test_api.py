@@ -94,6 +94,7 @@ COUNTERPARTS = {
     "compute_experiment_power": ["experiment power"],
     "identify_hand": ["identify hand"],
     "create_keys": ["keys new"],
+    "renew_keys": ["keys renew"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],
     **{

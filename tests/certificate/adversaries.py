@@ -118,8 +118,10 @@ STABLE = ("stable",)
 
 
 def _load(name: str, overrides: Mapping[str, Any] | None = None, /, **more: Any) -> Callable[[], Scenario]:
-    changes = {**(overrides or {}), **{key.replace("__", "."): value for key, value in more.items()}}
-    return lambda: load_scenario(name, changes)
+    """Makes a shipped scenario with changes, at the speed limit for which its verdict was judged."""
+    changes = {key.replace("__", "."): value for key, value in more.items()}
+    limit = {"limits.qd_limit_rad_s": 100.0}
+    return lambda: load_scenario(name, {**limit, **(overrides or {}), **changes})
 
 
 PUSH = [{"kind": "recorded", "points": [[0.0, 3.0, 0.0], [1e3, 3.0, 0.0]]}]

@@ -179,7 +179,14 @@ def _draw_wall(rng: np.random.Generator) -> Drawn:
     rate_hz = int(rng.choice([100, 200]))
     edge = 15.5e3 * rate_hz / 1000
     K = edge * (rng.uniform(0.8, 1.2) if rng.random() < 0.5 else rng.uniform(0.2, 2.5))
-    made = {SAMPLED: True, STIFFNESS: K, "rate_hz": rate_hz, "duration_s": DRAWN_S}
+    # The stored truths are those of the speed limit that `windup` had when they were found.
+    made = {
+        SAMPLED: True,
+        STIFFNESS: K,
+        "rate_hz": rate_hz,
+        "duration_s": DRAWN_S,
+        "limits.qd_limit_rad_s": 100.0,
+    }
     return Drawn("wall", load_scenario("windup", made), STIFFNESS)
 
 

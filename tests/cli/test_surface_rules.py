@@ -24,7 +24,8 @@ NO_RESULT = {
     *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
     *(f"trilat new {kind}" for kind in ("law", "hand", "plant")),
     "trilat experiment new",
-    *(f"trilat {name}" for name in ("scenario show", "scenario new", "keys new", "keys pair")),  # files
+    *(f"trilat {name}" for name in ("scenario show", "scenario new")),  # files
+    *(f"trilat keys {name}" for name in ("new", "renew", "pair")),
 }
 """Commands that print what they do, and find nothing."""
 

@@ -108,7 +108,7 @@ def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
     ("limits", "words"),
     [
         ({"q_min_rad": 1.0, "q_max_rad": 0.5}, "above q_min_rad"),
-        ({"q_max_rad": 0.2}, "start within"),
+        ({"q_max_rad": 0.2}, "start at most"),
         ({"q_min_rad": [1.0, 2.0, 3.0]}, "has 3 numbers, and the arm has 2 joints"),
         ({"tau_rate_limit_nm_s": 0.0}, "tau_rate_limit_nm_s"),
     ],

@@ -132,7 +132,7 @@ class DelayEquations:
 def equations(scenario) -> DelayEquations:
     """The equations of a scenario whose arms, gains and delays are all alike."""
     specs = list(scenario.sites.values())
-    assert len({(s.arm, s.control) for s in specs}) == 1
+    assert all((spec.arm, spec.control) == (specs[0].arm, specs[0].control) for spec in specs)
     arm = specs[0].arm
     return DelayEquations(theta=theta_of(arm), g=arm.g_m_s2, **common_terms(scenario))
 

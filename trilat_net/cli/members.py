@@ -227,11 +227,23 @@ def record_command(
     if concluded:
         refuse_existing(page, force=force)
     clock = make_system_clock(clock_offset, clock_drift)
-    if warning := describe_load(measure_busy_share(clock)):
-        terminal.print_note(warning)
+
+    def warn_of_load() -> None:
+        if warning := describe_load(measure_busy_share(clock)):
+            terminal.print_note(warning)
+
     then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
     try:
-        code = record_session(session, place, connection, join_timeout, clock, terminal.print_line, then)
+        code = record_session(
+            session=session,
+            storage=place,
+            connection=connection,
+            join_timeout_s=join_timeout,
+            clock=clock,
+            say=terminal.print_line,
+            afterwards=then,
+            warn=warn_of_load,
+        )
     finally:
         if concluded and output is None:
             with suppress(OSError):

@@ -124,6 +124,10 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
     Private keys, hosts and the lists of members stay as they are.
 
+    >>> folders = tn.create_keys("lab-keys", ["m", "s"], days=1)
+    >>> [folder.name for folder in tn.renew_keys("lab-keys", days=30)]
+    ['m', 's']
+
     Args:
         folder: the folder that `create_keys` made, with its folder `authority`.
         members: whose certificates are renewed; none: those of all members whose folders are there.

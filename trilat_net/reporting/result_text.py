@@ -74,7 +74,15 @@ class TextTable(NamedTuple):
             cells = [row[n] for row in self.rows if n < len(row)]
             widest = max((len(found) for cell in cells for found in HASH.findall(cell)), default=None)
             side: Any = "right" if right else "left"
-            table.add_column(Text(sanitize(title)), justify=side, overflow="fold", min_width=widest)
+            # Rich narrows columns that may wrap before it looks at the least widths of the others.
+            holds_hashes = widest is not None and all(len(cell) <= widest for cell in cells)
+            table.add_column(
+                Text(sanitize(title)),
+                justify=side,
+                overflow="fold",
+                min_width=widest,
+                no_wrap=holds_hashes,
+            )
         for row in self.rows:
             heading = "bold" if len(row) == 1 < len(self.headers) else ""
             table.add_row(*(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row))

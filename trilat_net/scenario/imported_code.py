@@ -130,13 +130,20 @@ def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list
     return [f"{key} = {new.get(key, 'its default')} (was {old.get(key, 'its default')})" for key in changed]
 
 
-LONGEST_SETTING = 80
+LONGEST_SETTING = 300
+"""Characters of a setting that are shown; paths of files are shorter."""
 
 
 def describe_setting(value: Any) -> str:
-    """Returns the value of a setting as a short text without control characters."""
+    """Returns the value of a setting as a text without control characters.
+
+    Of a long value the beginning and the end are shown: the end of a path is what tells files apart.
+    """
     text = json.dumps(value, default=str)
-    return text if len(text) <= LONGEST_SETTING else f"{text[: LONGEST_SETTING - 3]}..."
+    if len(text) <= LONGEST_SETTING:
+        return text
+    half = LONGEST_SETTING // 2
+    return f"{text[:half]} ... {text[-half:]} ({len(text)} characters)"
 
 
 _executed: dict["CodeSource", Any] = {}

@@ -78,7 +78,12 @@ def test_records_with_none_beside_them_are_no_period() -> None:
 
 def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
     """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
-    light = {"arm.m2_kg": 0.001, "rate_hz": 333, "duration_s": 2.0}
+    light = {
+        "arm.m2_kg": 0.001,
+        "rate_hz": 333,
+        "duration_s": 2.0,
+        "limits.qd_limit_rad_s": 100.0,
+    }
     found = certify(trilat_net.simulate(load_scenario("two_sites", light)))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert "the period is too long for these gains" in found.verdict.text
