@@ -37,10 +37,8 @@ def test_a_good_log_is_verified_and_reported_beside_itself(stage: Stage) -> None
 def test_a_run_that_diverged_fails_though_its_log_is_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def recorded(_session: str, storage: LogStorage, *others: object) -> int:
+    def recorded(storage: LogStorage, afterwards: Callable[[], None], **_others: object) -> int:
         assert not record_virtual(load_scenario("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path)
-        *_, afterwards = others
-        assert isinstance(afterwards, Callable)
         afterwards()
         return 0
 
