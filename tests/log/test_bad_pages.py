@@ -1,5 +1,6 @@
 """Pages that are zeroed, stale or misdirected: recovery invents nothing, and says what it could not save."""
 
+import hashlib
 import io
 import random
 from collections import Counter
@@ -8,14 +9,14 @@ from pathlib import Path
 import pytest
 import zstandard
 from mcap.opcode import Opcode
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 
 from tests.log.bad_pages import GOLDEN, damaged, recovered_all, rewritten, shelf
 from tests.log.dealt import messages
 from tests.log_editing import recorded
-from trilat_net.errors import LogError
+from trilat_net.errors import LogError, NothingSaved
 from trilat_net.execution.verify import verify
-from trilat_net.log.log_layout import SCENARIO
+from trilat_net.log.log_layout import SCENARIO, SESSION
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.mcap_records import RecordScanner
 from trilat_net.log.recover import Recovery, recover
@@ -123,6 +124,76 @@ def test_a_session_of_another_log_is_not_believed(tmp_path: Path) -> None:
     assert any("commands of trilat-net do not" in text for text in result.lost)
     with pytest.raises(LogError, match="no log of trilat-net"):
         open_log(tmp_path / "zz.mcap")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -> None:
+    """Another seed gives another hash of the scenario, and with it other boots in every message."""
+    data = recorded("paper", {"duration_s": 0.5})
+    other = recorded("paper", {"duration_s": 0.5, "seed": 5})
+    torn = bytearray(data if whole else data[: chunk_offsets(data)[-1][1]])
+    torn[:PAGE_BYTES] = other[:PAGE_BYTES]
+    result, saved = recovered(bytes(torn), tmp_path)
+    assert not Counter(messages(saved)) - Counter(messages(data))
+    assert result.messages > 1500
+    assert any("in whose place are those of another session" in text for text in result.lost)
+    assert any("commands of trilat-net do not" in text for text in result.lost)
+    assert b"scenario.toml.damaged" in saved
+
+
+def test_a_chunk_of_another_virtual_run_is_refused(tmp_path: Path) -> None:
+    """Its checksum is right, and in an unfinished file so are its place and its times."""
+    data, other = (recorded("paper", {"duration_s": 1.5, "seed": seed}) for seed in (1, 5))
+    (begin, end), (last_begin, last_end) = chunk_offsets(data)
+    first, length = chunk_offsets(other)[0]
+    torn = data[:begin] + other[first:length] + data[last_begin:last_end]
+    result, saved = recovered(torn, tmp_path)
+    assert [text.partition(": ")[2] for text in result.lost] == ["a chunk of another run"]
+    assert not Counter(messages(saved)) - Counter(messages(data))
+    assert verify(open_log(tmp_path / "zz.mcap")).agreed
+    result, _ = recovered(data[:begin] + data[begin:end] + data[last_begin:last_end], tmp_path)
+    assert result.lossless
+
+
+@pytest.mark.parametrize("kind", ["without checksums", "damaged chunk"])
+def test_without_anything_to_save_no_file_is_made(kind: str, tmp_path: Path) -> None:
+    """Neither a message that nothing proves, nor a file that holds nothing."""
+    data = bytearray(recorded("paper"))
+    if kind == "without checksums":
+        live = (GOLDEN / "live-paper.mcap").read_bytes()
+        data = bytearray(rewritten(live, 50_000, enable_crcs=False)[:96_571])
+    else:
+        (begin, end), *_ = chunk_offsets(bytes(data))
+        del data[end + 500 :]
+        data[begin + PAGE_BYTES : begin + 2 * PAGE_BYTES] = bytes(PAGE_BYTES)
+    data[8:PAGE_BYTES] = bytes(PAGE_BYTES - 8)
+    (tmp_path / "zz.mcap").write_bytes(b"precious")
+    with pytest.raises(NothingSaved, match="nothing in it that could be saved") as error:
+        recovered(bytes(data), tmp_path)
+    expected = "without the scenario no message can be checked" if kind == "without checksums" else "chunk"
+    assert expected in str(error.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["z.mcap.active", "zz.mcap"]
+    assert (tmp_path / "zz.mcap").read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("scenario", ["another = 1", "no TOML", "\xff"])
+def test_a_log_that_no_command_opens_is_stated(scenario: str, tmp_path: Path) -> None:
+    """Nothing of it is damaged; the new file is read once more, and what a reader says is a loss."""
+    text = scenario.encode("latin-1")
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    session = {"session": "paper", "driver": "virtual", "schema_version": "4", "epoch_unix_ns": "0"}
+    session["scenario_sha256"] = hashlib.sha256(text).hexdigest()
+    writer.add_metadata(SESSION, session)
+    writer.add_attachment(0, 0, SCENARIO, "application/toml", text)
+    writer.finish()
+    result, _ = recovered(stream.getvalue(), tmp_path)
+    with pytest.raises(LogError):
+        open_log(tmp_path / "zz.mcap")
+    assert len(result.lost) == 1
+    assert "its scenario cannot be read" in result.lost[0]
+    assert "commands of trilat-net do not" in result.lost[0]
 
 
 def without_scenario(data: bytes) -> bytes:

@@ -8,7 +8,6 @@ written in the present one; a message of the present version keeps its bytes.
 """
 
 import bisect
-import hashlib
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -37,6 +36,7 @@ from ..log.log_reader import Log
 from ..log.log_writer import LogWriter
 from ..log.mcap_reader import read_contents
 from ..log.mcap_writer import Sink
+from ..log.message_identity import compute_virtual_boot
 from ..log.ros2.viz_channels import VIZ_HZ
 from ..net import topics
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
@@ -251,7 +251,7 @@ def execute_virtual(
 
 def virtual_boot(scenario: Scenario, site: str) -> int:
     """Returns the boot of a site in virtual time: a function of scenario and name."""
-    return int.from_bytes(hashlib.sha256(f"{scenario.sha256}/{site}".encode()).digest()[:8], "big")
+    return compute_virtual_boot(scenario.sha256, site)
 
 
 class _VirtualChannels(SiteChannels):

@@ -6,6 +6,8 @@ Invariant:
   number and with its own time of sending, and was logged within its chunk and not before the message that
   precedes it.
 - Nothing is believed after the first message that fails.
+- Of a session in virtual time every message names the scenario by its boot: a chunk of a run of another
+  scenario, which includes the seed, is refused even where a checksum covers it.
 
 A log names each message four times over: by its place in the file, by its channel, by its sequence number and
 by its content. Damage that keeps all four consistent changes numbers inside a message alone, and is shorter
@@ -15,7 +17,7 @@ than a message.
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..core.ticks import tick_ns
 from ..errors import WireError
@@ -26,39 +28,77 @@ from ..scenario import Scenario
 from ..scenario.run_changes import count_skipped_ticks
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
 from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
-from .message_identity import AnyMessage, MessageIdentity, identify_message
+from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot, identify_message
 
 CDR_HEAD = b"\x00\x01"
 """First bytes of a message of a channel for viewers."""
 
 
+VIRTUAL_DRIVER = "virtual"
+"""Driver of a session in virtual time."""
 _SAMPLED_MESSAGES = 200
+_CHECKED_MESSAGES = 20
+"""Messages of a chunk that are compared with the boots of a session in virtual time."""
 
 
-def find_epochs_ns(data: bytes) -> set[int]:
-    """Returns the epochs, Unix ns, that the first messages of an unpacked chunk imply or state.
+class MessageOrigins(NamedTuple):
+    """The origins that messages state.
+
+    Attributes:
+        epochs_ns: the epochs of their sessions, Unix ns.
+        boots: their senders, and the boots of those.
+    """
+
+    epochs_ns: set[int]
+    boots: set[tuple[str, int]]
+
+
+def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
+    """Returns the origins that the first messages of an unpacked chunk imply or state.
 
     An event states the epoch that it announces. Records and statistics state when they were sent since the
     epoch, and are stored with the Unix time of that; a session in virtual time has the epoch 0.
+
+    Args:
+        data: the records of the chunk.
+        most: the number of messages that are decoded.
     """
     epochs_ns: set[int] = set()
-    found = 0
+    boots: set[tuple[str, int]] = set()
+    decoded = 0
     for opcode, begin, end in iterate_records(data):
-        if opcode != OP_MESSAGE or end - begin < MESSAGE_HEAD.size or found >= _SAMPLED_MESSAGES:
+        if opcode != OP_MESSAGE or end - begin < MESSAGE_HEAD.size:
             continue
-        found += 1
+        if decoded >= most:
+            break
+        decoded += 1
         publish_ns = MESSAGE_HEAD.unpack_from(data, begin)[3]
         payload = data[begin + MESSAGE_HEAD.size : end]
         kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
         for kind in kinds:
             with suppress(WireError):
                 message: AnyMessage = decode(payload, kind, messages.READABLE)
-                sent_ns = identify_message(message, 1).sent_ns
+                identity = identify_message(message, 1)
+                sent_ns = identity.sent_ns
+                boots.add((identity.sender, message.boot))
                 if isinstance(message, messages.Event):
                     epochs_ns |= {message.epoch_unix_ns} if message.epoch_unix_ns else set()
                 elif sent_ns is not None and publish_ns:
                     epochs_ns.add(publish_ns - sent_ns)
-    return epochs_ns
+    return MessageOrigins(epochs_ns, boots)
+
+
+def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
+    """True if no message is of a session in virtual time, whose boots follow from its scenario.
+
+    Args:
+        about: metadata of the session; of a session in real time nothing is foreign.
+        boots: the senders of the messages, and their boots.
+    """
+    if about.get("driver") != VIRTUAL_DRIVER:
+        return False
+    digest = about.get("scenario_sha256", "")
+    return bool(boots) and all(boot != compute_virtual_boot(digest, sender) for sender, boot in boots)
 
 
 class ContentCheck:
@@ -72,6 +112,7 @@ class ContentCheck:
 
     def __init__(self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool) -> None:
         self._scenario = scenario
+        self._about = about
         self._session = about.get("session", "")
         epoch_text = about.get("epoch_unix_ns", "")
         self._epoch_ns = int(epoch_text) if re.fullmatch(r"\d{1,19}", epoch_text) else 0
@@ -180,8 +221,17 @@ class ContentCheck:
             if publish_ns != sent_ns:
                 raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
 
+    def check_origin(self, data: bytes) -> None:
+        """Raises if the messages of an unpacked chunk are of another run in virtual time."""
+        if self._about.get("driver") != VIRTUAL_DRIVER:
+            return
+        if has_foreign_boots(self._about, find_origins(data, _CHECKED_MESSAGES).boots):
+            raise UnreadableRecord("a chunk of another run")
+
     def _find_boot(self, member: str) -> int | None:
-        """Returns the start of a member that sent its messages so far; None if there are none."""
+        """Returns the boot with which a member sends its messages; None if nothing tells it yet."""
+        if self._about.get("driver") == VIRTUAL_DRIVER:
+            return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
         channels = RECORDER_CHANNELS if member == topics.RECORDER else SITE_CHANNELS
         for channel in channels:
             topic = "/" + topics.key(self._session, member, channel)

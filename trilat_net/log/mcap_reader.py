@@ -7,7 +7,7 @@ the memory of all ends where its share does, and the others are read.
 
 import math
 from array import array
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,8 +17,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ..errors import LogError
+from ..errors import LogError, ScenarioError
 from ..net import topics
+from ..scenario import parse_embedded
 from ..wording import count_nouns
 from . import mcap_records
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
@@ -374,6 +375,32 @@ def read_contents(
             channel = taken[topic] = channels.setdefault(topic, ChannelMessages()) if is_ours else None
         if channel is not None:
             channel.add(payload, log_ns, publish_ns)
+    _check_head(reader, name)
+    session = reader.metadata[SESSION]
+    damaged = [f"{name}: {damage}" for damage in reader.damaged]
+    complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
+    text, chain = reader.attachments[SCENARIO], reader.judge_digest()
+    ended = reader.complete
+    return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
+
+
+def check_log(stream: BinaryIO, name: str) -> None:
+    """Reads a file once, message by message, as a reader of a log does, and keeps nothing.
+
+    Raises:
+        LogError: no command opens the file; the text says why.
+    """
+    reader = McapReader(stream, name)
+    deque(reader.messages(), maxlen=0)
+    _check_head(reader, name)
+    try:
+        parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
+    except (ScenarioError, UnicodeDecodeError) as error:
+        raise LogError(f"{name}: its scenario cannot be read: {error}") from None
+
+
+def _check_head(reader: McapReader, name: str) -> None:
+    """Raises `LogError` unless a file that was read describes a session."""
     session = reader.metadata.get(SESSION, {})
     lacking = [key for key in ("session", "driver") if key not in session]
     lacking += [] if SCENARIO in reader.attachments else [SCENARIO]
@@ -381,8 +408,3 @@ def read_contents(
         why = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
         problem = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking[0]}"
         raise LogError(f"{problem}; {why}" if why else problem)
-    damaged = [f"{name}: {damage}" for damage in reader.damaged]
-    complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
-    text, chain = reader.attachments[SCENARIO], reader.judge_digest()
-    ended = reader.complete
-    return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)

@@ -4,6 +4,7 @@ Invariant: the answer depends on the content of the message alone, never on wher
 place in a file can be compared with it.
 """
 
+import hashlib
 from typing import NamedTuple
 
 from ..net import messages, topics
@@ -29,6 +30,14 @@ class MessageIdentity(NamedTuple):
     number: int
     sequence: int
     sent_ns: int | None
+
+
+def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
+    """Returns the boot of a site in virtual time: a function of the scenario's hash and the site's name.
+
+    So every message of such a run names its scenario.
+    """
+    return int.from_bytes(hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()[:8], "big")
 
 
 def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:

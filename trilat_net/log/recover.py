@@ -5,6 +5,8 @@ Invariant:
 - What cannot be read is left out and reported. Nothing is invented: of a trilat-net log a message is
   copied only if a valid checksum covers it or if its content proves it (`content_check`), and only from a
   chunk that stands where it was written (`recovery_survey`).
+- No file is made that holds nothing. A log that no command opens in the end is reported as such: the new
+  file is read once more.
 - The source file is not modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebuilt.
 """
 
@@ -40,13 +42,17 @@ from .log_layout import (
     collect_provenance,
     describe_unfinished,
 )
-from .mcap_reader import McapReader, Progress
+from .mcap_reader import McapReader, Progress, check_log
 from .mcap_records import UnreadableRecord
 from .mcap_writer import McapWriter
 from .recovery_survey import RecoverySurvey
 from .running_digest import DIGESTS, RECOVERED, DigestState
 from .torn_chunk import TornChunk
 
+_UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
+_UNPROVEN = "without a checksum, and without the scenario no message can be checked"
+_MAX_REASONS = 3
+"""Losses that the error names where they leave nothing to save."""
 MAX_LISTED_LOSSES = 20
 """Losses that are listed there one by one."""
 DAMAGED_SUFFIX = ".damaged"
@@ -195,7 +201,10 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
     working.unlink(missing_ok=True)
     file = LogFile(result.output, force=force, working=working)
     try:
-        _FileCopy(reader, file, survey, result).run(restored)
+        copy = _FileCopy(reader, file, survey, result)
+        copy.run(restored)
+        if copy.is_session_log and not any(_UNOPENED in text for text in result.lost):
+            _check_output(working, result)
         file.close()
     except BaseException:
         file.discard()
@@ -203,6 +212,15 @@ def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress
             raise file.refused(file.trouble) from None
         raise
     return result
+
+
+def _check_output(working: Path, result: Recovery) -> None:
+    """Adds a loss if no command opens the file that was made."""
+    with working.open("rb") as stream:
+        try:
+            check_log(stream, str(result.output))
+        except LogError as error:
+            result.lose(f"{error}; {_UNOPENED}")
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
@@ -220,7 +238,11 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
 
 
 class _FileCopy:
-    """Copy of one file into another; of a number's definitions the first one holds."""
+    """Copy of one file into another; of a number's definitions the first one holds.
+
+    Attributes:
+        is_session_log: True if anything says that it is a log of a session.
+    """
 
     def __init__(self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery) -> None:
         reader.watch = self._copy
@@ -230,6 +252,8 @@ class _FileCopy:
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
         self._content = _make_content_check(survey, self._accounts)
         self._data_end = reader.size + 1
+        self.is_session_log = survey.is_session_log
+        self._is_empty = True  # neither a message nor metadata nor an attachment was copied
         self._reported = 0  # damaged parts that are among the losses
         self._defined: dict[tuple[int, int], Any] = {}  # schemas and channels, by opcode and number
         self._contradicted: set[int] = set()  # numbers that have two definitions
@@ -251,15 +275,24 @@ class _FileCopy:
                 self._open_channel(number)  # with or without messages
 
     def run(self, restored: bytes) -> None:
-        """Copies everything; a scenario that was `restored` from elsewhere comes first."""
+        """Copies everything; a scenario that was `restored` from elsewhere comes first.
+
+        Raises:
+            NothingSaved: all that the file holds is lost.
+        """
         if restored:
             self._out.add_attachment(0, 0, SCENARIO, "application/toml", restored)
+            self._is_empty = False
         deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
         self._report_damaged()
         if self._scanner.torn is not None:
             self._take_torn(self._scanner.torn)
         self._out.flush()
         self._report_unnamed()
+        if self._is_empty and self._result.lost:  # before the end mark, which would make it a file
+            reasons = [text for text in self._result.lost if _UNOPENED not in text][:_MAX_REASONS]
+            why = f"there is nothing in it that could be saved: {'; '.join(reasons)}"
+            raise NothingSaved(f"{self._result.path}: {why}")
         self._finish()
 
     def _copy(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
@@ -303,18 +336,20 @@ class _FileCopy:
         if entry.name == SESSION and entry.metadata != self._survey.metadata.get(SESSION):
             raise UnreadableRecord("metadata of another session")
         self._out.add_metadata(entry.name, entry.metadata)
+        self._is_empty = False
 
     def _take_attachment(self, content: bytes) -> None:
         """Copies an attachment; one that is damaged must not get a valid checksum under its own name."""
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
-        is_right = mcap_records.has_right_crc(content)
-        if name == SCENARIO:
-            is_right = is_right and entry.data == self._survey.attachments.get(SCENARIO)
-        if not is_right:
+        problem = "" if mcap_records.has_right_crc(content) else "its CRC differs"
+        if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
+            problem = problem or "it is not that of this session"
+        if problem:
             name = f"{name}{DAMAGED_SUFFIX}"
-            self._result.lose(f"attachment {entry.name}: its CRC differs; it is kept as {name}")
+            self._result.lose(f"attachment {entry.name}: {problem}; it is kept as {name}")
         self._out.add_attachment(entry.create_time, entry.log_time, name, entry.media_type, entry.data)
+        self._is_empty = False
 
     def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Leaves out what is made again; raises if it is something else whose kind was damaged."""
@@ -333,9 +368,13 @@ class _FileCopy:
             raise UnreadableRecord(problem)
         head = self._scanner.head(frame)
         inner = [(opcode, data[begin:end]) for opcode, begin, end in mcap_records.iterate_records(data)]
-        if self._content is not None and not head.crc:
+        if not head.crc and self._content is None and self.is_session_log:
+            raise UnreadableRecord(f"a chunk {_UNPROVEN}")
+        if not head.crc and self._content is not None:
             self._take_unproven(inner, (head.start_ns, head.end_ns))
             return
+        if self._content is not None:
+            self._content.check_origin(data)
         for opcode, content in inner:
             self._take_inner(opcode, content)
 
@@ -343,6 +382,8 @@ class _FileCopy:
         """Copies a message outside of chunks, which has no checksum."""
         if self._content is not None:
             self._take_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
+        elif self.is_session_log:
+            raise UnreadableRecord(f"a message {_UNPROVEN}")
         elif self._survey.is_chunked:
             raise UnreadableRecord("a message stands outside of the chunks")
         else:
@@ -359,6 +400,7 @@ class _FileCopy:
                 self._unnamed[number] += 1
                 return
             self._out.add_message(new[0], log_ns, payload, publish_ns, sequence)
+            self._is_empty = False
             if self._content is not None:
                 self._content.follow(new[1], sequence, log_ns, payload)
             if self._accounts is not None:
@@ -383,6 +425,10 @@ class _FileCopy:
     def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
         if opcode in mcap_records.DEFINITIONS:
             entry = mcap_records.parse_record(opcode, content)
+            is_own = opcode == Opcode.CHANNEL and entry.topic.startswith(f"/{topics.ROOT}/")
+            if is_own and self._content is None:
+                self.is_session_log = True
+                raise UnreadableRecord("its scenario, without which no message can be checked")
             if opcode == Opcode.CHANNEL and not self._is_plausible(entry.topic):
                 raise UnreadableRecord("a channel is none of this session")
             self._define(opcode, content)
@@ -482,7 +528,7 @@ class _FileCopy:
 
     def _salvage(self, offset: int) -> str:
         """Copies the records of a chunk that was cut off, block by block; returns what ended that, or ""."""
-        if self._content is None and self._survey.is_session_log:
+        if self._content is None and self.is_session_log:
             return "its scenario, without which no message can be checked"
         try:
             torn = TornChunk.read(self._scanner, offset)
@@ -504,14 +550,14 @@ class _FileCopy:
             result.lose(f"what channel or schema {number} is: the file says it in two ways")
         survey = self._survey
         has_head = SESSION in survey.metadata and SCENARIO in survey.attachments
-        if survey.is_session_log and not has_head:
+        if self.is_session_log and not has_head:
             lacks = "the scenario" if SESSION in survey.metadata else "the session's metadata"
             if survey.is_foreign_session:
                 lacks += ", in whose place are those of another session"
-            result.lose(
-                f"{lacks}; other MCAP programs open the new file, commands of trilat-net do not. If the file "
-                f"that was run stands beside the log as {SCENARIO}, recover puts it in"
-            )
+            advice = ""
+            if SESSION in survey.metadata:  # which names the hash that the scenario must have
+                advice = f". If the file that was run stands beside the log as {SCENARIO}, recover puts it in"
+            result.lose(f"{lacks}; {_UNOPENED}{advice}")
         if stated is not None and self._out.messages < stated and result.lossless:
             result.lose(
                 f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"

@@ -3,7 +3,8 @@
 Invariant:
 - Of two definitions of a number, the one covered by a valid checksum wins, else the first.
 - Of several sessions and scenarios in a file those count that name each other; one whose epoch contradicts
-  all messages with a checksum is of another log, and does not count.
+  all messages with a checksum is of another log, and does not count. In virtual time, where the epoch is 0,
+  the boots of the messages tell.
 - A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a finished file
   the index tells, which has a checksum of its own; in a log that was not finished the times of the chunks do,
   which never go back.
@@ -20,9 +21,10 @@ from mcap.opcode import Opcode
 
 from ..net import topics
 from . import mcap_records
-from .content_check import find_epochs_ns
+from .content_check import MessageOrigins, find_origins, has_foreign_boots
 from .log_layout import ACCOUNTS, PART, SCENARIO, SESSION
 from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
+from .torn_chunk import PAGE_BYTES
 
 Definition = tuple[int, bytes]
 """A schema or a channel: opcode and content."""
@@ -58,7 +60,7 @@ class RecoverySurvey:
         self.attachments: dict[str, bytes] = {}
         self.count: int | None = None
         self._scanner = scanner
-        self._sessions: list[dict[str, str]] = []
+        self._sessions: list[tuple[dict[str, str], int]] = []  # and where they stand
         self._scenarios: list[tuple[bytes, bool]] = []  # and whether a checksum covers it
         self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
         self._indexes: dict[int, Any] = {}  # of chunks, by offset
@@ -66,12 +68,15 @@ class RecoverySurvey:
         is_covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
         summary_offset = (footer.summary_start if footer is not None and is_covered else 0) or scanner.size
         found: dict[tuple[bool, int], list[Definition]] = defaultdict(list)  # in the summary or not
+        self._places: dict[Definition, int] = {}  # of definitions that no checksum covers
         has_messages = False
         for frame in scanner.frames():
             has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
             if frame.opcode in mcap_records.DEFINITIONS:
                 entry = frame.opcode, scanner.content(frame)
                 found[frame.offset >= summary_offset, frame.opcode].append(entry)
+                if frame.offset < summary_offset:
+                    self._places.setdefault(entry, frame.offset)
             elif frame.opcode == Opcode.CHUNK:
                 self._chunks.append((frame, scanner.head(frame)))
             elif frame.opcode in _DESCRIBING:
@@ -83,6 +88,9 @@ class RecoverySurvey:
         self.definitions = [
             entry for kind in mcap_records.DEFINITIONS for entry in found[True, kind] or found[False, kind]
         ]
+        for kind in mcap_records.DEFINITIONS:
+            for entry in found[True, kind]:
+                self._places.pop(entry, None)
         self.is_redefined = any(
             found[True, kind] and not set(found[False, kind]) <= set(found[True, kind])
             for kind in mcap_records.DEFINITIONS
@@ -95,9 +103,7 @@ class RecoverySurvey:
         self.is_chunked = bool(self._chunks)
         self._choose_session()
         self.is_foreign_session = False
-        epochs_ns = self._find_epochs_ns()
-        self.is_session_log |= bool(epochs_ns)
-        self._reject_foreign_session(epochs_ns)
+        self._judge_messages()
         self.misplaced = self._find_misplaced_chunks()
         is_torn_chunk = scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
         self.is_chunked |= is_torn_chunk
@@ -115,7 +121,7 @@ class RecoverySurvey:
             case Opcode.METADATA:
                 self.metadata[record.name] = record.metadata
                 if record.name == SESSION:
-                    self._sessions.append(record.metadata)
+                    self._sessions.append((record.metadata, frame.offset))
             case Opcode.STATISTICS:
                 self.count = record.message_count
             case Opcode.CHUNK_INDEX:
@@ -137,36 +143,55 @@ class RecoverySurvey:
         if covered:
             self.attachments[SCENARIO] = covered[0]
         digests = {hashlib.sha256(text).hexdigest(): text for text, _ in self._scenarios}
-        for session in self._sessions:
+        for session, _ in self._sessions:
             if session.get("scenario_sha256") in digests:
                 self.metadata[SESSION] = session
                 self.attachments[SCENARIO] = digests[session["scenario_sha256"]]
                 return
         if self._sessions:
-            self.metadata[SESSION] = self._sessions[0]
+            self.metadata[SESSION], _ = self._sessions[0]
 
-    def _reject_foreign_session(self, epochs_ns: set[int]) -> None:
-        """Leaves out a session, its scenario and its channels if the messages are of another session."""
-        session = self.metadata.get(SESSION)
-        if session is None:
-            return
-        if not epochs_ns or session.get("epoch_unix_ns", "") in set(map(str, epochs_ns)):
-            return
+    def _judge_messages(self) -> None:
+        """Compares the first chunks that have messages with the session that the file names.
+
+        A chunk without a checksum tells that the file is a log, but nothing against its session.
+        """
+        origins = MessageOrigins(set(), set())
+        for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
+            with suppress(UnreadableRecord):
+                data = mcap_records.unpack_chunk(self._scanner.content(frame))
+                stated = find_origins(data)
+                self.is_session_log |= bool(stated.boots) or _names_session(data)
+                if head.crc:
+                    origins.epochs_ns.update(stated.epochs_ns)
+                    origins.boots.update(stated.boots)
+        session = self.metadata.get(SESSION, {})
+        epochs = set(map(str, origins.epochs_ns))
+        if session and epochs and session.get("epoch_unix_ns", "") not in epochs:
+            self._reject_session(session, is_renamed=True)
+        elif session and has_foreign_boots(session, origins.boots):
+            self._reject_session(session, is_renamed=False)
+
+    def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
+        """Leaves out a session of another log, its scenario, and its channels unless a checksum covers them.
+
+        Args:
+            session: metadata of that session.
+            is_renamed: False if the session of the messages may have the same name; then the channels that
+                are left out are those that stand in the same page.
+        """
         self.is_foreign_session = True
+        pages = {offset // PAGE_BYTES for entry, offset in self._sessions if entry == session}
         del self.metadata[SESSION]
         self.attachments.pop(SCENARIO, None)
         names = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
-        self.definitions = [entry for entry in self.definitions if names not in entry[1]]
 
-    def _find_epochs_ns(self) -> set[int]:
-        """Returns the epochs that messages under a checksum state, in the first chunks that have any."""
-        epochs_ns: set[int] = set()
-        for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
-            with suppress(UnreadableRecord):
-                if head.crc:
-                    data = mcap_records.unpack_chunk(self._scanner.content(frame))
-                    epochs_ns |= find_epochs_ns(data)
-        return epochs_ns
+        def is_own(entry: Definition) -> bool:
+            offset = self._places.get(entry)
+            is_near = is_renamed or (offset is not None and offset // PAGE_BYTES in pages)
+            return offset is None or names not in entry[1] or not is_near
+
+        self.definitions = list(filter(is_own, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
         if self._indexes:
@@ -198,6 +223,12 @@ class RecoverySurvey:
             else:
                 misplaced[frame.offset] = "a chunk that the index of the file does not name"
         return misplaced
+
+
+def _names_session(data: bytes) -> bool:
+    """True if an unpacked chunk defines a channel of a session."""
+    records = mcap_records.iterate_records(data)
+    return any(opcode == Opcode.CHANNEL and _TOPIC_ROOT in data[begin:end] for opcode, begin, end in records)
 
 
 _CHUNK_BYTE = bytes([Opcode.CHUNK])
