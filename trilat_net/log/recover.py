@@ -220,7 +220,7 @@ def _check_output(working: Path, result: Recovery) -> None:
         try:
             check_log(stream, str(result.output))
         except LogError as error:
-            result.lose(f"{error}; {_UNOPENED}")
+            result.lost.insert(0, f"{error}; {_UNOPENED}")
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
@@ -557,7 +557,7 @@ class _FileCopy:
             advice = ""
             if SESSION in survey.metadata:  # which names the hash that the scenario must have
                 advice = f". If the file that was run stands beside the log as {SCENARIO}, recover puts it in"
-            result.lose(f"{lacks}; {_UNOPENED}{advice}")
+            result.lost.insert(0, f"{lacks}; {_UNOPENED}{advice}")  # lists show the first losses
         if stated is not None and self._out.messages < stated and result.lossless:
             result.lose(
                 f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"

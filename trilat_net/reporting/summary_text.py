@@ -205,7 +205,10 @@ def compose_recovery(found: Recovery) -> Iterator[Block]:
         rows.append(("of the run", str(found.coverage)))
         rows.append(("source", f"digest chain {found.chain}"))
     rows.append(("messages", f"{found.messages} in {found.duration_s:.3f} s"))
-    for name, lines in (("lost", found.lost), ("missing", found.missing)):
+    lists = [("lost", found.lost)]
+    if found.coverage.expected:  # else nothing tells which records there should be
+        lists.append(("missing", found.missing))
+    for name, lines in lists:
         rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]
         if len(lines) > _MAX_LOSSES:
             rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
