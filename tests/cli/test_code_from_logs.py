@@ -199,7 +199,7 @@ RUNNING_OWN: dict[str, list[str]] = {
     "sim": ["sim", "own.toml", "-o", "sim.mcap"],
     "test": ["test", "own.toml", "--jobs", "1"],
     "linear": ["linear", "own.toml"],
-    "sweep": ["sweep", "own.toml", "--over", "link.delay_ms=0:20:20", "--jobs", "1"],
+    "sweep": ["sweep", "own.toml", "--over", "links.m1->s.delay_ms=0,20", "--jobs", "1"],
     "experiment run": ["experiment", "run", "own-reaching.toml", "--jobs", "1"],
 }
 ONLY_NAMING_OWN: dict[str, list[str]] = {
@@ -214,7 +214,8 @@ ONLY_NAMING_OWN: dict[str, list[str]] = {
 def test_command_runs_own_code_as_the_page_says(name: str, place: Path) -> None:
     (place / "mylaws.py").write_text(LAW)
     setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
-    (place / "own.toml").write_text(trilat("scenario", "show", "paper", *setting, cwd=place).succeeds())
+    shown = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
+    (place / "own.toml").write_text(shown.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4"))
     trilat("experiment", "new", "own-reaching.toml", cwd=place).succeeds()
     shorten(place / "own-reaching.toml")
     protocol = (place / "own-reaching.toml").read_text(encoding="utf-8")
