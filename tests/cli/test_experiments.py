@@ -19,7 +19,7 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     assert (again["done"], again["conditions"]) == (4, ["no_delay", "delay_300"])
     assert "4 of 4" in trilat("experiment", "status", folder, cwd=tmp_path).succeeds()
     found = trilat("experiment", "analyse", folder, "--exclude", "P2=late", cwd=tmp_path).succeeds()
-    assert "1 more were excluded (P2: late)" in found
+    assert "1 more was excluded (P2: late)" in found
     assert f"{folder}/analysis/methods.txt" in found
     next((tmp_path / folder / "logs").iterdir()).unlink()
     assert "is missing" in trilat("experiment", "status", folder, cwd=tmp_path).err

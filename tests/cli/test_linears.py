@@ -72,8 +72,9 @@ def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
     shipped = (files("trilat_net") / "scenarios" / "p_d_margin_two.toml").read_text(encoding="utf-8")
     (tmp_path / "moved.toml").write_text(f"{shipped}\n{sines}", encoding="utf-8")
     spring = 'sites.m.hands=[{kind="tip_spring",stiffness_n_m=[50,50],damping_n_s_m=[4,4]}]'
-    told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250", "-o", "run.mcap")
-    trilat("sim", "moved.toml", "--duration", "30", *told, cwd=tmp_path)
+    told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
+    fast = ("--set", "limits.qd_limit_rad_s=20", "-o", "run.mcap")  # the sines move s at 11.5 rad/s
+    trilat("sim", "moved.toml", "--duration", "30", *told, *fast, cwd=tmp_path).succeeds()
     asked = ("identify", "hand", "run.mcap", "--site", "m")
     assert "coherence" in trilat(*asked, cwd=tmp_path).succeeds()
     (tmp_path / "m.json").write_text(trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8")
