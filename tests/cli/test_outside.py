@@ -37,7 +37,7 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     checked = trilat(*verify, cwd=tmp_path)
     assert checked.code == 0
     assert "6000/6000 records identical" in checked.out
-    assert "mylaws:Spring of m1, m2, s; its file is the one that ran" in checked.out
+    assert "mylaws:Spring of m1, m2, s with K = 80; its file is the one that ran" in checked.out
     assert demo[:2] == ["demo", "paper"]
     shown = trilat("sim", *demo[1:], *SHORT, "-o", "slave.mcap", cwd=tmp_path)
     shown.succeeds()
