@@ -195,6 +195,7 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
         "rate_hz": 200,
         "duration_s": 40.0,
         "arm": RODS,
+        "limits.qd_limit_rad_s": 10.0,  # that of the rods, as in `jitter`
         "control": {"law": "p_d", "K": 10.0, "d": d},
         "link": link or {"delay_ms": 200.0},
         "expect": {"stable": stable},
