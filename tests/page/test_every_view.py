@@ -1,18 +1,18 @@
 """Every view of the live page with data of every kind: no error, no empty frame, every line drawn."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from live.experiment_stage import Stage, TrialWatch
 from live.page_server import PageServer
 from tests.analysis.logs import BUSY, FOUR
 from tests.chains import six_joints
-from tests.live.browsers import launch, needs_browser, shows
+from tests.live.browsers import needs_browser, shows
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
@@ -113,20 +113,6 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Record
         return known[name]
 
     return find
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-        yield server.address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -3,17 +3,13 @@
 `axe-core/axe.min.js` is axe-core 4.14.1 of Deque Systems, under the Mozilla Public License 2.0.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
-from live.page_server import PageServer
-from tests.live.browsers import launch, needs_browser, tip_px
-from tests.net.local_bus import LocalNetwork
-from trilat_net.net.clock import SystemClock
+from tests.live.browsers import needs_browser, tip_px
 
 from .recorded_session import ROLES, SCREENS, RecordedSession, record_session
 
@@ -26,20 +22,6 @@ SCHEMES = ("light", "dark")
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     return record_session(tmp_path_factory.mktemp("session"))
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-        yield server.address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def grave_findings(page: Page) -> list[str]:

@@ -1,13 +1,12 @@
 """A page when arms are stopped, sites are silent and a session has ended: what each role reads and may do."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
 from live.page_server import PageServer
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
@@ -24,20 +23,6 @@ Json = dict[str, Any]
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     return record_session(tmp_path_factory.mktemp("session"), 3.0)
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-        yield server.address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 ALARMS = {

@@ -6,17 +6,14 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, WebSocketRoute, sync_playwright
+from playwright.sync_api import Browser, Page, WebSocketRoute
 
 from live.experiment_stage import Stage
-from live.page_server import PageServer
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
-from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
 from tests.studies.experiment.experiments import write_protocol
-from trilat_net.net.clock import SystemClock
 from trilat_net.studies.experiment.experiment_run import begin_experiment
 
 from .people import NO_SESSION
@@ -31,20 +28,6 @@ questionnaires = [
 ]
 """
 Json = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
-        yield server.address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

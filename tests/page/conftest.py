@@ -1,0 +1,27 @@
+"""A page's server without a session, and the browser in which its pages are opened."""
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+from live.page_server import PageServer
+from tests.live.browsers import launch
+from tests.net.local_bus import LocalNetwork
+from trilat_net.net.clock import SystemClock
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """The address of a page server of session `s1`, for the experimenter."""
+    with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
+        yield server.address
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """A headless Chromium."""
+    with sync_playwright() as playwright:
+        browser = launch(playwright)
+        yield browser
+        browser.close()
