@@ -86,6 +86,8 @@ class SessionProcess:
     def problem(self) -> str | None:
         """Describes how the process failed; None if it did not."""
         code = self.code
+        if self._signalled and self.pid is None:
+            return None  # the signal met the starter: an interpreter that still starts ends with any code
         if code in (0, None) or (self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)):
             return None  # a process that ends anyway has no handler any more
         if code is not None and code < 0:

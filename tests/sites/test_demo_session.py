@@ -77,6 +77,16 @@ def test_what_has_not_begun_is_ended_with_its_starter(tmp_path: Path) -> None:
         assert ended(starter, process).problem() is None
 
 
+@pytest.mark.parametrize("code", [1, 130, -signal.SIGINT])
+def test_the_code_of_an_interrupted_starter_is_no_problem(tmp_path: Path, code: int) -> None:
+    """An interpreter that a signal meets while it imports its first modules ends with code 1."""
+    with closing(started(tmp_path)) as starter:
+        process = starter.start("m1", WAITS)
+        process.end(signal.SIGINT)
+        process.code = code
+        assert process.problem() is None
+
+
 def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = waiting(starter, "m1")
